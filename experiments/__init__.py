@@ -1,0 +1,1 @@
+"""Studies: each is a script, ``python -m experiments.NAME``."""

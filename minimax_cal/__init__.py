@@ -1,0 +1,28 @@
+"""Calibrate robot arms, and tell why a calibrated arm still misses."""
+
+from minimax_cal.calibrate import Options, calibrate
+from minimax_cal.calibration import Calibration
+from minimax_cal.cell import Cell, evaluate, load_cell
+from minimax_cal.data import Measurements, measurements, read_measurements, write_measurements
+from minimax_cal.errors import CalibrationError, DataError, OptionError, RobotError
+from minimax_cal.robot import Robot, builtin_robots, load_robot
+
+__all__ = [
+    "Calibration",
+    "CalibrationError",
+    "Cell",
+    "DataError",
+    "Measurements",
+    "OptionError",
+    "Options",
+    "Robot",
+    "RobotError",
+    "builtin_robots",
+    "calibrate",
+    "evaluate",
+    "load_cell",
+    "load_robot",
+    "measurements",
+    "read_measurements",
+    "write_measurements",
+]

@@ -1,0 +1,423 @@
+"""Calibrate a robot: from measurements to parameters with their uncertainty and honest accuracy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal import gates, identify, kinematics, start
+from minimax_cal.calibration import Calibration, Parameter, Provenance
+from minimax_cal.cell import Cell
+from minimax_cal.data import Measurements, groups, read_measurements, split
+from minimax_cal.errors import DataError, OptionError
+from minimax_cal.identify import Identification
+from minimax_cal.kinematics import Array
+from minimax_cal.metrics import accuracy
+from minimax_cal.model import Model, Prior, SumOfSquares, in_base, model_of
+from minimax_cal.parameters import Names, State, links_of
+from minimax_cal.robot import Robot, load_robot
+from minimax_cal.solvers import least_squares, minimax
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+from minimax_cal.solvers.minimax import Optimum, Sqp
+from minimax_cal.solvers.status import Status
+from minimax_cal.start import Frame
+from minimax_cal.worst import DISTANCE_FORMS, Distances, measured_distances, worst_target
+from qp_backends import BackendError, Problem
+from qp_backends import solve as solve_qp
+
+QP_TOLERANCE = 1e-9
+TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
+# With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
+# beside 1, but leaves their own coordinates determined.
+ASIDE = 1e-9
+FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
+LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
+FEW = 30  # poses that are enough to test a slip of units or signs
+POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to calibrate.
+
+    objective: sum, minimax, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the
+    poses kept out of the fit.  seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
+    method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
+    distance constraints, two-sided, squared or off.  distance_tolerance: [m], NaN for the
+    instrument's own accuracy.  resolution: relative singular value that counts as not measured.
+    """
+
+    objective: str = "minimax"
+    qp: str = "daqp"
+    holdout: float = 0.2
+    seed: int = 0
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    priors: Mapping[str, float] = field(default_factory=dict)
+    method: str = "snllm"
+    hessian: str = "gauss-newton"
+    distance: str = "two-sided"
+    distance_tolerance: float = np.nan
+    resolution: float = identify.RESOLUTION
+
+
+Report = Callable[[str], None]
+
+
+def silent(message: str) -> None:
+    """Say nothing."""
+
+
+def calibrate(
+    robot: Robot | str | Path,
+    data: Measurements | str | Path,
+    objective: str = "minimax",
+    qp: str = "daqp",
+    report: Report = silent,
+    **options: object,
+) -> Calibration:
+    """Calibrate a robot from measurements.
+
+    robot, data: loaded, or a name or path.  options: the fields of `Options`.  report: called with
+    a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended is in the
+    result's `status`.
+    """
+    chosen = Options(objective=objective, qp=qp, **options)  # type: ignore[arg-type]
+    began = time.perf_counter()
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    data = data if isinstance(data, Measurements) else read_measurements(data)
+    objective_of(chosen.objective, data)
+    check_options(chosen)
+    gates.check_joints(robot, data)
+    train, held, notices = split(data, chosen.holdout, chosen.seed)
+    notices = (*data.notices, *gates.limit_notices(robot, data), *notices)
+    if not held.poses:
+        notices += ("no pose is held out: nothing here says how the fit does on new poses",)
+    report("start")
+    fit = fit_cell(robot, train, chosen, report)
+    if chosen.objective == "minimax" and len(data.targets) == 1:
+        notices += ("there is one target: minimax and sum are the same",)
+    if gates.collinear(train):
+        notices += (
+            "the targets lie nearly on a line: positions are fine, but orientations about that "
+            "line would not be determined",
+        )
+    calibrated = Cell.of(robot, fit.state, data.targets)
+    nominal = Cell.of(robot, fit.nominal, data.targets)
+    errors = {
+        "nominal": nominal.error(held),
+        "train": calibrated.error(train),
+        "holdout": calibrated.error(held),
+        "nominal_train": nominal.error(train),
+    }
+    return Calibration(
+        robot=calibrated.robot,
+        cell=calibrated,
+        nominal=nominal,
+        objective=chosen.objective,
+        qp=chosen.qp,
+        status=fit.status,
+        iterations=fit.iterations,
+        seconds=time.perf_counter() - began,
+        parameters=parameter_table(robot, fit),
+        accuracy={key: accuracy(error) for key, error in errors.items()},
+        errors=errors,
+        identification=fit.identification,
+        covariance=fit.covariance,
+        worst=fit.worst,
+        distances=fit.distances,
+        trace=fit.trace,
+        notices=(*notices, *fit.notices),
+        provenance=Provenance.of(robot, data, vars(chosen)),
+    )
+
+
+def objective_of(objective: str, data: Measurements) -> int:
+    """Index of the single target of smr:K, else -1.  Raises OptionError."""
+    if objective in ("sum", "minimax"):
+        return -1
+    kind, _, which = objective.partition(":")
+    if kind != "smr" or not which:
+        raise OptionError(
+            f"no objective {objective!r}; choose sum, minimax or smr:K (K as in smr1)"
+        )
+    if f"smr{which}" not in data.targets:
+        raise OptionError(
+            f"objective {objective}: {data.source} has no target smr{which}; "
+            f"it has {', '.join(data.targets)}"
+        )
+    return data.targets.index(f"smr{which}")
+
+
+def check_options(options: Options) -> None:
+    """Raise an error for a choice that does not exist, before any work."""
+    for name, value, choices in (
+        ("method", options.method, tuple(METHODS)),
+        ("hessian", options.hessian, minimax.HESSIANS),
+        ("distance form", options.distance, DISTANCE_FORMS),
+    ):
+        if value not in choices:
+            raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
+    if not 0.0 <= options.resolution < 1.0:
+        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    if options.distance_tolerance <= 0.0:
+        raise OptionError(f"distance tolerance {options.distance_tolerance:g} m: must be positive")
+    for pattern, sigma in options.priors.items():
+        if not (np.isfinite(sigma) and sigma > 0.0):
+            raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
+    try:
+        solve_qp(TRIVIAL, options.qp)
+    except BackendError as error:
+        raise OptionError(str(error)) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What the solvers found.
+
+    nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
+    covariance: (p, p) of all parameters, base in its own axes, NaN where not identified.
+    worst: the minimax answer, where there was one to find.  trace: cost at each iterate of the
+    least squares [m^2].
+    """
+
+    names: Names
+    nominal: State
+    state: State
+    identification: Identification
+    covariance: Array
+    status: Status
+    iterations: int
+    worst: tuple[Optimum[State], ...]
+    distances: Distances
+    trace: tuple[float, ...]
+    notices: tuple[str, ...]
+
+
+def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report) -> Fit:
+    """Fit the chosen objective to all poses of the data."""
+    base = model_of(robot, data)
+    names, k = base.names, len(data.targets)
+    allowed, order, sigma = wishes(robot, base, options)
+    reference = identify.plenty_of_poses(robot, base)
+    unknowns = identify.generic_count(robot, reference, order, allowed)
+    only = objective_of(options.objective, data)
+    telling = data if only < 0 else data.only(only)
+    spare = 0 if only < 0 else 3 * (k - 1)  # coordinates of targets that follow
+    poses, known = len(np.unique(groups(telling))), int(np.isfinite(sigma[allowed]).sum())
+    gates.check_count(telling, poses, unknowns - spare, known)
+    frame = start.fit_frame(base, robot.mdh)
+    check_sense(robot, data, base, frame)
+
+    report("identifiable parameters")
+    share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
+    model = base.emphasise(share)
+    found = identify.identify(
+        model,
+        frame.state,
+        order,
+        allowed=allowed,
+        reference=reference,
+        known=np.isfinite(sigma),
+        resolution=options.resolution,
+    )
+    report("least squares")
+    model, squares = least(model.only(found.active), frame, sigma, options)
+    squares, notices = wider(robot, model, squares, report)
+    state, status = squares.x.take(np.array(0)), squares.status[0]
+    iterations = int(squares.iterations[0])
+    distances = measured_distances(data, options.distance_tolerance)
+    worst: tuple[Optimum[State], ...] = ()
+    if options.objective == "minimax" and k > 1:
+        report("minimax")
+        problem = worst_target(model, state, distances, options.distance)
+        qp = partial(solve_qp, name=options.qp, tolerance=QP_TOLERANCE)
+        best = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+        state, status, worst = best.x, best.status, (best,)
+        iterations += best.iterations
+        share = np.maximum(best.mu, FLOOR) / model.counts
+        notices += tuple(f"QP: {note}" for note in best.notes)
+    return Fit(
+        names=names,
+        nominal=frame.state,
+        state=state,
+        identification=found,
+        covariance=covariance(base.only(found.active).with_prior(model.prior), state, share),
+        status=status,
+        iterations=iterations,
+        worst=worst,
+        distances=distances,
+        trace=tuple(float(value) for value in squares.trace[:, 0]),
+        notices=notices,
+    )
+
+
+def wishes(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, Array]:
+    """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
+    names = model.names
+    allowed = ~names.match(options.fix, "--fix")
+    order = identify.drop_order(robot, names)
+    wanted = names.match(options.free, "--free")
+    if (wanted & ~allowed).any():
+        name = names.all[int(np.argmax(wanted & ~allowed))]
+        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+    order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
+    sigma = np.full(names.count, np.inf)
+    for pattern, value in options.priors.items():
+        chosen = names.match([pattern], "--prior")
+        if (chosen & ~names.links).any():
+            raise OptionError(
+                f"--prior {pattern}: base and targets have no nominal value to keep to"
+            )
+        sigma[chosen] = value
+    return allowed, order, sigma
+
+
+def least(
+    model: Model, frame: Frame, sigma: Array, options: Options
+) -> tuple[Model, LeastSquares[State]]:
+    """Least squares from the nominal start; with priors, weighed against the noise that remains."""
+    points = float(model.counts.sum())
+    method = METHODS[options.method]
+    mean_square = frame.mean_square / 3.0
+    for _ in range(20 if np.isfinite(sigma).any() else 1):
+        model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
+        problem = SumOfSquares(model)
+        found = least_squares.solve(problem, frame.state.batch(), 1, points, method)
+        state = found.x.take(np.array(0))
+        _, _, gram = problem.normal(state)
+        weight = np.diag(model.prior.weight[model.active])
+        fitted = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
+        previous = mean_square
+        spare = max(3.0 * points - fitted, 1.0)
+        mean_square = max(float(model.cost(state).sum()) / spare, LEAST_NOISE**2)
+        if abs(mean_square - previous) <= 0.01 * previous:
+            break
+    return model, found
+
+
+def wider(
+    robot: Robot, model: Model, found: LeastSquares[State], report: Report
+) -> tuple[LeastSquares[State], tuple[str, ...]]:
+    """The fit, or a better one from a search over base rotations where it misses grossly."""
+    points = float(model.counts.sum())
+    limit = POOR_FIT * robot.reach()
+
+    def miss(fit: LeastSquares[State]) -> float:
+        return float(np.sqrt(fit.cost[0] / points))
+
+    if miss(found) <= limit:
+        return found, ()
+    report("search over base rotations")
+    wide = start.search(model, robot.mdh, points)
+    notices: tuple[str, ...] = ()
+    if wide.cost[0] < 0.99 * found.cost[0]:
+        found = wide
+        notices = ("the nominal angles are far off; a search over base rotations found this fit",)
+    if miss(found) > limit:
+        notices += (
+            f"the best fit still misses by {1e3 * miss(found):.3g} mm: check joint signs, units "
+            "and the link lengths in the robot file",
+        )
+    return found, notices
+
+
+def check_sense(robot: Robot, data: Measurements, model: Model, frame: Frame) -> None:
+    """Raise DataError for slips that show once base and targets are fitted."""
+    found = gates.swapped(cross_errors(model, frame.state))
+    if found:
+        lines = ", ".join(str(data.line[row]) for row, _ in found[:8])
+        more = f" and {len(found) - 8} more" if len(found) > 8 else ""
+        moved = [data.targets[i] for i, j in enumerate(found[0][1]) if i != j]
+        raise DataError(
+            f"{data.source}:{data.line[found[0][0]]}: targets look swapped ({', '.join(moved)}); "
+            f"{len(found)} such rows: lines {lines}{more}; put their columns right or delete them"
+        )
+    if np.sqrt(frame.mean_square) <= POOR_FIT * robot.reach():
+        return
+    trials = [("the measurement frame looks left-handed; reverse one of its axes", frame.mirrored)]
+    few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
+    for text, mended in gates.suspicions(robot, data.take(few)):
+        trials.append((text, start.fit_frame(model_of(robot, mended), robot.mdh).mean_square))
+    least_square = min(mean_square for _, mean_square in trials)
+    # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
+    text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
+    good = np.sqrt(mean_square) <= 4.0 * POOR_FIT * robot.reach()
+    if good and mean_square < 0.04 * frame.mean_square:
+        raise DataError(
+            f"{data.source}: {text} (the nominal robot then misses by "
+            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(frame.mean_square):.3g} mm)"
+        )
+
+
+def cross_errors(model: Model, state: State) -> Array:
+    """(k, k, m) distance of measured target i from predicted target j, NaN where not measured."""
+    links = kinematics.chain(state.mdh, model.q, model.prismatic)
+    predicted = kinematics.points(links, state.targets)
+    measured = in_base(state, model.y)
+    distance = np.linalg.norm(measured[:, None] - predicted[None], axis=-2)
+    return np.where(model.seen[:, None], distance, np.nan)
+
+
+def covariance(model: Model, state: State, share: Array) -> Array:
+    """Covariance (p, p) of an estimator that weighs target i by share_i; NaN where not estimated.
+
+    The sandwich H^-1 V H^-1 with H = sum share_i J_i'J_i and V = sum share_i^2 s_i^2 J_i'J_i, where
+    s_i is the residual noise of target i per coordinate, its degrees of freedom counted.  Errors
+    are taken as independent: model error that the poses share makes the true uncertainty larger.
+    """
+    out = np.full((model.names.count,) * 2, np.nan)
+    normal = model.normal(state, model.active)
+    coordinates = 3.0 * model.counts
+    spare = coordinates.sum() - model.active.sum() + np.count_nonzero(model.prior.weight)
+    if spare <= 0:
+        return out
+    noise = normal.cost / coordinates * coordinates.sum() / spare
+    prior = np.diag(model.prior.weight[model.active]) * share.max()
+    bread = np.einsum("k,kij->ij", share, normal.gram) + prior
+    filling = np.einsum("k,kij->ij", share**2 * noise, normal.gram)
+    filling = filling + prior * share.max() * float(noise.mean())
+    inverse = solve_normal(bread, np.eye(len(bread)))
+    out[np.ix_(model.active, model.active)] = inverse @ filling @ inverse
+    return out
+
+
+def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
+    """Every parameter in the contract's units; base entries in measurement axes."""
+    names, state, nominal = fit.names, fit.state, fit.nominal
+    n = robot.joints
+    turn = np.eye(names.count)
+    for first in (5 * n, 5 * n + 3):
+        turn[first : first + 3, first : first + 3] = state.rotation
+    spread = fit.covariance
+    known = fit.identification.active
+    whole = np.where(np.outer(known, known), spread, 0.0)
+    sigma = np.sqrt(np.maximum(np.diag(turn @ whole @ turn.T), 0.0))
+    sigma = np.where(known & np.isfinite(np.diag(spread)), sigma, np.nan)
+
+    def values(x: State) -> Array:
+        base = Rotation.from_matrix(x.rotation).as_rotvec()
+        return np.concatenate([links_of(x.mdh), x.origin, base, x.targets.reshape(-1)])
+
+    order = [kind * n + joint for joint in range(n) for kind in range(5)]
+    order += range(5 * n, names.count)
+    value, before, linear = values(state), values(nominal), names.linear
+    return tuple(
+        Parameter(
+            name=names.all[i],
+            value=float(value[i]),
+            nominal=float(before[i]),
+            sigma=float(sigma[i]),
+            unit="m" if linear[i] else "rad",
+            identifiable=bool(known[i]),
+            reason=fit.identification.reasons.get(names.all[i], ""),
+        )
+        for i in order
+    )

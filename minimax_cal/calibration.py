@@ -1,0 +1,275 @@
+"""The result of a calibration: what was found, how well it does, and where it came from."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.cell import Cell
+from minimax_cal.data import Measurements
+from minimax_cal.files import json_text, write_whole
+from minimax_cal.identify import Identification
+from minimax_cal.kinematics import Array
+from minimax_cal.metrics import Accuracy
+from minimax_cal.parameters import State
+from minimax_cal.robot import Robot
+from minimax_cal.solvers.minimax import Optimum
+from minimax_cal.solvers.status import Status
+from minimax_cal.tables import Cell as TableCell
+from minimax_cal.tables import Table
+from minimax_cal.worst import Distances
+
+SCHEMA = 1
+PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter in SI; sigma is NaN where it is not identified, reason says why it is not."""
+
+    name: str
+    value: float
+    nominal: float
+    sigma: float
+    unit: str
+    identifiable: bool
+    reason: str = ""
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON, lengths in millimetres."""
+        scale = 1e3 if self.unit == "m" else 1.0
+        out: dict[str, object] = {
+            "name": self.name,
+            "value": self.value * scale,
+            "nominal": self.nominal * scale,
+            "sigma": None if math.isnan(self.sigma) else self.sigma * scale,
+            "unit": "mm" if self.unit == "m" else "rad",
+            "identifiable": self.identifiable,
+        }
+        return out | ({"reason": self.reason} if self.reason else {})
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result came from, so that it can be had again."""
+
+    robot: str
+    data: str
+    data_sha256: str
+    settings: Mapping[str, object]
+    versions: Mapping[str, str]
+
+    @staticmethod
+    def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
+        """Of this run, on this machine."""
+        plain = {
+            key: None if isinstance(value, float) and math.isnan(value) else value
+            for key, value in settings.items()
+        }
+        versions = {name: version(name) for name in PACKAGES}
+        versions["python"] = platform.python_version()
+        return Provenance(robot.name, data.source, data.digest, plain, versions)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated robot and everything that is known about the fit.
+
+    robot: calibrated, usable wherever a robot is.  cell: with base and targets.  nominal: the
+    nominal robot with its best base and targets.  accuracy: nominal and holdout on the held-out
+    poses, nominal_train and train on the training poses.  errors: (k, m, 3) measured minus
+    predicted points under the same keys, NaN where not measured [m].  covariance: (p, p) of all
+    parameters, NaN where not identified [SI, base in its own axes].  worst: the minimax answer, if
+    one was asked for.  trace: cost at each iterate of the least squares [m^2].
+    """
+
+    robot: Robot
+    cell: Cell
+    nominal: Cell
+    objective: str
+    qp: str
+    status: Status
+    iterations: int
+    seconds: float
+    parameters: tuple[Parameter, ...]
+    accuracy: Mapping[str, Accuracy]
+    errors: Mapping[str, Array]
+    identification: Identification
+    covariance: Array
+    worst: tuple[Optimum[State], ...]
+    distances: Distances
+    trace: tuple[float, ...]
+    notices: tuple[str, ...]
+    provenance: Provenance
+
+    @property
+    def worst_mm2(self) -> tuple[float, ...]:
+        """F_i of the training poses [mm^2]."""
+        return self.accuracy["train"].sse_mm2
+
+    def predict(self, q: Array) -> Array:
+        """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
+        return self.cell.predict(q)
+
+    def accuracy_table(self) -> Table:
+        """Accuracy before and after, on the training and on the held-out poses."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, key in (
+            ("training, nominal", "nominal_train"),
+            ("training, calibrated", "train"),
+            ("held out, nominal", "nominal"),
+            ("held out, calibrated", "holdout"),
+        ):
+            a = self.accuracy[key]
+            each = [
+                math.sqrt(f / m) if m else math.nan
+                for f, m in zip(a.sse_mm2, a.counts, strict=True)
+            ]
+            rows.append((title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *each))
+        targets = tuple(f"{name} RMS mm" for name in self.cell.targets)
+        return Table(
+            f"{self.robot.name}: position accuracy, objective {self.objective}",
+            ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
+            tuple(rows),
+            ("", "d", *[".4f"] * (3 + len(targets))),
+        )
+
+    def parameter_rows(self) -> Table:
+        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
+        rows = []
+        for p in self.parameters:
+            # millimetres and milliradians: 1e3 serves both
+            scale, unit = 1e3, "mm" if p.unit == "m" else "mrad"
+            fixed = p.reason or "not identifiable"
+            rows.append(
+                (
+                    p.name,
+                    unit,
+                    p.nominal * scale,
+                    (p.value - p.nominal) * scale,
+                    p.sigma * scale,
+                    "" if p.identifiable else fixed,
+                )
+            )
+        return Table(
+            "parameters",
+            ("name", "unit", "nominal", "change", "sigma", "not identified because"),
+            tuple(rows),
+            ("", "", ".4f", "+.4f", ".4f", ""),
+        )
+
+    def minimax_table(self) -> Table:
+        """What the minimax found: F_i, multipliers, activity; empty without one."""
+        rows: list[tuple[str, float, float, str]] = []
+        for best in self.worst:
+            top = best.f.max()
+            for name, sse, f, mu in zip(
+                self.cell.targets, self.worst_mm2, best.f, best.mu, strict=True
+            ):
+                rows.append((name, sse, float(mu), "yes" if f >= top * (1 - 1e-6) else ""))
+        return Table(
+            "worst target on the training poses",
+            ("target", "F_i mm^2", "multiplier", "active"),
+            tuple(rows),
+            ("", ".4f", ".4f", ""),
+        )
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        before, after = self.accuracy["nominal"], self.accuracy["holdout"]
+        where = f"on {after.poses} poses that were not used for the fit"
+        if not after.poses:
+            before, after = self.accuracy["nominal_train"], self.accuracy["train"]
+            where = f"on the {after.poses} poses of the fit itself (none was held out)"
+        identified = sum(p.identifiable for p in self.parameters)
+        text = (
+            f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, {where}. "
+            f"{identified} of {len(self.parameters)} parameters identified "
+            f"(condition {self.identification.condition:.3g}); {self.status} after "
+            f"{self.iterations} iterations, {self.seconds:.2f} s."
+        )
+        return text + (f" {self.status.advice}." if self.status.advice else "")
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        worst = (self.minimax_table(),) if self.worst else ()
+        return (self.accuracy_table(), *worst, self.parameter_rows())
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more."""
+        out: dict[str, Any] = {
+            "schema": SCHEMA,
+            "kind": "calibration",
+            "robot": self.robot.to_dict(),
+            "nominal_robot": self.nominal.robot.to_dict(),
+            **self.cell.to_dict(),
+            "objective": self.objective,
+            "qp": self.qp,
+            "status": str(self.status),
+            "advice": self.status.advice,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "parameters": [p.to_dict() for p in self.parameters],
+            "accuracy": {key: value.to_dict() for key, value in self.accuracy.items()},
+            "condition": finite(self.identification.condition),
+            "trace_mm2": [value * 1e6 for value in self.trace],
+            "notices": list(self.notices),
+            "provenance": vars(self.provenance),
+        }
+        for best in self.worst:
+            out["minimax"] = {
+                "max_F_over_m_mm2": max(
+                    f / m
+                    for f, m in zip(self.worst_mm2, self.accuracy["train"].counts, strict=True)
+                ),
+                "multipliers": best.mu.tolist(),
+                "active": [
+                    name
+                    for name, f in zip(self.cell.targets, best.f, strict=True)
+                    if f >= best.f.max() * (1 - 1e-6)
+                ],
+                "distances": [
+                    {
+                        "pair": [self.cell.targets[a], self.cell.targets[b]],
+                        "measured_mm": float(mean) * 1e3,
+                        "tolerance_mm": float(tolerance) * 1e3,
+                        "multiplier": float(lam),
+                    }
+                    for (a, b), mean, tolerance, lam in zip(
+                        self.distances.pairs,
+                        self.distances.mean,
+                        self.distances.tolerance,
+                        best.lam if len(best.lam) else np.zeros(len(self.distances.mean)),
+                        strict=True,
+                    )
+                ],
+                "kkt": vars(best.kkt),
+                "iterations": best.iterations,
+                "trace": [vars(step) for step in best.trace],
+            }
+        return out
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())
+
+
+def finite(value: float) -> float | None:
+    """For JSON: null where there is no finite number."""
+    return value if math.isfinite(value) else None

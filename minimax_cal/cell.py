@@ -1,0 +1,110 @@
+"""A robot in its place: base frame and targets as the instrument sees them; predictions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.data import Measurements
+from minimax_cal.errors import CalibrationError, DataError
+from minimax_cal.files import read_text
+from minimax_cal.gates import check_joints
+from minimax_cal.kinematics import Array
+from minimax_cal.metrics import Accuracy, accuracy
+from minimax_cal.parameters import State
+from minimax_cal.robot import Robot, robot_from_dict
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A robot, its base in the measurement frame, and the targets on its flange.
+
+    base: (4, 4) pose of the base [m].  targets: k names.  spots: (k, 3) in the last frame [m].
+    """
+
+    robot: Robot
+    base: Array
+    targets: tuple[str, ...]
+    spots: Array
+
+    @staticmethod
+    def of(robot: Robot, state: State, targets: tuple[str, ...]) -> Cell:
+        """The cell that a state of the parameters describes."""
+        base = np.eye(4)
+        base[:3, :3], base[:3, 3] = state.rotation, state.origin
+        return Cell(robot.with_mdh(state.mdh), base, targets, state.targets)
+
+    def predict(self, q: Array) -> Array:
+        """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
+        pose = self.base @ self.robot.pose(np.atleast_2d(q))
+        turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.spots)
+        return np.asarray(turned + pose[:, None, :3, 3])
+
+    def error(self, data: Measurements) -> Array:
+        """Measured minus predicted: (k, m, 3), for the targets of the data [m]."""
+        check_joints(self.robot, data)
+        strange = [name for name in data.targets if name not in self.targets]
+        if strange:
+            raise DataError(
+                f"{data.source}: target {strange[0]} is not one of the fit's "
+                f"({', '.join(self.targets)})"
+            )
+        chosen = [self.targets.index(name) for name in data.targets]
+        return np.asarray(np.moveaxis(data.y - self.predict(data.q)[:, chosen], 1, 0))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: millimetres and a rotation vector in radians."""
+        turn = Rotation.from_matrix(self.base[:3, :3]).as_rotvec()
+        return {
+            "base": {
+                "translation_mm": [float(v) * 1e3 for v in self.base[:3, 3]],
+                "rotation_vector_rad": [float(v) for v in turn],
+            },
+            "targets_mm": {
+                name: [float(v) * 1e3 for v in spot]
+                for name, spot in zip(self.targets, self.spots, strict=True)
+            },
+        }
+
+
+def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
+    """A cell from the JSON of a calibration.  Raises CalibrationError."""
+    try:
+        base = np.eye(4)
+        turn = np.array(content["base"]["rotation_vector_rad"], dtype=float)
+        base[:3, :3] = Rotation.from_rotvec(turn.reshape(3)).as_matrix()
+        base[:3, 3] = np.array(content["base"]["translation_mm"], dtype=float).reshape(3) * 1e-3
+        targets = content["targets_mm"]
+        spots = np.array([targets[name] for name in targets], dtype=float).reshape(-1, 3) * 1e-3
+        robot = content["robot"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{source}: is not a saved calibration (robot, base, targets_mm: {error}); "
+            "write one with minimax-cal calibrate -o"
+        ) from error
+    if not (np.all(np.isfinite(base)) and np.all(np.isfinite(spots))):
+        raise CalibrationError(f"{source}: base or targets are not finite numbers")
+    return Cell(robot_from_dict(robot, source), base, tuple(map(str, targets)), spots)
+
+
+def load_cell(path: Path | str) -> Cell:
+    """The calibrated cell of a file that `minimax-cal calibrate -o` wrote."""
+    text = read_text(path)
+    try:
+        content = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise CalibrationError(f"{path}: is not JSON ({error})") from error
+    if not isinstance(content, Mapping):
+        raise CalibrationError(f"{path}: is not a saved calibration")
+    return cell_from_dict(content, str(path))
+
+
+def evaluate(cell: Cell, data: Measurements) -> Accuracy:
+    """Accuracy of a calibrated cell on new measurements in the same measurement frame."""
+    return accuracy(cell.error(data))

@@ -1,0 +1,337 @@
+"""Measurements: what a tracker saw at each pose; CSV in, CSV out."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import hashlib
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.errors import DataError, OptionError
+from minimax_cal.files import read_text, write_whole
+from minimax_cal.kinematics import Array
+
+UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
+JOINT = re.compile(r"q(\d+)_(rad|deg|mm|m)")
+TARGET = re.compile(r"smr(\d+)_([xyz])_(mm|m)")
+# Optional columns that some part of the project understands: pattern, factor to SI by unit.
+OPTIONAL = {
+    name: re.compile(pattern)
+    for name, pattern in {
+        "order": r"order",
+        "time": r"time_(s)",
+        "temperature": r"temperature_(C)",
+        "payload": r"payload_(kg)",
+        "tau": r"tau\d+_(Nm)",
+        "approach": r"approach\d+",
+        "session": r"session",
+        "u95": r"u95_(mm|m)",
+        "pose": r"pose",
+        "split": r"split",
+        "qread": r"qread\d+_(rad|deg|mm|m)",
+        "base": r"base\d+_[xyz]_(mm|m)",
+    }.items()
+}
+TEXT = {"session", "pose", "split"}  # labels, compared but never computed with
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Joint values and the targets seen at each of m poses.
+
+    q: (m, n) joint values as the controller gives them [rad, or m where `sliding`].
+    y: (m, k, 3) targets in the measurement frame, NaN where not measured [m].
+    targets: k names, as smr1.
+    sliding: (n,) True where the joint column has a unit of length.
+    line: (m,) line of the file, for messages.
+    columns: the optional columns by name; numbers in SI, labels as text.
+    notices: what the reader should know about the file.
+    source, digest: path and SHA-256 of the file.
+    """
+
+    q: Array
+    y: Array
+    targets: tuple[str, ...]
+    sliding: Array
+    line: Array
+    columns: Mapping[str, Array]
+    notices: tuple[str, ...] = ()
+    source: str = "measurements"
+    digest: str = ""
+
+    @property
+    def poses(self) -> int:
+        """Number of rows."""
+        return len(self.q)
+
+    @property
+    def seen(self) -> Array:
+        """(m, k) True where a target was measured."""
+        return np.isfinite(self.y[:, :, 0])
+
+    def take(self, rows: Array) -> Measurements:
+        """The measurements at some rows only.  rows: indices or a mask."""
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return replace(self, q=self.q[rows], y=self.y[rows], line=self.line[rows], columns=columns)
+
+    def only(self, target: int) -> Measurements:
+        """One target alone, at the poses where it was measured."""
+        alone = replace(self, y=self.y[:, [target]], targets=(self.targets[target],))
+        return alone.take(self.seen[:, target])
+
+    def with_y(self, y: Array) -> Measurements:
+        """The same poses with other measured points."""
+        return replace(self, y=y)
+
+
+def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
+    """Measurements from arrays.
+
+    q: (m, n) [rad, m].  y: (m, 3) or (m, k, 3), NaN where not measured [m].  columns: optional
+    columns by their file name without the unit (`order`, `u95`), in SI.
+    """
+    q, y = np.array(q, dtype=float), np.array(y, dtype=float)
+    y = y[:, None, :] if y.ndim == 2 else y
+    if q.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or len(q) != len(y):
+        raise DataError(f"q must be (m, n) and y (m, k, 3); got {q.shape} and {y.shape}")
+    names = tuple(f"smr{i + 1}" for i in range(y.shape[1]))
+    sliding = np.zeros(q.shape[1], dtype=bool)
+    extra = {name: np.asarray(column) for name, column in columns.items()}
+    return check_finite(Measurements(q, y, names, sliding, np.arange(len(q)) + 1, extra))
+
+
+def check_finite(data: Measurements) -> Measurements:
+    """The data, if every joint value is a number and every point whole.  Raises DataError."""
+    if not len(data.q):
+        raise DataError(f"{data.source}: holds no poses")
+    if not np.all(np.isfinite(data.q)):
+        row, joint = np.argwhere(~np.isfinite(data.q))[0]
+        raise DataError(f"{data.source}:{data.line[row]}: joint {joint + 1} is not a finite number")
+    broken = np.isinf(data.y).any(-1) | (np.isnan(data.y).any(-1) != np.isnan(data.y).all(-1))
+    if broken.any():
+        row, target = np.argwhere(broken)[0]
+        raise DataError(
+            f"{data.source}:{data.line[row]}: {data.targets[target]} has some of x, y, z only; "
+            "give all three, or leave all three empty where it was not measured"
+        )
+    return data
+
+
+def read_measurements(path: Path | str) -> Measurements:
+    """Read a CSV file of measurements as the contract describes it.  Raises DataError."""
+    text = read_text(path, kind=DataError)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    if "\0" in text:
+        raise DataError(f"{path}: is not a text file; expected CSV")
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise DataError(f"{path}:{reader.line_num}: is not CSV ({error})") from error
+    rows = [(number, row) for number, row in lines if any(row)]
+    if not rows:
+        raise DataError(f"{path}: is empty")
+    (_, header), *body = rows
+    while header and not header[-1]:  # a trailing comma
+        header.pop()
+    header_check(path, header)
+    for at, row in body:
+        if len(row) < len(header) or any(row[len(header) :]):
+            raise DataError(f"{path}:{at}: {len(row)} cells, but the header has {len(header)}")
+    if not body:
+        raise DataError(f"{path}: holds a header but no rows")
+    cells = {name: [row[i] for _, row in body] for i, name in enumerate(header)}
+    line = np.array([number for number, _ in body])
+
+    def number(name: str, *, unit: str = "", empty: bool = False) -> Array:
+        return numbers(path, name, cells[name], line, empty=empty) * UNITS.get(unit, 1.0)
+
+    joints = sorted((int(m[1]), m[2], name) for name in header if (m := JOINT.fullmatch(name)))
+    q = np.stack([number(name, unit=unit) for _, unit, name in joints], axis=1)
+    found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
+    y = np.full((len(body), len(found), 3), np.nan)
+    for name in header:
+        if m := TARGET.fullmatch(name):
+            y[:, found.index(int(m[1])), "xyz".index(m[2])] = number(name, unit=m[3], empty=True)
+    columns: dict[str, Array] = {}
+    unknown: list[str] = []
+    for name in header:
+        kind, match = optional_kind(name)
+        if kind in TEXT:
+            columns[name] = np.array(cells[name])
+        elif match:
+            unit = match[1] if match.re.groups else ""
+            stem = name.removesuffix(f"_{unit}")
+            columns[stem] = number(name, unit=unit, empty=True)
+        elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
+            columns[name] = np.array(cells[name])
+            unknown.append(name)
+    notices = [f"{path}: column {name} is not used{near(name)}" for name in unknown]
+    data = Measurements(
+        q=q,
+        y=y,
+        targets=tuple(f"smr{i}" for i in found),
+        sliding=np.array([unit in ("m", "mm") for _, unit, _ in joints]),
+        line=line,
+        columns=columns,
+        source=str(path),
+        digest=digest,
+    )
+    check_finite(data)
+    blind = np.asarray(~data.seen.any(axis=1))
+    if blind.all():
+        raise DataError(f"{path}: no target was measured at any pose")
+    if blind.any():
+        notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
+    return replace(data.take(~blind), notices=tuple(notices))
+
+
+def header_check(path: Path | str, header: list[str]) -> None:
+    """Raise DataError for a header that cannot be understood."""
+    joints = [m for name in header if (m := JOINT.fullmatch(name))]
+    targets = [m for name in header if (m := TARGET.fullmatch(name))]
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise DataError(f"{path}:1: column {twice[0] or '(without a name)'} stands twice")
+    if not joints:
+        hint = "; is it separated by ';'? save it with commas" if ";" in header[0] else ""
+        raise DataError(
+            f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"
+        )
+    numbers_found = sorted(int(m[1]) for m in joints)
+    missing = sorted(set(range(1, numbers_found[-1] + 1)) - set(numbers_found))
+    if missing:
+        raise DataError(f"{path}:1: column q{missing[0]}_{joints[0][2]} is missing")
+    if len(set(numbers_found)) < len(numbers_found):
+        raise DataError(f"{path}:1: a joint has two columns; keep one unit for each joint")
+    if {"rad", "deg"} <= {m[2] for m in joints}:
+        raise DataError(f"{path}:1: joint columns mix _rad and _deg; use one of them")
+    if not targets:
+        raise DataError(f"{path}:1: no target columns; name them smr1_x_mm, smr1_y_mm, smr1_z_mm")
+    for number in sorted({int(m[1]) for m in targets}):
+        axes = [m[2] for m in targets if int(m[1]) == number]
+        unit = next(m[3] for m in targets if int(m[1]) == number)
+        for axis in "xyz":
+            if axes.count(axis) != 1:
+                fault = "is missing" if axis not in axes else "is given in two units"
+                raise DataError(f"{path}:1: column smr{number}_{axis}_{unit} {fault}")
+
+
+def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:
+    """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
+    out = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        if not cell and empty:
+            continue
+        try:
+            out[i] = float(cell)
+        except ValueError:
+            what = f"{cell!r} is not a number" if cell else "is empty"
+            comma = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
+            raise DataError(f"{path}:{line[i]}: column {name}: {what}{comma}") from None
+        if not np.isfinite(out[i]):
+            mend = "; leave the cell empty where it was not measured" if empty else ""
+            raise DataError(f"{path}:{line[i]}: column {name}: {cell} is not a finite number{mend}")
+    return out
+
+
+def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
+    """Which optional column a name is, or ''."""
+    for kind, pattern in OPTIONAL.items():
+        if match := pattern.fullmatch(name):
+            return kind, match
+    return "", None
+
+
+def near(name: str) -> str:
+    """A hint when a column's name is close to one that would be used."""
+    known = ["order", "time_s", "temperature_C", "payload_kg", "session", "u95_mm", "pose", "split"]
+    known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
+    known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
+    match = difflib.get_close_matches(name, known, 1, cutoff=0.75)
+    return f" (did you mean {match[0]}?)" if match else ""
+
+
+def write_measurements(path: Path | str, data: Measurements) -> None:
+    """Write CSV as the contract describes it: radians (mm for slides) and millimetres."""
+    joints, k = data.q.shape[1], len(data.targets)
+    header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
+    header += [f"{name}_{axis}_mm" for name in data.targets for axis in "xyz"]
+    named = {name: file_column(name) for name in data.columns}
+    header += [name for name, _ in named.values()]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    for j in range(data.poses):
+        q = data.q[j] * np.where(data.sliding, 1e3, 1.0)
+        y = data.y[j].reshape(3 * k) * 1e3
+        row = [f"{value:.9f}" for value in q]
+        row += ["" if np.isnan(value) else f"{value:.6f}" for value in y]
+        for name, column in data.columns.items():
+            value = column[j]
+            text = isinstance(value, str)
+            row.append(str(value) if text else f"{float(value) * named[name][1]:.9g}")
+        writer.writerow(row)
+    write_whole(path, stream.getvalue())
+
+
+def file_column(stem: str) -> tuple[str, float]:
+    """Name with its unit, and the factor from SI, of an optional column."""
+    exact = {"time": "_s", "temperature": "_C", "payload": "_kg"}
+    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]", stem):
+        return f"{stem}_mm", 1e3
+    if re.fullmatch(r"tau\d+", stem):
+        return f"{stem}_Nm", 1.0
+    if re.fullmatch(r"qread\d+", stem):
+        return f"{stem}_rad", 1.0
+    return stem + exact.get(stem, ""), 1.0
+
+
+def groups(data: Measurements) -> Array:
+    """(m,) a number for each pose: rows with the same joints or the same `pose` share it."""
+    _, group = np.unique(np.round(data.q, 9), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    if "pose" in data.columns:
+        labels = data.columns["pose"]
+        for label in np.unique(labels[labels != ""]):
+            same = np.isin(group, group[labels == label])
+            group[same] = group[same].min()
+    return np.asarray(group)
+
+
+def split(
+    data: Measurements, holdout: float, seed: int
+) -> tuple[Measurements, Measurements, tuple[str, ...]]:
+    """Training and held-out poses, and notices.
+
+    A `split` column decides where there is one; else a seeded random share of the poses is held
+    out, all rows of a pose together.  Raises OptionError, DataError.
+    """
+    if not 0.0 <= holdout < 1.0:
+        raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
+    if "split" in data.columns:
+        labels = np.char.lower(data.columns["split"].astype(str))
+        odd = ~np.isin(labels, ("train", "holdout"))
+        if odd.any():
+            row = int(np.argmax(odd))
+            label = str(data.columns["split"][row])
+            raise DataError(
+                f"{data.source}:{data.line[row]}: column split: {label!r} is neither train nor "
+                "holdout"
+            )
+        held = labels == "holdout"
+        if held.all():
+            raise DataError(f"{data.source}: column split leaves no row for training")
+        return data.take(~held), data.take(held), ("the split column decides what is held out",)
+    group = groups(data)
+    poses = np.unique(group)
+    count = round(holdout * len(poses))
+    chosen = np.random.default_rng(seed).permutation(poses)[:count]
+    held = np.isin(group, chosen)
+    return data.take(~held), data.take(held), ()

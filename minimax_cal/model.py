@@ -1,0 +1,370 @@
+"""The bridge from robot and measurements to numbers: errors, normal equations, separable split.
+
+The Jacobian of all points is never stored: poses are taken in blocks that fit the cache, and each
+block adds to the normal equations of its target.  Sums over thousands of poses then cost what the
+arithmetic costs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal import kinematics
+from minimax_cal.data import Measurements
+from minimax_cal.kinematics import Array, Chain
+from minimax_cal.parameters import Names, State, links_of
+from minimax_cal.robot import Robot
+from minimax_cal.solvers.least_squares import solve_normal
+
+BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Sums of squares and their normal equations, for each target.
+
+    cost: (..., k) F_i = sum_j w_ij |e_ij|^2 [m^2].
+    slope: (..., k, p) J_i' W e_i, so that the gradient of F_i is -2 slope_i.
+    gram: (..., k, p, p) J_i' W J_i.
+    """
+
+    cost: Array
+    slope: Array
+    gram: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some poses and the chain of the arm there."""
+
+    rows: slice
+    links: Chain
+
+    @cached_property
+    def screws(self) -> tuple[Array, Array]:
+        """See `kinematics.screws`."""
+        return kinematics.screws(self.links)
+
+    def stretched(self, state: State, model: Model) -> Block:
+        """The same poses with other lengths, angles as they were."""
+        q = model.q[self.rows]
+        return Block(self.rows, kinematics.stretch(self.links, state.mdh, q, model.prismatic))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian knowledge about parameters: mean (p,) and weight (p,) = noise^2 / sigma^2."""
+
+    mean: Array
+    weight: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot at given poses, and what was measured there.
+
+    q: (m, n) joint values with signs applied.  prismatic: (n,).
+    y: (k, 3, m) measured points, 0 where not measured [m].
+    weight: (k, m) weight of each point, 0 where not measured.
+    names: the parameters.  active: (p,) True where a parameter is free.
+    prior: on the parameters, in the order of `names`.
+    """
+
+    q: Array
+    prismatic: Array
+    y: Array
+    weight: Array
+    names: Names
+    active: Array
+    prior: Prior
+
+    @property
+    def counts(self) -> Array:
+        """(k,) at how many poses each target was measured."""
+        return np.asarray(np.count_nonzero(self.weight, axis=1))
+
+    @cached_property
+    def seen(self) -> Array:
+        """(k, m) True where a target was measured."""
+        return np.asarray(self.weight > 0.0)
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether every weight is one."""
+        return bool(np.all(self.weight == 1.0))
+
+    def only(self, active: Array) -> Model:
+        """The same model with other free parameters."""
+        return replace(self, active=active)
+
+    def with_prior(self, prior: Prior) -> Model:
+        """The same model with another prior."""
+        return replace(self, prior=prior)
+
+    def emphasise(self, share: Array) -> Model:
+        """The same model with the points of target i weighted by share_i too.  share: (k,)."""
+        return replace(self, weight=self.weight * share[:, None])
+
+    def error(self, state: State) -> Array:
+        """Measured minus predicted, in base axes: (..., k, m, 3), NaN where not measured [m]."""
+        links = kinematics.chain(state.mdh, self.q, self.prismatic)
+        error = in_base(state, self.y) - kinematics.points(links, state.targets)
+        error = np.swapaxes(error, -1, -2)
+        error[..., ~self.seen, :] = np.nan
+        return np.asarray(error)
+
+    def jacobian(self, state: State) -> Array:
+        """Derivative of every point, in base axes, by every parameter: (..., k, m, 3, p)."""
+        links = kinematics.chain(state.mdh, self.q, self.prismatic)
+        point = kinematics.points(links, state.targets)
+        every = np.ones(self.names.count, dtype=bool)
+        turned = Columns.of(self.names, every).jacobian(Block(slice(0), links), point)
+        return np.asarray(np.swapaxes(np.moveaxis(turned, -3, -1), -3, -2))
+
+    def blocks(self, state: State) -> list[Block]:
+        """The poses cut into blocks that fit the cache, each with its chain."""
+        robots = int(np.prod(state.mdh.shape[:-2]))
+        m = len(self.q)
+        parts = -(-m * robots * len(self.y) // BLOCK)
+        edges = np.linspace(0, m, min(parts, m) + 1).astype(int)
+        rows = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
+        q, flat = self.q, self.prismatic
+        return [Block(part, kinematics.chain(state.mdh, q[part], flat)) for part in rows]
+
+    def error_of(self, state: State, block: Block) -> tuple[Array, Array]:
+        """Weighted errors and predicted points of one block: (..., k, 3, c) each [m]."""
+        point = kinematics.points(block.links, state.targets)
+        error = in_base(state, self.y[..., block.rows]) - point
+        if not self.even:
+            error *= np.sqrt(self.weight[:, None, block.rows])
+        return error, point
+
+    def cost(self, state: State) -> Array:
+        """F_i: (..., k) [m^2], the prior left out."""
+        total = np.zeros(1)
+        for block in self.blocks(state):
+            error, _ = self.error_of(state, block)
+            total = total + np.einsum("...kcm,...kcm->...k", error, error)
+        return np.asarray(total)
+
+    def normal(self, state: State, active: Array) -> Normal:
+        """Normal equations for the parameters that are True in active (p,), at a state."""
+        return self.normal_on(state, active, self.blocks(state))
+
+    def normal_on(self, state: State, active: Array, blocks: list[Block]) -> Normal:
+        """`normal` with the chains at hand."""
+        select = Columns.of(self.names, active)
+        cost, slope, gram = np.zeros((3, 1))
+        for block in blocks:
+            error, point = self.error_of(state, block)
+            turned = select.jacobian(block, point)
+            if not self.even:
+                turned *= np.sqrt(self.weight[:, None, None, block.rows])
+            *batch, k, p, _, c = turned.shape
+            flat = turned.reshape(*batch, k, p, 3 * c)
+            cost = cost + np.einsum("...kcm,...kcm->...k", error, error)
+            slope = slope + (flat @ error.reshape(*batch, k, 3 * c, 1))[..., 0]
+            gram = gram + flat @ np.swapaxes(flat, -1, -2)
+        return Normal(np.asarray(cost), np.asarray(slope), np.asarray(gram))
+
+    def coupling_on(self, state: State, blocks: list[Block]) -> Array:
+        """M = sum of w e . d2x/(dr domega) for free lengths r and angles omega: (..., r, omega).
+
+        The part of the variable-projection Jacobian that Kaufman leaves out [paper S, eq. 24].
+        """
+        names, active = self.names, self.active
+        n, k = names.joints, len(names.targets)
+        linear = names.linear
+        total = np.zeros(1)
+        for block in blocks:
+            links = block.links
+            error, _ = self.error_of(state, block)
+            if not self.even:
+                error = error * np.sqrt(self.weight[:, None, block.rows])
+            *batch, _, _, c = error.shape
+            axis, _ = block.screws
+            base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
+            axis = np.concatenate([axis, base], axis=-3)  # theta, alpha, beta, base rotation
+            part = np.zeros((*batch, 2 * n + 3 + 3 * k, 3 * n + 3))
+            pull = kinematics.cross(error.sum(-3)[..., None, :, :], axis)
+            flat = np.swapaxes(pull.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
+            lengths = np.concatenate([links.x, links.z], axis=-3)
+            part[..., : 2 * n, :] = lengths.reshape(*batch, 2 * n, 3 * c) @ flat
+            turned = links.axes.reshape(*batch, 3, 3 * c)
+            for i in range(k):
+                own = kinematics.cross(error[..., i, None, :, :], axis)
+                flat = np.swapaxes(own.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
+                part[..., 2 * n + 3 + 3 * i : 2 * n + 6 + 3 * i, :] = turned @ flat
+            total = total + part
+        coupled = total * precedes(n, k)
+        return np.asarray(coupled[..., active[linear], :][..., active[~linear]])
+
+    def values(self, state: State) -> Array:
+        """(..., p) the parameters' values; base rotation entries are 0 (they are steps only)."""
+        *batch, n, _ = state.mdh.shape
+        k = state.targets.shape[-2]
+        links = np.swapaxes(state.mdh, -1, -2).reshape(*batch, 5 * n)
+        base = np.concatenate([state.origin, np.zeros((*batch, 3))], axis=-1)
+        return np.concatenate([links, base, state.targets.reshape(*batch, 3 * k)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SumOfSquares:
+    """The sum of F_i over all targets, plus the prior: separable in the free parameters."""
+
+    model: Model
+
+    @property
+    def linear(self) -> Array:
+        """(free,) True for lengths."""
+        return np.asarray(self.model.names.linear[self.model.active])
+
+    def normal(self, x: State) -> tuple[Array, Array, Array]:
+        """Cost (...), slope (..., free) and Gram matrix (..., free, free)."""
+        return self.normal_on(x, self.model.active, self.model.blocks(x))
+
+    def normal_on(self, x: State, active: Array, blocks: list[Block]) -> tuple[Array, Array, Array]:
+        """The same over any choice of parameters, with the chains at hand."""
+        normal, prior = self.model.normal_on(x, active, blocks), self.model.prior
+        off = prior.mean - self.model.values(x)
+        weight = prior.weight[active]
+        cost = normal.cost.sum(-1) + (prior.weight * off**2).sum(-1)
+        slope = normal.slope.sum(-2) + weight * off[..., active]
+        return cost, slope, normal.gram.sum(-3) + np.diag(weight)
+
+    def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
+        """The states with their best free lengths [paper S, eq. 18], `normal` there, and M.
+
+        full: whether to compute the coupling M (..., r, omega); zeros otherwise.
+        """
+        model = self.model
+        lengths = model.active & model.names.linear
+        blocks = model.blocks(x)
+        _, slope, gram = self.normal_on(x, lengths, blocks)
+        dx = np.zeros((*slope.shape[:-1], model.names.count))
+        dx[..., lengths] = solve_normal(gram, slope[..., None])[..., 0]
+        x = x.step(dx)
+        blocks = [block.stretched(x, model) for block in blocks]
+        found = self.normal_on(x, model.active, blocks)
+        free = self.linear
+        nothing = np.zeros((*slope.shape[:-1], free.sum(), (~free).sum()))
+        return x, *found, model.coupling_on(x, blocks) if full else nothing
+
+    def cost(self, x: State) -> Array:
+        """The sum alone: (...)."""
+        off = self.model.prior.mean - self.model.values(x)
+        return np.asarray(self.model.cost(x).sum(-1) + (self.model.prior.weight * off**2).sum(-1))
+
+    def step(self, x: State, dx: Array) -> State:
+        """The states moved by a step in the free parameters."""
+        full = np.zeros((*dx.shape[:-1], self.model.names.count))
+        full[..., self.model.active] = dx
+        return x.step(full)
+
+
+def in_base(state: State, y: Array) -> Array:
+    """Measured points in base axes: (..., k, 3, m).  y: (k, 3, m) in the measurement frame."""
+    centred = y - state.origin[..., None, :, None]
+    return np.asarray(np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ centred)
+
+
+def precedes(n: int, k: int) -> Array:
+    """(r, omega) True where turning angle omega turns the direction of length r."""
+    link = np.arange(n)
+    length = np.concatenate([3 * link + 1, 3 * link, np.full(3, -9), np.full(3 * k, 3 * n)])
+    angle = np.concatenate([3 * link, 3 * link + 1, 3 * link + 2, np.full(3, -1)])
+    return np.asarray(angle[None, :] <= length[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Which columns a Jacobian has and where they come from."""
+
+    count: int
+    lengths: Array
+    angles: Array
+    base: Array
+    targets: Array
+    targets_at: int
+    angles_at: int
+    joints: int
+
+    @staticmethod
+    def of(names: Names, active: Array) -> Columns:
+        """The columns of the active parameters, in order."""
+        n = names.joints
+        base = np.flatnonzero(active[5 * n : 5 * n + 3])
+        turns = np.flatnonzero(active[5 * n + 3 : 5 * n + 6])
+        lengths = np.flatnonzero(active[: 2 * n])
+        angles = np.flatnonzero(active[2 * n : 5 * n])
+        targets = np.flatnonzero(active[5 * n + 6 :])
+        count = sum(map(len, (lengths, angles, base, turns, targets)))
+        return Columns(
+            count,
+            lengths,
+            np.concatenate([angles, 3 * n + turns]),
+            base,
+            targets,
+            count - len(targets),
+            len(lengths),
+            len(angles),
+        )
+
+    def jacobian(self, block: Block, point: Array) -> Array:
+        """Transposed derivative of points (..., k, 3, c): (..., k, p, 3, c), base axes."""
+        *batch, k, _, c = point.shape
+        links = block.links
+        n = links.x.shape[-3]
+        out = np.empty((*batch, k, self.count, 3, c), dtype=point.dtype)
+        for column, which in enumerate(self.lengths):
+            source = links.x if which < n else links.z
+            out[..., column, :, :] = source[..., None, which % n, :, :]
+        if len(self.angles):
+            axis, moment = block.screws
+            still = np.zeros((*batch, 3, 3, c), dtype=point.dtype)
+            axis = np.concatenate([axis, still + np.eye(3)[..., None]], axis=-3)
+            moment = np.concatenate([moment, still], axis=-3)
+            axis, moment = axis[..., self.angles, :, :], moment[..., self.angles, :, :]
+            turned = moment[..., None, :, :, :] - kinematics.cross(
+                point[..., None, :, :], axis[..., None, :, :, :]
+            )
+            at = self.angles_at
+            out[..., at : at + self.joints, :, :] = turned[..., : self.joints, :, :]
+            at += self.joints + len(self.base)
+            out[..., at : self.targets_at, :, :] = turned[..., self.joints :, :, :]
+        at = self.angles_at + self.joints
+        out[..., at : at + len(self.base), :, :] = np.eye(3)[self.base][..., None]
+        out[..., self.targets_at :, :, :] = 0.0
+        for column, which in enumerate(self.targets, start=self.targets_at):
+            target, axis_number = divmod(int(which), 3)
+            out[..., target, column, :, :] = links.axes[..., axis_number, :, :]
+        return out
+
+
+def model_of(robot: Robot, data: Measurements) -> Model:
+    """The model of a robot at the measured poses, all parameters free, no prior.
+
+    Points are weighted by (typical u95 / u95)^2 where the data have a `u95` column.
+    """
+    seen = data.seen.T
+    weight = seen.astype(float)
+    if "u95" in data.columns:
+        u95 = data.columns["u95"]
+        usual = np.nanmedian(u95)
+        weight = weight * np.where(np.isfinite(u95), (usual / u95) ** 2, 1.0)
+    names = Names(robot.joints, data.targets)
+    mean = np.zeros(names.count)
+    mean[names.links] = links_of(robot.mdh)
+    return Model(
+        q=data.q * robot.sign,
+        prismatic=robot.prismatic,
+        y=np.where(seen[:, None], np.moveaxis(data.y, 0, 2), 0.0),
+        weight=weight,
+        names=names,
+        active=np.ones(names.count, dtype=bool),
+        prior=Prior(mean, np.zeros(names.count)),
+    )

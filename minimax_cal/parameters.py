@@ -1,0 +1,128 @@
+"""Which numbers describe a calibrated cell: names, kinds, units, and how a step changes them.
+
+The order is fixed: all a, all d, all theta, all alpha, all beta, the base frame's translation and
+rotation, then the targets.  Base steps are taken in the base's own axes, so that nothing depends on
+where the measuring instrument stands.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from minimax_cal import kinematics
+from minimax_cal.errors import OptionError
+from minimax_cal.kinematics import MDH_NAMES, Array
+
+BASE_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A geometry, the base in the measurement frame, and the targets; ``...`` is a batch.
+
+    mdh: (..., n, 5) [m, rad].  rotation: (..., 3, 3), origin: (..., 3) [m], pose of the base.
+    targets: (..., k, 3) in the last frame [m].
+    """
+
+    mdh: Array
+    rotation: Array
+    origin: Array
+    targets: Array
+
+    def step(self, dx: Array) -> State:
+        """The state moved by dx (..., p), all parameters in the order of `Names`."""
+        n, k = self.mdh.shape[-2], self.targets.shape[-2]
+        batch = dx.shape[:-1]
+        links = np.swapaxes(dx[..., : 5 * n].reshape(*batch, 5, n), -1, -2)
+        move, turn, shift = np.split(dx[..., 5 * n :], (3, 6), axis=-1)
+        return State(
+            mdh=self.mdh + links,
+            rotation=self.rotation @ kinematics.rotation(turn),
+            origin=self.origin + (self.rotation @ move[..., None])[..., 0],
+            targets=self.targets + shift.reshape(*batch, k, 3),
+        )
+
+    def take(self, rows: Array) -> State:
+        """Some members of a batch."""
+        return State(self.mdh[rows], self.rotation[rows], self.origin[rows], self.targets[rows])
+
+    def put(self, rows: Array, other: State) -> State:
+        """The batch with some members replaced."""
+        out = replace(
+            self,
+            mdh=self.mdh.copy(),
+            rotation=self.rotation.copy(),
+            origin=self.origin.copy(),
+            targets=self.targets.copy(),
+        )
+        out.mdh[rows], out.rotation[rows] = other.mdh, other.rotation
+        out.origin[rows], out.targets[rows] = other.origin, other.targets
+        return out
+
+    def batch(self) -> State:
+        """A single state as a batch of one."""
+        return State(self.mdh[None], self.rotation[None], self.origin[None], self.targets[None])
+
+    def repeat(self, count: int) -> State:
+        """A single state, count times."""
+        return self.batch().take(np.zeros(count, dtype=int))
+
+
+@dataclass(frozen=True)
+class Names:
+    """The parameters of an arm with n joints seen through some targets."""
+
+    joints: int
+    targets: tuple[str, ...]
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..."""
+        links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
+        spots = [f"{target}_{axis}" for target in self.targets for axis in "xyz"]
+        return (*links, *BASE_NAMES, *spots)
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return 5 * self.joints + 6 + 3 * len(self.targets)
+
+    @property
+    def linear(self) -> Array:
+        """(p,) True for lengths: positions are affine in them [paper S, eq. 11]."""
+        n = self.joints
+        mask = np.ones(self.count, dtype=bool)
+        mask[2 * n : 5 * n] = False
+        mask[5 * n + 3 : 5 * n + 6] = False
+        return mask
+
+    @property
+    def links(self) -> Array:
+        """(p,) True for the robot's own parameters, False for base and targets."""
+        return np.arange(self.count) < 5 * self.joints
+
+    def index(self, name: str) -> int:
+        """Place of a name."""
+        return self.all.index(name)
+
+    def match(self, patterns: Iterable[str], option: str) -> Array:
+        """(p,) True where a name matches a pattern, as ``beta*``.  Raises OptionError."""
+        names, chosen = self.all, np.zeros(self.count, dtype=bool)
+        for pattern in patterns:
+            hits = np.array([fnmatchcase(name, pattern) for name in names])
+            if not hits.any():
+                close = difflib.get_close_matches(pattern, names, 1)
+                hint = f"did you mean {close[0]}?" if close else "try a1, theta2, beta*, base_z"
+                raise OptionError(f"{option}: no parameter called {pattern!r}; {hint}")
+            chosen |= hits
+        return chosen
+
+
+def links_of(mdh: Array) -> Array:
+    """Link parameters of an MDH table in the order of `Names`: (5n,)."""
+    return np.asarray(mdh.T.reshape(-1))

@@ -1,0 +1,1 @@
+"""Solvers that know no robot: separable least squares and minimax SQP."""

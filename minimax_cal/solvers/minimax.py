@@ -1,0 +1,410 @@
+"""Minimax by sequential quadratic programming on the epigraph QP [paper M, eq. 10-13].
+
+    min over x of  max_i f_i(x)   subject to   lower <= c(x) <= upper
+
+Each step solves  min 1/2 d'Hd + v,  f + f'd - max f <= v,  lower - c <= c'd <= upper - c  with any
+QP solver.  Globalisation (the paper has none): a line search on max f + penalty * violation, with a
+second-order correction where the curvature of the active pieces spoils the full step [Maratos
+effect; Nocedal and Wright, Numerical Optimization, ch. 18], and damping of H as the last resort.
+The solver knows no robot; problem and iterate are the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from minimax_cal.solvers.status import Status
+from qp_backends import Problem, Solution
+
+Array = np.ndarray[Any, np.dtype[Any]]
+X = TypeVar("X")
+Solver = Callable[[Problem], Solution]
+
+HESSIANS = ("gauss-newton", "bfgs")
+
+# Differences of the merit function below this, relative, are rounding: the model is trusted there.
+ROUNDING = 1e-12
+PATIENCE = 10  # iterations without progress in value or optimality before giving up
+RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
+NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
+
+# P_vv of the epigraph variable: makes P definite for solvers that ask for it.  v is the decrease
+# that is still to be had, so the term vanishes at the solution and does not move it.
+EPIGRAPH = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Values and first derivatives at a point.
+
+    f: (k,).  slope: (k, p) of f.  c: (l,).  normal: (l, p) of c.
+    curvature: (k, p, p) second derivatives of the f_i, or (0, p, p) when BFGS is to find them.
+    """
+
+    f: Array
+    slope: Array
+    c: Array
+    normal: Array
+    curvature: Array
+
+
+class Minimax(Protocol[X]):
+    """A smooth max-of-functions problem with two-sided constraints."""
+
+    @property
+    def lower(self) -> Array:
+        """(l,) -inf where open."""
+
+    @property
+    def upper(self) -> Array:
+        """(l,) inf where open."""
+
+    def evaluate(self, x: X) -> tuple[Array, Array]:
+        """f (k,) and c (l,)."""
+
+    def linearise(self, x: X) -> Linear:
+        """f, c and their derivatives."""
+
+    def step(self, x: X, d: Array) -> X:
+        """The point moved by d (p,)."""
+
+
+@dataclass(frozen=True)
+class Sqp:
+    """Settings of the SQP.
+
+    tolerance: on stationarity, complementarity and violation (problem scaled to about one).
+    iterations: at most so many QPs.  floor: least weight of a function in the Gauss-Newton
+    Hessian, which an inactive function would otherwise leave singular.
+    hessian: "gauss-newton" (weighted by the multipliers) or "bfgs" (damped, Powell).
+    """
+
+    tolerance: float = 1e-8
+    iterations: int = 200
+    floor: float = 1e-3
+    hessian: str = "gauss-newton"
+
+
+@dataclass(frozen=True)
+class Kkt:
+    """How far from optimal: all three are zero at a Karush-Kuhn-Tucker point.
+
+    stationarity: largest entry of sum mu_i f_i' + sum lambda_l c_l'.
+    complementarity: sum mu_i (max f - f_i) + sum |lambda_l| (distance of c_l to its bound).
+    violation: largest violation of a constraint.
+    """
+
+    stationarity: float
+    complementarity: float
+    violation: float
+
+    @property
+    def residual(self) -> float:
+        """The largest of the three."""
+        return max(self.stationarity, self.complementarity, self.violation)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the iteration trace; `backend` is the QP solver that really answered."""
+
+    iteration: int
+    value: float
+    violation: float
+    kkt: float
+    length: float
+    backend: str
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum(Generic[X]):
+    """x with its f (k,), c (l,), multipliers mu (k,) that sum to one and lambda (l,).
+
+    lambda is > 0 at an upper bound and < 0 at a lower one.
+    """
+
+    x: X
+    f: Array
+    c: Array
+    mu: Array
+    lam: Array
+    kkt: Kkt
+    iterations: int
+    status: Status
+    trace: tuple[Step, ...] = ()
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def value(self) -> float:
+        """max f."""
+        return float(self.f.max())
+
+
+def solve(
+    problem: Minimax[X],
+    x: X,
+    qp: Solver,
+    settings: Sqp = Sqp(),
+    progress: Callable[[int, float], None] = lambda iteration, value: None,
+) -> Optimum[X]:
+    """Minimise max f from x.  qp: a QP solver whose answers are already verified."""
+    lower, upper = problem.lower, problem.upper
+    here = problem.linearise(x)
+    k, p = here.slope.shape
+    mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
+    quasi = Bfgs.start(here, p)
+    exact = settings.hessian == "gauss-newton" and len(here.curvature) > 0
+    penalty, damping = 0.0, 0.0
+    status = Status.ITERATION_LIMIT
+    trace: list[Step] = []
+    notes: list[str] = []
+    kkt = optimality(here, mu, lam, lower, upper)
+    best, lowest, idle = np.inf, np.inf, 0
+    for iteration in range(1, settings.iterations + 1):
+        if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.slope))):
+            status = Status.FAILED
+            break
+        hessian = weighted(here.curvature, mu, settings.floor) if exact else quasi.matrix
+        hessian = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-8))
+
+        def resolve(f: Array, c: Array, here: Linear = here, hessian: Array = hessian) -> Plan:
+            bent = replace(here, f=f, c=c)
+            return subproblem(bent, hessian, lower, upper, qp, penalty)  # noqa: B023
+
+        plan = resolve(here.f, here.c)
+        notes += [note for note in plan.notes if note not in notes]
+        if not plan.usable:
+            status = Status.FAILED
+            break
+        mu, lam = plan.mu, plan.lam
+        kkt = optimality(here, mu, lam, lower, upper)
+        if plan.relaxed:
+            penalty = max(penalty, plan.penalty)
+            if hopeless(here, plan, lower, upper, settings.tolerance):
+                if penalty > RELENTLESS * max(1.0, float(np.abs(here.slope).max())):
+                    status = Status.INFEASIBLE
+                    break
+                penalty *= 10.0
+        else:
+            penalty = max(penalty, 1.5 * float(np.abs(lam).max(initial=0.0)))
+        length, move, there = 0.0, np.zeros(p), here
+        if kkt.residual > settings.tolerance:
+            length, move, there = search(problem, x, here, plan, penalty, resolve)
+        trace.append(
+            Step(iteration, float(here.f.max()), kkt.violation, kkt.residual, length, plan.backend)
+        )
+        progress(iteration, float(here.f.max()))
+        if kkt.residual <= settings.tolerance:
+            status = Status.CONVERGED
+            break
+        if kkt.residual < 0.9 * best or here.f.max() < lowest - ROUNDING * abs(lowest):
+            best, lowest, idle = min(best, kkt.residual), float(here.f.max()), 0
+        else:
+            idle += 1
+        if idle >= PATIENCE and kkt.violation <= settings.tolerance:
+            good = kkt.residual <= NEARLY * settings.tolerance
+            status = Status.CONVERGED if good else Status.STALLED
+            break
+        if length == 0.0:
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e8:
+                status = Status.STALLED
+                break
+            continue
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
+        x = problem.step(x, move)
+        before, here = here, there
+        quasi = quasi if exact else quasi.update(move, before, here, mu, lam)
+        kkt = optimality(here, mu, lam, lower, upper)
+        if kkt.residual <= settings.tolerance:
+            status = Status.CONVERGED
+            break
+    return Optimum(x, here.f, here.c, mu, lam, kkt, len(trace), status, tuple(trace), tuple(notes))
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """An answer of the QP: step d, multipliers, and which backend gave it."""
+
+    d: Array
+    mu: Array
+    lam: Array
+    usable: bool
+    backend: str
+    notes: tuple[str, ...]
+    relaxed: bool
+    penalty: float
+
+
+Resolve = Callable[[Array, Array], Plan]
+
+
+def subproblem(
+    here: Linear, hessian: Array, lower: Array, upper: Array, qp: Solver, penalty: float
+) -> Plan:
+    """Solve the epigraph QP; if its constraints contradict each other, their elastic relaxation."""
+    plain = epigraph(here, hessian, lower, upper)
+    answer = qp(plain)
+    if answer.solved or not len(here.c):
+        return read(answer, here, relaxed=False, penalty=0.0)
+    weight = max(penalty, 1e2 * float(np.abs(here.slope).max(initial=1.0)))
+    return read(qp(elastic(plain, len(here.f), weight)), here, relaxed=True, penalty=weight)
+
+
+def epigraph(here: Linear, hessian: Array, lower: Array, upper: Array) -> Problem:
+    """min 1/2 d'Hd + v with rows f - max f + f'd <= v and lower - c <= c'd <= upper - c."""
+    k, p = here.slope.shape
+    rows = np.zeros((k + len(here.c), p + 1))
+    rows[:k, :p], rows[:k, p], rows[k:, :p] = here.slope, -1.0, here.normal
+    quadratic = np.zeros((p + 1, p + 1))
+    quadratic[:p, :p] = hessian
+    quadratic[p, p] = EPIGRAPH
+    linear = np.zeros(p + 1)
+    linear[p] = 1.0
+    low = np.concatenate([np.full(k, -np.inf), lower - here.c])
+    high = np.concatenate([here.f.max() - here.f, upper - here.c])
+    return Problem(quadratic, linear, rows, low, high)
+
+
+def elastic(problem: Problem, k: int, weight: float) -> Problem:
+    """The same QP with slacks s, t >= 0 on its constraint rows: c'd + s - t, at a price each."""
+    n, m = len(problem.q), len(problem.l)
+    slack = np.zeros((m, 2 * (m - k)))
+    slack[k:] = np.hstack([np.eye(m - k), -np.eye(m - k)])
+    rows = np.block([[problem.A, slack], [np.zeros((2 * (m - k), n)), np.eye(2 * (m - k))]])
+    quadratic = np.zeros((n + 2 * (m - k),) * 2)
+    quadratic[:n, :n] = problem.P
+    quadratic[n:, n:] = EPIGRAPH * np.eye(2 * (m - k))
+    linear = np.concatenate([problem.q, np.full(2 * (m - k), weight)])
+    low = np.concatenate([problem.l, np.zeros(2 * (m - k))])
+    high = np.concatenate([problem.u, np.full(2 * (m - k), np.inf)])
+    return Problem(quadratic, linear, rows, low, high)
+
+
+def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
+    """Step and multipliers of a QP answer; mu is brought back to sum one exactly."""
+    k, p = here.slope.shape
+    usable = answer.solved
+    mu = np.maximum(answer.y[:k], 0.0) if usable else np.full(k, 1.0 / k)
+    total = mu.sum()
+    lam = answer.y[k : k + len(here.c)] if usable else np.zeros(len(here.c))
+    return Plan(
+        d=answer.x[:p] if usable else np.zeros(p),
+        mu=mu / total if total > 0.0 else np.full(k, 1.0 / k),
+        lam=lam,
+        usable=usable,
+        backend=answer.backend,
+        notes=answer.notes,
+        relaxed=relaxed,
+        penalty=penalty,
+    )
+
+
+def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
+    """The KKT residuals at a point."""
+    stationarity = here.slope.T @ mu + here.normal.T @ lam
+    with np.errstate(invalid="ignore"):
+        room = np.where(lam > 0, upper - here.c, here.c - lower)
+        slack = np.where(lam == 0, 0.0, np.abs(lam) * np.abs(room))
+    return Kkt(
+        float(np.abs(stationarity).max(initial=0.0)),
+        float(mu @ (here.f.max() - here.f) + slack.sum()),
+        float(excess(here.c, lower, upper).max(initial=0.0)),
+    )
+
+
+def hopeless(here: Linear, plan: Plan, lower: Array, upper: Array, tolerance: float) -> bool:
+    """Whether constraints are violated and the relaxed QP sees no way to violate them less."""
+    now = excess(here.c, lower, upper).sum()
+    ahead = excess(here.c + here.normal @ plan.d, lower, upper).sum()
+    return bool(now > tolerance and ahead > (1.0 - 1e-6) * now)
+
+
+def excess(c: Array, lower: Array, upper: Array) -> Array:
+    """(l,) by how much each constraint is violated."""
+    return np.asarray(np.maximum(np.maximum(c - upper, lower - c), 0.0))
+
+
+def weighted(curvature: Array, mu: Array, floor: float) -> Array:
+    """The Gauss-Newton Hessian of the Lagrangian, every function with at least the floor weight."""
+    return np.asarray(np.einsum("k,kij->ij", np.maximum(mu, floor), curvature))
+
+
+def search(
+    problem: Minimax[X], x: X, here: Linear, plan: Plan, penalty: float, resolve: Resolve
+) -> tuple[float, Array, Linear]:
+    """Length, move and end of a step that lowers max f + penalty * violation; length 0 if none.
+
+    The full step is nearly always taken, so its derivatives are computed at once.  resolve: solves
+    the QP again with other values f, c, for the second-order correction.
+    """
+    lower, upper = problem.lower, problem.upper
+
+    def merit(f: Array, c: Array) -> float:
+        value = float(f.max() + penalty * excess(c, lower, upper).sum())
+        return value if np.isfinite(value) else float("inf")
+
+    start = merit(here.f, here.c)
+    ahead = merit(here.f + here.slope @ plan.d, here.c + here.normal @ plan.d)
+    decrease = start - ahead
+    slack = ROUNDING * abs(start)
+    there = problem.linearise(problem.step(x, plan.d))
+    value = merit(there.f, there.c)
+    if value <= start - 1e-4 * decrease + slack:
+        return 1.0, plan.d, there
+    if np.isfinite(value):
+        # what the linear model missed at the full step goes into the constants
+        bent = resolve(there.f - here.slope @ plan.d, there.c - here.normal @ plan.d)
+        if bent.usable and np.linalg.norm(bent.d) <= 2.0 * np.linalg.norm(plan.d):
+            there = problem.linearise(problem.step(x, bent.d))
+            if merit(there.f, there.c) <= start - 1e-4 * decrease + slack:
+                return 1.0, bent.d, there
+    length = 1.0
+    while length > 1e-8:
+        curved = 2.0 * (value - start + length * decrease)
+        fit = length**2 * decrease / curved if np.isfinite(value) and curved > 0 else 0.0
+        length = min(max(fit, 0.1 * length), 0.5 * length)
+        value = merit(*problem.evaluate(problem.step(x, length * plan.d)))
+        if value <= start - 1e-4 * length * decrease + slack:
+            move = length * plan.d
+            return length, move, problem.linearise(problem.step(x, move))
+    return 0.0, np.zeros_like(plan.d), here
+
+
+@dataclass(frozen=True, eq=False)
+class Bfgs:
+    """A damped BFGS estimate of the Hessian of the Lagrangian [Powell 1978]."""
+
+    matrix: Array
+    fresh: bool
+
+    @staticmethod
+    def start(here: Linear, size: int) -> Bfgs:
+        """The mean Gauss-Newton Hessian where there is one, else the identity."""
+        if len(here.curvature):
+            ridge = 1e-3 * np.diag(np.einsum("kii->i", here.curvature) / len(here.curvature))
+            return Bfgs(here.curvature.mean(axis=0) + ridge, fresh=False)
+        return Bfgs(np.eye(size), fresh=True)
+
+    def update(self, s: Array, before: Linear, after: Linear, mu: Array, lam: Array) -> Bfgs:
+        """With the change of the Lagrangian's gradient over the step s, same multipliers."""
+        q = (after.slope - before.slope).T @ mu + (after.normal - before.normal).T @ lam
+        length = float(s @ s)
+        if length == 0.0 or not np.all(np.isfinite(q)):
+            return self
+        matrix = self.matrix
+        if self.fresh and q @ s > 0:  # size of the first guess [Nocedal and Wright, eq. 6.20]
+            matrix = float(q @ q) / float(q @ s) * np.eye(len(s))
+        bs = matrix @ s
+        curve = float(s @ bs)
+        if curve <= 0.0:
+            return self
+        if float(q @ s) < 0.2 * curve:
+            share = 0.8 * curve / (curve - float(q @ s))
+            q = share * q + (1.0 - share) * bs
+        new = matrix - np.outer(bs, bs) / curve + np.outer(q, q) / float(q @ s)
+        return Bfgs(0.5 * (new + new.T), fresh=False)

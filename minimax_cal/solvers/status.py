@@ -1,0 +1,30 @@
+"""How a solver ended; the text says what to try."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Status(StrEnum):
+    """How a solver ended, in the contract's words."""
+
+    CONVERGED = "converged"
+    ITERATION_LIMIT = "iteration_limit"
+    STALLED = "stalled"
+    INFEASIBLE = "infeasible"
+    FAILED = "failed"
+
+    @property
+    def advice(self) -> str:
+        """What to try next."""
+        return ADVICE[self]
+
+
+ADVICE = {
+    Status.CONVERGED: "",
+    Status.ITERATION_LIMIT: "the iteration limit was reached; allow more iterations",
+    Status.STALLED: "no step lowers the error any more, yet the optimality test fails; "
+    "try another QP backend, or fix weakly determined parameters (--fix) or give them priors",
+    Status.INFEASIBLE: "the constraints contradict each other; loosen the distance tolerance",
+    Status.FAILED: "the numbers broke down; check units and joint signs, try another QP backend",
+}

@@ -1,0 +1,110 @@
+"""The one way a number reaches people: a table, as text, Markdown, CSV or LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+Cell = str | float | int
+
+LATEX_ESCAPES = str.maketrans(
+    {c: "\\" + c for c in "&%$#_{}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, a header with units, and rows; formats holds one format spec a column."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    formats: tuple[str, ...] = ()
+
+    def cells(self) -> list[list[str]]:
+        """Every cell as text; NaN is a dash."""
+        formats = self.formats or ("",) * len(self.header)
+        return [
+            [show(cell, spec) for cell, spec in zip(row, formats, strict=True)] for row in self.rows
+        ]
+
+    def numeric(self) -> list[bool]:
+        """Which columns hold numbers (and are aligned right)."""
+        return [
+            any(isinstance(row[i], (int, float)) for row in self.rows)
+            for i in range(len(self.header))
+        ]
+
+    def text(self, width: int = 100) -> str:
+        """Plain text, without colour."""
+        stream = io.StringIO()
+        Console(file=stream, width=width, color_system=None, highlight=False).print(self.rich())
+        return stream.getvalue().rstrip()
+
+    def rich(self) -> RichTable:
+        """For a terminal.  Cells are literal text, never markup."""
+        table = RichTable(
+            title=Text(self.title), title_justify="left", header_style="bold", box=box.SIMPLE
+        )
+        for name, right in zip(self.header, self.numeric(), strict=True):
+            table.add_column(Text(name), justify="right" if right else "left", overflow="fold")
+        for row in self.cells():
+            table.add_row(*map(Text, row))
+        return table
+
+    def markdown(self) -> str:
+        """A pipe table under its title."""
+        rule = ["---:" if right else "---" for right in self.numeric()]
+        lines = [list(self.header), rule, *self.cells()]
+        body = "\n".join(
+            "| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in lines
+        )
+        return f"**{self.title}**\n\n{body}\n"
+
+    def csv(self) -> str:
+        """Header and rows at full precision."""
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(self.header)
+        writer.writerows(self.rows)
+        return stream.getvalue()
+
+    def latex(self) -> str:
+        """A booktabs tabular with the title as caption."""
+        align = "".join("r" if right else "l" for right in self.numeric())
+        header, *body = [
+            " & ".join(cell.translate(LATEX_ESCAPES) for cell in row) + r" \\"
+            for row in (list(self.header), *self.cells())
+        ]
+        return "\n".join(
+            [
+                r"\begin{table}",
+                rf"\caption{{{self.title.translate(LATEX_ESCAPES)}}}",
+                rf"\begin{{tabular}}{{{align}}}",
+                r"\toprule",
+                header,
+                r"\midrule",
+                *body,
+                r"\bottomrule",
+                r"\end{tabular}",
+                r"\end{table}",
+                "",
+            ]
+        )
+
+
+def show(cell: Cell, spec: str) -> str:
+    """One cell as text: numbers by the column's format, missing numbers as a dash."""
+    if isinstance(cell, str):
+        return cell
+    if isinstance(cell, float) and math.isnan(cell):
+        return "-"
+    return format(cell, spec)

@@ -1,0 +1,21 @@
+"""Quadratic programs by any solver, each answer judged by one formula; knows no robot."""
+
+from __future__ import annotations
+
+from .accuracy import Accuracy, accuracy
+from .judge import solve
+from .problem import BackendError, Problem, Solution, Status
+from .registry import available, names, register
+
+__all__ = [
+    "Accuracy",
+    "BackendError",
+    "Problem",
+    "Solution",
+    "Status",
+    "accuracy",
+    "available",
+    "names",
+    "register",
+    "solve",
+]

@@ -1,0 +1,99 @@
+"""One judge for all backends: how well x and y meet the optimality conditions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg.blas import idamax
+
+if TYPE_CHECKING:
+    from .problem import Array, Problem, Solution
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Residuals of the optimality conditions, absolute and relative; infinite without x and y.
+
+    primal: largest violation of l ≤ Ax ≤ u, in the units of its row.
+    dual: largest entry of Px + q + Aᵀy, multipliers of open sides left out.
+    gap: |xᵀPx + qᵀx + uᵀy⁺ - lᵀy⁻|, primal minus dual objective.
+    primal_relative, dual_relative, gap_relative: see `accuracy`.
+    objective: ½xᵀPx + qᵀx.
+    """
+
+    primal: float
+    dual: float
+    gap: float
+    primal_relative: float
+    dual_relative: float
+    gap_relative: float
+    objective: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three relative numbers: what a tolerance is compared with."""
+        return max(self.primal_relative, self.dual_relative, self.gap_relative)
+
+
+NOWHERE = Accuracy(*(7 * [math.inf]))
+
+
+def accuracy(problem: Problem, solution: Solution) -> Accuracy:
+    """How far a solution is from optimal, by one formula for every backend.
+
+    The relative numbers divide by the size of what had to cancel, so that they do not change when
+    the objective or a row is multiplied by a number (‖.‖ is the largest absolute entry):
+
+    primal: violation / max(‖Ax‖, λ), each row first divided by its Euclidean norm, so that a
+    violation is the distance of x from the row's half-space.
+    dual: ‖Px + q + Aᵀy‖ / δ with δ = max(‖Px‖, ‖q‖, ‖Aᵀy‖).
+    gap: |gap| / max(|xᵀPx|, |qᵀx|, |uᵀy⁺ - lᵀy⁻|, δλ).
+
+    λ = min(1, δ / ‖P‖), the step on which the largest gradient meets the largest curvature, stands
+    in for the size of x where x vanishes (1 for a linear program, which has no curvature). Without
+    it an exact x = 0 with a rounding error would have an infinite relative residual.
+    """
+    x, y, q, A = solution.x, solution.y, problem.q, problem.A
+    l, u = problem.l, problem.u  # noqa: E741
+    if x.shape != q.shape or y.shape != l.shape:
+        return NOWHERE
+    bound = np.where(y > 0, u, l)
+    bound[y == 0] = 0.0
+    support = float(y @ bound)
+    if not math.isfinite(support):  # NaN, or a multiplier at an open side
+        y, bound = np.where(np.isinf(bound), 0.0, (y, bound))
+        support = float(y @ bound)
+    Px, Ax, Aty = problem.P @ x, A @ x, y @ A
+    xPx, qx = float(x @ Px), float(q @ x)
+    gap = abs(xPx + qx + support)
+    if not math.isfinite(gap):
+        return NOWHERE
+    outside = Ax - np.minimum(np.maximum(Ax, l), u)
+    dual, delta = _size(Px + q + Aty), max(_size(Px), _size(q), _size(Aty))
+    curvature = float(problem.P.diagonal().max(initial=0.0))  # the largest entry, P being psd
+    step = min(1.0, delta / curvature) if curvature > 0 else 1.0
+    return Accuracy(
+        primal=_size(outside),
+        dual=dual,
+        gap=gap,
+        primal_relative=_ratio(
+            _size(outside / problem.row_norm), max(_size(Ax / problem.row_norm), step)
+        ),
+        dual_relative=_ratio(dual, delta),
+        gap_relative=_ratio(gap, max(abs(xPx), abs(qx), abs(support), delta * step)),
+        objective=0.5 * xPx + qx,
+    )
+
+
+def _size(vector: Array) -> float:
+    """Largest absolute entry; by BLAS, because the inner loop of an SQP waits for it."""
+    return abs(float(vector[idamax(vector)])) if vector.size else 0.0
+
+
+def _ratio(part: float, whole: float) -> float:
+    if part == 0:
+        return 0.0
+    return part / whole if whole > 0 else math.inf

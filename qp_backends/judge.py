@@ -1,0 +1,174 @@
+"""Run a backend, judge its answer, and go on to others while it is not good enough."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from .accuracy import accuracy
+from .certificates import proof
+from .polish import polish
+from .problem import COLD, Problem, Solution, Status, nothing
+from .registry import Solver, backend, fallback_order
+
+NO_ANSWER = (Status.INFEASIBLE, Status.UNBOUNDED, Status.FAILED)
+NEAR = 1e-2  # relative residual up to which an answer is worth polishing; beyond, it is wrong
+TIGHTER = 1e-3  # what the tolerance is multiplied by when an answer is asked for again
+
+
+def solve(
+    problem: Problem,
+    name: str = "daqp",
+    *,
+    tolerance: float = 1e-8,
+    time_limit: float = math.inf,
+    warm_start: Solution = COLD,
+    fallback: bool | Sequence[str] = True,
+) -> Solution:
+    """Solve a QP with the named backend; its answer is judged, and others take over if need be.
+
+    tolerance: what the worst relative residual of `accuracy` may be, for every backend.
+    time_limit: wall time for everything, fallbacks and checks included [s].
+    warm_start: an earlier solution of a similar problem, used by backends that can.
+    fallback: True for the installed backends in the order of `registry.fallback_order`, False for
+    none, or the names to try.
+
+    An answer counts as solved if and only if `accuracy` says so, whatever the backend claims.  One
+    that is not accurate enough is polished, then asked for again at a tighter tolerance, then the
+    next backend is tried; one that runs has half of the time that is left while others wait.
+    "Infeasible" and "unbounded" are believed only with a certificate (`certificates.proof`).
+    A mistake in `name` or in the data raises BackendError; nothing else is raised.
+    """
+    start = time.perf_counter()
+    run = backend(name)
+    share = time_limit if fallback is False else 0.5 * time_limit
+    raw = _call(run, problem, tolerance, share, warm_start)
+    worst = accuracy(problem, raw).worst
+    if worst <= tolerance:  # the usual case, kept short
+        return Solution(
+            raw.x,
+            raw.y,
+            Status.SOLVED,
+            time.perf_counter() - start,
+            name,
+            worst,
+            iterations=raw.iterations,
+        )
+    others = fallback_order(problem) if fallback is True else tuple(fallback or ())
+    queue = (name, *(other for other in others if other != name))
+    job = Job(problem, tolerance, warm_start, start, start + time_limit)
+    return _persist(job, queue, raw)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What all attempts at a problem share; start and until are moments of perf_counter [s]."""
+
+    problem: Problem
+    tolerance: float
+    warm_start: Solution
+    start: float
+    until: float
+
+    @property
+    def left(self) -> float:
+        """Time that is left [s]."""
+        return self.until - time.perf_counter()
+
+
+def _named(name: str) -> Solver:
+    """A backend that is looked up when it is called: a missing one is passed over then."""
+    return lambda problem, **keywords: backend(name)(problem, **keywords)
+
+
+def _call(
+    run: Solver, problem: Problem, tolerance: float, time_limit: float, warm_start: Solution
+) -> Solution:
+    """What a backend answers; FAILED with a note when it raises."""
+    try:
+        return run(problem, tolerance=tolerance, time_limit=time_limit, warm_start=warm_start)
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # a solver may raise anything; a panic in Rust is no Exception
+        return nothing(problem, Status.FAILED, f"raised {type(error).__name__}: {error}")
+
+
+def _persist(job: Job, queue: Sequence[str], raw: Solution) -> Solution:
+    """Improve the first answer, then go through the other backends until one is good enough."""
+    best, least, asked = nothing(job.problem, Status.FAILED), math.inf, False
+    notes: tuple[str, ...] = ()
+    for index, name in enumerate(queue):
+        last = index + 1 == len(queue)
+        if index:
+            share = job.left if last else 0.5 * job.left
+            raw = _call(_named(name), job.problem, job.tolerance, share, job.warm_start)
+            if accuracy(job.problem, raw).worst <= job.tolerance:
+                return _closed(job, raw, Status.SOLVED, name, notes)
+        better = _improved(job, name, raw)
+        worst = accuracy(job.problem, better).worst
+        remark = _remark(job, name, raw)
+        if worst <= job.tolerance:
+            notes += (f"{remark}; improved to {worst:.1e}",)
+            return _closed(job, better, Status.SOLVED, name, notes)
+        notes += (remark,)
+        if worst < least:
+            best, least = replace(better, backend=name), worst
+        if not asked and (raw.status in NO_ANSWER or last):
+            asked = True  # once is enough: the answer does not depend on the backend
+            status, certificate = proof(job.problem, max(job.left, 1e-3))
+            if status is not Status.FAILED:
+                none = nothing(job.problem, status)
+                return _closed(job, replace(none, certificate=certificate), status, name, notes)
+        if job.left <= 0:
+            return _closed(job, best, Status.TIME_LIMIT, best.backend or name, notes)
+    limits = (Status.ITERATION_LIMIT, Status.TIME_LIMIT)
+    end = best.status if best.status in limits else Status.INACCURATE
+    if not math.isfinite(least):
+        end = Status.FAILED
+    return _closed(job, best, end, best.backend or queue[0], notes)
+
+
+def _improved(job: Job, name: str, raw: Solution) -> Solution:
+    """An answer after polishing and, if that is not enough, after a second, tighter run.
+
+    Our own subgradient method has to stand on its own: its failures are part of what it shows.
+    """
+    if name.startswith("subgradient"):
+        return raw
+    better = _polished(job, raw)
+    done = accuracy(job.problem, better).worst <= job.tolerance
+    if done or raw.status is not Status.SOLVED or job.left <= 0:
+        return better
+    again = _call(backend(name), job.problem, TIGHTER * job.tolerance, 0.5 * job.left, better)
+    answers = (better, _polished(job, again))
+    return min(answers, key=lambda answer: accuracy(job.problem, answer).worst)
+
+
+def _polished(job: Job, answer: Solution) -> Solution:
+    """An answer, polished if it is nearly right."""
+    near = accuracy(job.problem, answer).worst <= NEAR
+    return polish(job.problem, answer, job.tolerance) if near else answer
+
+
+def _remark(job: Job, name: str, raw: Solution) -> str:
+    """One line on an answer that was not good enough."""
+    worst = accuracy(job.problem, raw).worst
+    said = "; ".join(raw.notes) or f"said {raw.status.name.lower()}"
+    size = f"its relative residual is {worst:.1e}" if math.isfinite(worst) else "it gave no x"
+    return f"{name} {said}, {size}"
+
+
+def _closed(
+    job: Job, answer: Solution, status: Status, name: str, notes: tuple[str, ...]
+) -> Solution:
+    """The answer with what is known about how it was come by."""
+    return replace(
+        answer,
+        status=status,
+        seconds=time.perf_counter() - job.start,
+        backend=name,
+        residual=accuracy(job.problem, answer).worst,
+        notes=notes,
+    )

@@ -1,0 +1,182 @@
+"""What goes into a QP backend and what comes out of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+Array: TypeAlias = NDArray[np.float64]
+Matrix: TypeAlias = Any  # a dense Array or a csc_array; both know @, .T and .shape
+
+OPEN = 1e20  # what QP files write for infinity
+EMPTY: Array = np.zeros(0)
+EMPTY.flags.writeable = False
+
+
+class BackendError(ValueError):
+    """A mistake of the caller: a wrong name, a missing package, data of the wrong shape."""
+
+
+class Status(Enum):
+    """How a solve ended; the text says what it means and what to try."""
+
+    SOLVED = "solved"
+    INACCURATE = (
+        "stopped short of the tolerance: use x with care, "
+        "or scale the problem, loosen the tolerance or try another backend"
+    )
+    INFEASIBLE = (
+        "infeasible: no x meets all rows; relax the rows at which the certificate is not zero"
+    )
+    UNBOUNDED = (
+        "unbounded: the objective falls for ever along the certificate; "
+        "bound that direction or add curvature to P"
+    )
+    ITERATION_LIMIT = "iteration limit: loosen the tolerance or try another backend"
+    TIME_LIMIT = "time limit: allow more time, loosen the tolerance or try a faster backend"
+    FAILED = "failed: the backend gave no usable answer; the notes say why; try another backend"
+
+
+def is_sparse(matrix: Any) -> bool:
+    """Whether a matrix is one of SciPy's sparse ones."""
+    return bool(sparse.issparse(matrix))
+
+
+def dense(matrix: Matrix) -> Array:
+    """A matrix as a dense array."""
+    array: Array = matrix.toarray() if is_sparse(matrix) else matrix
+    return array
+
+
+def _matrix(value: Any, name: str) -> Matrix:
+    """A float64 dense array, or a CSC array when the value is sparse."""
+    if is_sparse(value):
+        matrix: Any = sparse.csc_array(value, dtype=np.float64)
+        entries = matrix.data
+    else:
+        matrix = entries = _array(value)
+    if matrix.ndim != 2:
+        raise BackendError(f"{name} must have two dimensions, not {matrix.ndim}")
+    if not np.isfinite(entries).all():
+        raise BackendError(f"{name} holds NaN or infinite entries")
+    return matrix
+
+
+def _array(value: Any) -> Array:
+    """A contiguous float64 array; writeable, because some solvers insist on it."""
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()
+
+
+def _vector(value: Any, name: str, size: int) -> Array:
+    """A float64 vector of the given size."""
+    vector = _array(value)
+    if vector.shape != (size,):
+        raise BackendError(f"{name} has shape {vector.shape}, expected ({size},)")
+    return vector
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Minimise ½xᵀPx + qᵀx subject to l ≤ Ax ≤ u.
+
+    P: (n, n) symmetric positive semi-definite, dense or sparse; both triangles are given.
+    q: (n,).
+    A: (m, n) dense or sparse; m may be 0.
+    l, u: (m,) equal for an equality, ±inf where open; 1e20 and beyond counts as open.
+    """
+
+    P: Matrix
+    q: Array
+    A: Matrix
+    l: Array  # noqa: E741  the papers' letter
+    u: Array
+
+    def __post_init__(self) -> None:
+        """Bring the data to float64 and refuse what cannot be meant."""
+        P, A = _matrix(self.P, "P"), _matrix(self.A, "A")
+        n, m = P.shape[0], A.shape[0]
+        if P.shape != (n, n):
+            raise BackendError(f"P has shape {P.shape}, expected a square matrix")
+        if A.shape[1] != n:
+            raise BackendError(f"A has {A.shape[1]} columns, but P has {n}")
+        q = _vector(self.q, "q", n)
+        l, u = _vector(self.l, "l", m), _vector(self.u, "u", m)  # noqa: E741
+        if not np.isfinite(q).all():
+            raise BackendError("q holds NaN or infinite entries")
+        if np.isnan(l).any() or np.isnan(u).any():
+            raise BackendError("l or u holds NaN; an open side is -inf or inf")
+        l, u = np.where(l > -OPEN, l, -np.inf), np.where(u < OPEN, u, np.inf)  # noqa: E741
+        if not symmetric(P):
+            raise BackendError("P is not symmetric; give both triangles, for example (P + P.T) / 2")
+        for name, value in (("P", P), ("q", q), ("A", A), ("l", l), ("u", u)):
+            object.__setattr__(self, name, value)
+
+    @cached_property
+    def row_norm(self) -> Array:
+        """Euclidean norm of each row of A, 1 for an empty row.  Returns (m,)."""
+        if is_sparse(self.A):
+            norm = np.sqrt(np.asarray(self.A.multiply(self.A).sum(axis=1)).ravel())
+        else:
+            norm = np.sqrt(np.einsum("ij,ij->i", self.A, self.A))
+        return np.where(norm > 0, norm, 1.0)
+
+    @cached_property
+    def has_sparse(self) -> bool:
+        """Whether P or A came as a sparse matrix."""
+        return is_sparse(self.P) or is_sparse(self.A)
+
+
+def symmetric(P: Matrix) -> bool:
+    """Whether P equals its transpose but for rounding.  P: (n, n)."""
+    if is_sparse(P):
+        return bool(abs(P - P.T).max() <= 1e-9 * abs(P).max()) if P.nnz else True
+    return P.size == 0 or bool((P == P.T).all()) or bool(np.allclose(P, P.T, rtol=1e-9, atol=1e-9))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An answer and how it was come by.
+
+    x: (n,) minimiser; NaN where there is none.
+    y: (m,) multipliers, > 0 at u and < 0 at l, so that Px + q + Aᵀy = 0; NaN where there is none.
+    status: how it ended; its value is a text that says what to try.
+    seconds: wall time of the whole solve, fallbacks and checks included [s].
+    backend: the backend whose answer this is.
+    residual: the largest relative residual, as `accuracy` judged it; infinite where it did not.
+    notes: one line for each answer that was not good enough: a backend, what it said and what was
+    wrong with it, so that the next one took over or the answer had to be improved.
+    certificate: (m,) multipliers that prove INFEASIBLE, (n,) ray that proves UNBOUNDED, else (0,).
+    iterations: the backend's own count, 0 where it tells none.
+    """
+
+    x: Array
+    y: Array
+    status: Status
+    seconds: float
+    backend: str = ""
+    residual: float = math.inf
+    notes: tuple[str, ...] = ()
+    certificate: Array = field(default_factory=lambda: EMPTY)
+    iterations: int = 0
+
+    @property
+    def solved(self) -> bool:
+        """Whether x is an answer that kept the tolerance."""
+        return self.status is Status.SOLVED
+
+
+COLD = Solution(EMPTY, EMPTY, Status.FAILED, 0.0)  # "no warm start"
+
+
+def nothing(problem: Problem, status: Status, *notes: str) -> Solution:
+    """A solution without x and y."""
+    x, y = np.full(problem.q.shape, np.nan), np.full(problem.l.shape, np.nan)
+    return Solution(x, y, status, 0.0, notes=notes)

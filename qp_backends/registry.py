@@ -1,0 +1,161 @@
+"""The table of backends: a name, and the module that is imported when it is first used."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from importlib import import_module, metadata, util
+from typing import Any
+
+import numpy as np
+
+from .problem import BackendError, Problem, Solution, Status
+
+Solver = Callable[..., Solution]
+
+BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
+    "daqp": ("via_daqp", "daqp"),
+    "quadprog": ("via_qpsolvers", "quadprog"),
+    "piqp": ("via_qpsolvers", "piqp"),
+    "clarabel": ("via_qpsolvers", "clarabel"),
+    "proxqp": ("via_qpsolvers", "proxqp"),
+    "highs": ("via_qpsolvers", "highs"),
+    "osqp": ("via_qpsolvers", "osqp"),
+    "scs": ("via_qpsolvers", "scs"),
+    "ecos": ("via_qpsolvers", "ecos"),
+    "qpalm": ("via_qpsolvers", "qpalm"),
+    "cvxopt": ("via_qpsolvers", "cvxopt"),
+    "kvxopt": ("via_qpsolvers", "kvxopt"),
+    "gurobi": ("via_qpsolvers", "gurobi"),
+    "mosek": ("via_qpsolvers", "mosek"),
+    "copt": ("via_qpsolvers", "copt"),
+    "qpoases": ("via_qpsolvers", "qpoases"),
+    "qpswift": ("via_qpsolvers", "qpswift"),
+    "hpipm": ("via_qpsolvers", "hpipm"),
+    "cvxpy": ("via_cvxpy", ""),  # also "cvxpy:CLARABEL" and its other solvers
+    "subgradient": ("subgradient", "restarted"),  # also "subgradient:raw", "subgradient:eliminated"
+}
+PACKAGES = {  # where the package is not called like the backend: (module, distribution)
+    "proxqp": ("proxsuite", "proxsuite"),
+    "highs": ("highspy", "highspy"),
+    "gurobi": ("gurobipy", "gurobipy"),
+    "copt": ("coptpy", "coptpy"),
+    "hpipm": ("hpipm_python", "hpipm_python"),
+}
+EXTRAS = ("quadprog", "piqp", "highs", "scs")  # optional parts of our own package
+"""Order in which backends take over: exact and fast for dense problems first, for sparse ones
+interior points first; the first-order methods come last."""
+DENSE_ORDER = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
+SPARSE_ORDER = ("piqp", "clarabel", "highs", "proxqp", "osqp", "daqp", "quadprog", "scs")
+
+_registered: dict[str, Solver] = {}
+
+
+def register(name: str, solver: Callable[..., Any]) -> None:
+    """Make the user's own solver choosable by name.
+
+    solver(problem) returns a Solution or a pair (x, y); it may take the keywords tolerance,
+    time_limit and warm_start.  A name of the table is replaced by it.
+    """
+    _registered[name] = partial(_own, solver=solver, keywords=_keywords(solver))
+
+
+def names() -> tuple[str, ...]:
+    """All names that `solve` knows, installed or not."""
+    return tuple(dict.fromkeys((*BACKENDS, *_registered)))
+
+
+def backend(name: str) -> Solver:
+    """The QP solver called name; BackendError when there is none or its package is missing."""
+    if name in _registered:
+        return _registered[name]
+    family, _, choice = name.partition(":")
+    if family not in BACKENDS or (choice and family not in ("cvxpy", "subgradient")):
+        near = difflib.get_close_matches(name, names(), 1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise BackendError(f"no QP backend {name!r}; {hint}choose one of {', '.join(names())}")
+    return _imported(family, choice)
+
+
+@cache
+def _imported(family: str, choice: str) -> Solver:
+    module, method = BACKENDS[family]
+    if not _installed(family):
+        raise BackendError(f"{family!r} needs a package that is not here: {_pip(family)}")
+    try:
+        loaded = import_module(f".{module}", __package__)
+    except ModuleNotFoundError as error:
+        raise BackendError(f"{family!r} needs {error.name!r}: {_pip(family)}") from error
+    if choice:
+        loaded.check(choice)
+    solver: Solver = partial(loaded.solve, method=choice or method)
+    return solver
+
+
+def _pip(name: str) -> str:
+    """The command that installs a backend."""
+    extra = f"minimax-cal[{name}]" if name in EXTRAS else _package(name)[1]
+    return f"pip install {extra}"
+
+
+def _package(name: str) -> tuple[str, str]:
+    """The module and the distribution behind a backend."""
+    return PACKAGES.get(name, (name, name))
+
+
+def _installed(name: str) -> bool:
+    module, _ = BACKENDS[name]
+    return module == "subgradient" or util.find_spec(_package(name)[0]) is not None
+
+
+def available() -> dict[str, str]:
+    """The backends that can be used here, and the version of the package behind each."""
+    versions = {}
+    for name, (module, _) in BACKENDS.items():
+        if _installed(name):
+            versions[name] = "own" if module == "subgradient" else _version(_package(name)[1])
+    return versions | dict.fromkeys(_registered, "registered")
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def fallback_order(problem: Problem) -> tuple[str, ...]:
+    """The installed backends in the order in which they take over."""
+    order = SPARSE_ORDER if problem.has_sparse else DENSE_ORDER
+    return tuple(name for name in order if name in _registered or _installed(name))
+
+
+def _keywords(solver: Callable[..., Any]) -> tuple[str, ...]:
+    """Which of our keywords a callable takes."""
+    ours = ("tolerance", "time_limit", "warm_start")
+    try:
+        parameters = inspect.signature(solver).parameters
+    except (TypeError, ValueError):
+        return ()
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return ours
+    return tuple(name for name in ours if name in parameters)
+
+
+def _own(
+    problem: Problem, *, solver: Callable[..., Any], keywords: tuple[str, ...], **given: Any
+) -> Solution:
+    """The answer of the user's own solver as a Solution."""
+    start = time.perf_counter()
+    answer = solver(problem, **{name: given[name] for name in keywords})
+    if isinstance(answer, Solution):
+        return replace(
+            answer, x=np.asarray(answer.x, np.float64), y=np.asarray(answer.y, np.float64)
+        )
+    x, y = answer
+    seconds = time.perf_counter() - start
+    return Solution(np.asarray(x, np.float64), np.asarray(y, np.float64), Status.SOLVED, seconds)

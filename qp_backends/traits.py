@@ -1,0 +1,120 @@
+"""What each third-party solver wants to be given: a table, so that all backends agree on it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from .problem import Status
+
+
+@dataclass(frozen=True)
+class Trait:
+    """What a solver wants to be given.
+
+    storage: dense arrays, CSC matrices, or whichever of the two the problem came in.
+    box: whether bounds on x are better than rows.
+    tolerances: its settings that mean `tolerance`; none for a direct method.
+    finest: the smallest tolerance it makes sense to ask for.
+    clock: its setting for a time limit [s]; empty when it has none.
+    warm: how it takes a warm start: "x", "dual" or "all"; empty when it does not.
+    definite: whether it refuses a P that is only semi-definite.
+    fixed: settings of the first run.
+    rescue: settings that are changed for a second run when the first finds nothing.
+    """
+
+    storage: Literal["dense", "sparse", "either"] = "either"
+    box: bool = False
+    tolerances: tuple[str, ...] = ()
+    finest: float = 1e-13
+    clock: str = ""
+    warm: Literal["x", "dual", "all", ""] = ""
+    definite: bool = False
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    rescue: Mapping[str, Any] = field(default_factory=dict)
+
+
+TRAITS = {
+    "daqp": Trait(
+        "dense",
+        box=True,
+        tolerances=("eta_prox",),
+        clock="time_limit",
+        warm="dual",
+        # its rows are scaled by the square root of P, which makes 1e-6 there 1e-2 in Ax
+        fixed={"primal_tol": 1e-11},
+    ),
+    "quadprog": Trait("dense", definite=True),
+    "piqp": Trait(
+        box=True,
+        tolerances=("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"),
+    ),
+    "clarabel": Trait(
+        "sparse",
+        tolerances=("tol_feas", "tol_gap_abs", "tol_gap_rel"),
+        clock="time_limit",
+    ),
+    "osqp": Trait(
+        "sparse",
+        tolerances=("eps_abs", "eps_rel"),
+        clock="time_limit",
+        warm="x",
+        fixed={"max_iter": 50_000},
+    ),
+    "proxqp": Trait(
+        tolerances=("eps_abs",),
+        warm="all",
+        fixed={"eps_rel": 0.0, "max_iter": 10_000},
+        rescue={"rho": 1e-2},  # without curvature it takes feasible problems for infeasible
+    ),
+    "highs": Trait(
+        "sparse",
+        box=True,
+        tolerances=("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
+        finest=1e-10,
+        clock="time_limit",
+        # what HiGHS adds to P makes it robust, and wrong by as much
+        fixed={"qp_regularization_value": 0.0},
+        rescue={"qp_regularization_value": 1e-7},
+    ),
+    "scs": Trait(
+        "sparse",
+        tolerances=("eps_abs", "eps_rel"),
+        clock="time_limit_secs",
+        warm="x",
+        fixed={"max_iters": 50_000},
+    ),
+    "ecos": Trait("dense", tolerances=("feastol", "abstol", "reltol"), definite=True),
+    "qpalm": Trait("sparse", tolerances=("eps_abs", "eps_rel"), clock="time_limit", warm="x"),
+    "cvxopt": Trait(),
+    "kvxopt": Trait(),
+}
+
+
+def settings(method: str, tolerance: float, time_limit: float) -> dict[str, Any]:
+    """A solver's own settings for our tolerance and time limit [s]."""
+    trait = TRAITS.get(method, Trait())
+    chosen = dict(trait.fixed)
+    for name in trait.tolerances:
+        chosen[name] = max(tolerance, trait.finest)
+    if trait.clock and time_limit < np.inf:
+        chosen[trait.clock] = max(time_limit, 1e-6)  # 0 means no limit to some
+    return chosen
+
+
+REASONS = (
+    (re.compile("dual.?infeasible|unbounded", re.IGNORECASE), Status.UNBOUNDED),
+    (re.compile("infeasible", re.IGNORECASE), Status.INFEASIBLE),
+    (re.compile("inaccurate|almost", re.IGNORECASE), Status.INACCURATE),
+    (re.compile("iter|user.?limit", re.IGNORECASE), Status.ITERATION_LIMIT),
+    (re.compile("time", re.IGNORECASE), Status.TIME_LIMIT),
+)
+
+
+def reason(text: str) -> Status:
+    """Why a solver found nothing, from the words of its status."""
+    return next((status for sign, status in REASONS if sign.search(text)), Status.FAILED)

@@ -1,0 +1,40 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import minimax_cal as mc
+from minimax_cal.simulate import Simulation, Truth, simulate
+
+ROOT = Path(__file__).parent.parent
+SHARED = ROOT.parent / "shared" / "data"
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20260101)
+
+
+@pytest.fixture(scope="session")
+def robot() -> mc.Robot:
+    return mc.load_robot("irb2600")
+
+
+@pytest.fixture(scope="session")
+def noisy(robot: mc.Robot) -> Simulation:
+    """Geometric errors, compliance and tracker noise."""
+    return simulate(robot, 60, 3, seed=5)
+
+
+@pytest.fixture(scope="session")
+def clean(robot: mc.Robot) -> Simulation:
+    """Geometric errors only: the true robot can be found to rounding."""
+    return simulate(robot, 60, 3, seed=6, truth=Truth(compliance=0, noise=0, noise_per_metre=0))
+
+
+def shared(name: str) -> tuple[str, str]:
+    """Robot and measurement files of a real arm; skips where they are not there."""
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"real measurements {folder} are not on this machine")
+    return str(folder / "robot.json"), str(folder / "measurements.csv")

@@ -1,0 +1,55 @@
+"""Quadratic programs for the tests: with known answers, random, and like those of a calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+from scipy.io import loadmat
+
+from qp_backends import Problem
+
+MAROS_MESZAROS = Path("/work/shared/data/maros_meszaros")
+
+
+def maros_meszaros(path: Path) -> Problem:
+    """One problem of the Maros-Meszaros set, sparse."""
+    data = loadmat(path)
+    P, A = sparse.csc_array(data["P"]), sparse.csc_array(data["A"])
+    return Problem(P, data["q"].ravel(), A, data["l"].ravel(), data["u"].ravel())
+
+
+def epigraph(
+    rng: np.random.Generator,
+    n: int = 46,
+    m: int = 9,
+    condition: float = 1e4,
+    curvature: float = 1e-8,
+) -> Problem:
+    """What the SQP of a minimax calibration solves: min ½dᵀHd + v with F_i + gᵢᵀd - F_max ≤ v.
+
+    n: variables, the last of them v.  m: rows.  condition: of H.  curvature: entry of P at v, which
+    some solvers need to be positive.  Two thirds of the rows, and at most six, are distance
+    constraints |e + aᵀd| ≤ 0.01, without v, as far as m is small; with many rows all are maxima.
+    """
+    k = n - 1
+    basis, _ = np.linalg.qr(rng.normal(size=(k, k)))
+    H = (basis * np.geomspace(1.0, 1.0 / condition, k)) @ basis.T
+    P = np.zeros((n, n))
+    P[:k, :k] = 0.5 * (H + H.T)
+    P[k, k] = curvature
+    q = np.zeros(n)
+    q[k] = 1.0
+    pairs = 3 if m == 9 else 0
+    maxima = m - pairs
+    A = np.zeros((m, n))
+    # gradients of sums of squares lie in the range of H, weighted like its square root
+    root = (basis * np.sqrt(np.geomspace(1.0, 1.0 / condition, k))) @ basis.T
+    A[:, :k] = rng.normal(size=(m, k)) @ root
+    A[:maxima, k] = -1.0
+    values = np.abs(rng.normal(size=maxima))
+    l, u = np.full(m, -np.inf), np.full(m, 0.01)  # noqa: E741
+    u[:maxima] = values.max() - values
+    l[maxima:] = -0.01
+    return Problem(P, q, A, l, u)

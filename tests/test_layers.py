@@ -1,0 +1,50 @@
+"""Imports point down: a module imports only lower layers (those of one folder may share one)."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+LAYERS = (
+    "errors kinematics solvers.status",
+    "files gravity tables solvers.least_squares solvers.minimax",
+    "metrics robot data",
+    "parameters gates",
+    "model cell",
+    "identify start worst",
+    "calibration simulate",
+    "calibrate figures",
+    "cli",
+)
+LAYER = {name: number for number, names in enumerate(LAYERS) for name in names.split()}
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of the project that a file imports, dotted."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+    return found
+
+
+MODULES = sorted(p for p in (ROOT / "minimax_cal").rglob("*.py") if p.name != "__init__.py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_imports_point_down(path: Path) -> None:
+    name = ".".join(path.relative_to(ROOT / "minimax_cal").with_suffix("").parts)
+    assert name in LAYER, f"give {name} a layer"
+    for module in imported(path):
+        inner = module.removeprefix("minimax_cal.")
+        if module != inner and inner in LAYER:
+            assert LAYER[inner] < LAYER[name], f"{name} imports {inner}"
+        assert not module.startswith(("experiments", "tests"))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "qp_backends").glob("*.py")), ids=lambda p: p.stem)
+def test_qp_backends_knows_no_robot(path: Path) -> None:
+    assert not any(module.startswith(("minimax_cal", "experiments")) for module in imported(path))

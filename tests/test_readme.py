@@ -1,0 +1,62 @@
+"""What the README prints is what its commands print."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+import minimax_cal as mc
+
+README = (ROOT / "README.md").read_text()
+
+
+def test_the_result_is_the_one_of_the_first_command() -> None:
+    quoted = " ".join(
+        line.removeprefix("> ") for line in README.splitlines() if line.startswith("> ")
+    )
+    fit = mc.calibrate("irb2600", ROOT / "examples" / "irb2600.csv")
+    assert quoted in fit.headline()
+
+
+def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {})
+    assert mc.load_cell(tmp_path / "fit.json").targets == ("smr1", "smr2", "smr3")
+
+
+def test_the_example_is_what_its_script_makes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import make
+
+    make.make(tmp_path)
+    made, kept = (
+        mc.read_measurements(folder / "irb2600.csv") for folder in (tmp_path, ROOT / "examples")
+    )
+    assert abs(made.q - kept.q).max() <= 2e-9  # the digits of the file
+    assert abs(made.y - kept.y).max() <= 2e-9
+    assert (tmp_path / "irb2600.svg").stat().st_size > 10_000
+    sys.modules.pop("make")
+
+
+def test_the_map_names_what_is_there() -> None:
+    rows = [line for line in README.splitlines() if line.startswith("| `")]
+    named = set()
+    for row in rows:
+        first, *others = re.findall(r"`([^`]+)`", row.split("|")[1])
+        folder = (ROOT / first).parent  # the others of a row lie beside the first
+        for full in (ROOT / first, *(folder / other for other in others)):
+            assert full.exists(), full
+            named.add(full.resolve())
+    for module in (ROOT / "minimax_cal").glob("*.py"):
+        assert module.name == "__init__.py" or module.resolve() in named, module.name
+
+
+def test_there_are_two_set_up_commands() -> None:
+    (block,) = re.findall(r"```bash setup\n(.*?)```", README, flags=re.S)
+    assert len(block.strip().splitlines()) == 2

@@ -1,0 +1,92 @@
+"""Public measurements of real arms: numbers that the project promises, held out."""
+
+import numpy as np
+import pytest
+from conftest import shared
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+
+SEEDS = range(10)
+
+
+def medians(name: str, holdout: float) -> tuple[float, float]:
+    robot, data = mc.load_robot(shared(name)[0]), mc.read_measurements(shared(name)[1])
+    fits = [mc.calibrate(robot, data, "sum", holdout=holdout, seed=seed) for seed in SEEDS]
+    assert all(fit.status == "converged" for fit in fits)
+    before, after = ([fit.accuracy[key].rms_mm for fit in fits] for key in ("nominal", "holdout"))
+    return float(np.median(before)), float(np.median(after))
+
+
+@pytest.mark.parametrize(
+    ("name", "holdout", "nominal", "most"),
+    [
+        ("irb120", 0.3, 0.85, 0.33),
+        ("qkm_hl6", 0.2, 3.0, 0.40),
+        ("ur10_b", 0.2, 1.1, 0.50),
+        ("meca500_r", 0.2, 0.09, 0.065),
+    ],
+)
+def test_held_out_accuracy(name: str, holdout: float, nominal: float, most: float) -> None:
+    before, after = medians(name, holdout)
+    assert before == pytest.approx(nominal, rel=0.2)
+    assert after <= most
+
+
+def test_fanuc_leave_one_pose_out() -> None:
+    robot, data = (
+        mc.load_robot(shared("fanuc_r2000")[0]),
+        mc.read_measurements(shared("fanuc_r2000")[1]),
+    )
+    before, after = [], []
+    for j in range(data.poses):
+        rest = np.arange(data.poses) != j
+        fit = mc.calibrate(robot, data.take(rest), "sum", holdout=0.0)
+        after.append(mc.evaluate(fit.cell, data.take(~rest)).rms_mm)
+        before.append(mc.evaluate(fit.nominal, data.take(~rest)).rms_mm)
+    assert np.sqrt(np.mean(np.square(before))) == pytest.approx(0.8, rel=0.2)
+    assert np.sqrt(np.mean(np.square(after))) <= 0.52
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_minimax_never_exceeds_the_sum(seed: int) -> None:
+    robot, data = shared("irb120")
+    total, worst = (
+        mc.calibrate(robot, data, objective, holdout=0.3, seed=seed)
+        for objective in ("sum", "minimax")
+    )
+    assert worst.status == "converged"
+    assert max(worst.accuracy["train"].sse_mm2) <= max(total.accuracy["train"].sse_mm2)
+
+
+@pytest.mark.parametrize("backend", ["quadprog", "clarabel", "osqp", "proxqp"])
+def test_backends_agree(backend: str) -> None:
+    robot, data = shared("irb120")
+    best = [
+        max(mc.calibrate(robot, data, qp=qp, holdout=0.3).accuracy["train"].sse_mm2)
+        for qp in ("daqp", backend)
+    ]
+    assert best[1] == pytest.approx(best[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("times", [8, pytest.param(200, marks=pytest.mark.slow)])
+def test_turning_and_moving_the_frame(times: int) -> None:
+    robot, path = shared("irb120")
+    data = mc.read_measurements(path)
+    rng = np.random.default_rng(0)
+    nominal = mc.load_robot(robot)
+    total = mc.calibrate(nominal, data, "sum")
+    worst = mc.calibrate(nominal, data, "minimax")
+    for _ in range(times):
+        turn = Rotation.random(rng=rng).as_matrix()
+        moved = data.with_y(data.y @ turn.T + rng.uniform(-5, 5, 3))
+        again = mc.calibrate(nominal, moved, "sum")
+        for key in ("train", "holdout"):
+            length = np.linalg.norm(again.errors[key], axis=-1)
+            np.testing.assert_allclose(
+                length, np.linalg.norm(total.errors[key], axis=-1), rtol=0, atol=1e-9
+            )  # 1e-6 mm
+        other = mc.calibrate(nominal, moved, "minimax")
+        assert max(other.accuracy["train"].sse_mm2) == pytest.approx(
+            max(worst.accuracy["train"].sse_mm2), rel=1e-8
+        )

@@ -1,0 +1,135 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import minimax_cal as mc
+
+ROBOT = {
+    "name": "two bars",
+    "units": {"length": "mm", "angle": "deg"},
+    "joints": [
+        {"a": 300, "d": 0, "theta": 0, "alpha": 90, "lower": -170, "upper": 170, "ratio": 100},
+        {
+            "a": 0,
+            "d": 10,
+            "theta": 0,
+            "alpha": 0,
+            "type": "prismatic",
+            "upper": 200,
+            "lower": 0,
+            "mass_kg": 3,
+            "com_mm": [1, 2, 3],
+        },
+    ],
+}
+TOML = """
+name = "two bars"
+units = {length = "mm", angle = "deg"}
+[[joints]]
+a = 300
+d = 0
+theta = 0
+alpha = 90
+lower = -170
+upper = 170
+ratio = 100
+[[joints]]
+a = 0
+d = 10
+theta = 0
+alpha = 0
+type = "prismatic"
+lower = 0
+upper = 200
+mass_kg = 3
+com_mm = [1, 2, 3]
+"""
+YAML = """
+name: two bars
+units: {length: mm, angle: deg}
+joints:
+  - {a: 300, d: 0, theta: 0, alpha: 90, lower: -170, upper: 170, ratio: 1e2}
+  - {a: 0, d: 10, theta: 0, alpha: 0, type: prismatic, lower: 0, upper: 200, mass_kg: 3,
+     com_mm: [1, 2, 3]}
+"""
+
+
+def test_json_toml_and_yaml_are_the_same_robot(tmp_path: Path) -> None:
+    robots = []
+    for name, text in (("r.json", json.dumps(ROBOT)), ("r.toml", TOML), ("r.yaml", YAML)):
+        (tmp_path / name).write_text(text)
+        robots.append(mc.load_robot(tmp_path / name).to_dict())
+    assert robots[0] == robots[1] == robots[2]
+    first, second = robots[0]["joints"]
+    assert first["alpha"] == pytest.approx(np.pi / 2, abs=1e-15)
+    assert second["type"] == "prismatic"
+    assert second["upper"] == pytest.approx(200, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", mc.builtin_robots())
+def test_saved_robot_comes_back(name: str, tmp_path: Path) -> None:
+    robot = mc.load_robot(name)
+    robot.save(tmp_path / "r.json")
+    again = mc.load_robot(tmp_path / "r.json")
+    np.testing.assert_allclose(again.mdh, robot.mdh, rtol=1e-15, atol=1e-18)
+    np.testing.assert_allclose(again.upper, robot.upper, rtol=1e-15)
+    assert_array_equal(again.sign, robot.sign)
+    assert_array_equal(again.prismatic, robot.prismatic)
+
+
+def changed(**fields: object) -> str:
+    return json.dumps({**ROBOT, **fields})
+
+
+def joint(**fields: object) -> str:
+    first, second = ROBOT["joints"]  # type: ignore[misc]
+    return json.dumps({**ROBOT, "joints": [{**first, **fields}, second]})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ("{", "cannot be parsed"),
+        ("[1, 2]", "holds no robot"),
+        ("[" * 100_000, "cannot be parsed"),
+        (changed(joints=[]), "joints"),
+        (changed(units={"length": "inch", "angle": "deg"}), "units.length"),
+        (changed(convention="Craig"), "convention 'Craig'"),
+        (changed(up=[0, 0, 0]), "up: is a zero vector"),
+        (joint(alpha="ninety"), "joints[0].alpha"),
+        (joint(sign=2), "joints[0].sign"),
+        (joint(bta=0.1), "did you mean 'beta'"),
+        (joint(lower=10, upper=-10), "joint 1: lower must be less"),
+        (json.dumps({"name": "x"}), "units"),
+        (joint(a=float("nan")), "joints[0].a"),
+    ],
+)
+def test_broken_robot_files_say_what_is_wrong(text: str, say: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    path.write_text(text)
+    with pytest.raises(mc.RobotError) as caught:
+        mc.load_robot(path)
+    message = str(caught.value)
+    assert say in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+def test_unknown_names_get_a_hint(tmp_path: Path) -> None:
+    with pytest.raises(mc.RobotError, match="did you mean 'irb2600'"):
+        mc.load_robot("irb260")
+    with pytest.raises(mc.RobotError, match="cannot be read"):
+        mc.load_robot(tmp_path / "absent.json")
+    (tmp_path / "robot.txt").write_text("x")
+    with pytest.raises(mc.RobotError, match="not a robot file"):
+        mc.load_robot(tmp_path / "robot.txt")
+
+
+def test_yaml_cannot_run_code(tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text("!!python/object/apply:os.system ['echo hacked']")
+    with pytest.raises(mc.RobotError, match="cannot be parsed"):
+        mc.load_robot(path)
