@@ -169,7 +169,7 @@ def slsqp_minimax(case: Case, begin: State) -> float:
 
     unit = np.zeros(size + 1)
     unit[size] = 1.0
-    found = optimize.minimize(
+    found = optimize.minimize(  # type: ignore[call-overload]
         lambda u: float(u[size]),
         np.append(np.zeros(size), 1.0),
         jac=lambda u: unit,
