@@ -5,6 +5,7 @@ from minimax_cal.calibration import Calibration
 from minimax_cal.cell import Cell, evaluate, load_cell
 from minimax_cal.data import Measurements, measurements, read_measurements, write_measurements
 from minimax_cal.errors import CalibrationError, DataError, OptionError, RobotError
+from minimax_cal.minimize import minimize_max
 from minimax_cal.robot import Robot, builtin_robots, load_robot
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "load_cell",
     "load_robot",
     "measurements",
+    "minimize_max",
     "read_measurements",
     "write_measurements",
 ]

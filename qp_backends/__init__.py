@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from .accuracy import Accuracy, accuracy
+from .elimination import eliminate
 from .judge import solve
 from .problem import BackendError, Problem, Solution, Status
-from .registry import available, names, register
+from .registry import available, fallback_order, names, register
 
 __all__ = [
     "Accuracy",
@@ -15,6 +16,8 @@ __all__ = [
     "Status",
     "accuracy",
     "available",
+    "eliminate",
+    "fallback_order",
     "names",
     "register",
     "solve",

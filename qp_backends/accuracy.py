@@ -54,26 +54,36 @@ def accuracy(problem: Problem, solution: Solution) -> Accuracy:
 
     λ = min(1, δ / ‖P‖), the step on which the largest gradient meets the largest curvature, stands
     in for the size of x where x vanishes (1 for a linear program, which has no curvature). Without
-    it an exact x = 0 with a rounding error would have an infinite relative residual.
+    it an exact x = 0 with a rounding error would have an infinite relative residual.  For the same
+    reason δ, where q = 0, is at least ‖P‖ (1 if P = 0) times the distance to the farthest bound, or
+    times 1 if that is nearer.
     """
-    x, y, q, A = solution.x, solution.y, problem.q, problem.A
-    l, u = problem.l, problem.u  # noqa: E741
-    if x.shape != q.shape or y.shape != l.shape:
+    if solution.x.shape != problem.q.shape or solution.y.shape != problem.l.shape:
         return NOWHERE
+    with np.errstate(over="ignore", invalid="ignore"):  # x may be as wrong as it likes
+        return _judged(problem, solution.x, solution.y)
+
+
+def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
+    """The residuals of an x and y of the right shape."""
+    P, q, A, l, u = problem.P, problem.q, problem.A, problem.l, problem.u  # noqa: E741
     bound = np.where(y > 0, u, l)
     bound[y == 0] = 0.0
     support = float(y @ bound)
     if not math.isfinite(support):  # NaN, or a multiplier at an open side
-        y, bound = np.where(np.isinf(bound), 0.0, (y, bound))
+        y, bound = np.where(np.isinf(bound) & ~np.isnan(y), 0.0, (y, bound))
         support = float(y @ bound)
-    Px, Ax, Aty = problem.P @ x, A @ x, y @ A
+    Px, Ax, Aty = P @ x, A @ x, y @ A
     xPx, qx = float(x @ Px), float(q @ x)
     gap = abs(xPx + qx + support)
     if not math.isfinite(gap):
         return NOWHERE
     outside = Ax - np.minimum(np.maximum(Ax, l), u)
-    dual, delta = _size(Px + q + Aty), max(_size(Px), _size(q), _size(Aty))
-    curvature = float(problem.P.diagonal().max(initial=0.0))  # the largest entry, P being psd
+    slope, dual = _size(q), _size(Px + q + Aty)
+    delta = max(slope, _size(Px), _size(Aty))
+    curvature = float(P.diagonal().max(initial=0.0))  # the largest entry, P being psd
+    if slope == 0.0:
+        delta = max(delta, (curvature or 1.0) * _reach(problem))
     step = min(1.0, delta / curvature) if curvature > 0 else 1.0
     return Accuracy(
         primal=_size(outside),
@@ -86,6 +96,13 @@ def accuracy(problem: Problem, solution: Solution) -> Accuracy:
         gap_relative=_ratio(gap, max(abs(xPx), abs(qx), abs(support), delta * step)),
         objective=0.5 * xPx + qx,
     )
+
+
+def _reach(problem: Problem) -> float:
+    """Distance from 0 to the farthest finite bound, at most 1; 1 where all bounds are 0 or open."""
+    ends = np.abs((problem.l, problem.u)) / problem.row_norm
+    farthest = float(np.where(np.isfinite(ends), ends, 0.0).max(initial=0.0))
+    return min(1.0, farthest or 1.0)
 
 
 def _size(vector: Array) -> float:

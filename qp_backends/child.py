@@ -26,8 +26,8 @@ def run(
 ) -> Solution:
     """The answer of a module's `solve` if it comes in time, TIME_LIMIT without x if not.
 
-    Starting the process takes about a second, so this is for problems on which a solver can spend
-    much longer than that.
+    Starting the process takes half a second, so this is for problems on which a solver may spend
+    more than the limit.
     """
     paths = (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
     task = pickle.dumps((module, problem, method, tolerance, warm_start))

@@ -115,9 +115,9 @@ def _persist(job: Job, queue: Sequence[str], raw: Solution) -> Solution:
         notes += (remark,)
         if worst < least:
             best, least = replace(better, backend=name), worst
-        if not asked and (raw.status in NO_ANSWER or last):
+        if not asked and job.left > 0 and (raw.status in NO_ANSWER or last):
             asked = True  # once is enough: the answer does not depend on the backend
-            status, certificate = proof(job.problem, max(job.left, 1e-3))
+            status, certificate = proof(job.problem, job.left)
             if status is not Status.FAILED:
                 none = nothing(job.problem, status)
                 return _closed(job, replace(none, certificate=certificate), status, name, notes)

@@ -21,6 +21,8 @@ class Trait:
     tolerances: its settings that mean `tolerance`; none for a direct method.
     finest: the smallest tolerance it makes sense to ask for.
     clock: its setting for a time limit [s]; empty when it has none.
+    pace: what a solve takes at most, per (variables + rows)³, where there is no clock [s].
+    sparse_pace: the same for sparse data [s].
     warm: how it takes a warm start: "x", "dual" or "all"; empty when it does not.
     definite: whether it refuses a P that is only semi-definite.
     fixed: settings of the first run.
@@ -32,6 +34,8 @@ class Trait:
     tolerances: tuple[str, ...] = ()
     finest: float = 1e-13
     clock: str = ""
+    pace: float = 1e-9
+    sparse_pace: float = 1e-9
     warm: Literal["x", "dual", "all", ""] = ""
     definite: bool = False
     fixed: Mapping[str, Any] = field(default_factory=dict)
@@ -52,6 +56,7 @@ TRAITS = {
     "piqp": Trait(
         box=True,
         tolerances=("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"),
+        sparse_pace=1e-12,
     ),
     "clarabel": Trait(
         "sparse",

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .problem import Problem
 
 LARGEST_DENSE = 30_000_000  # entries of P and A that a dense solver is given, 240 MB
-LONG = 600  # variables and rows from which a solver may take longer than to start a process
 
 
 def solve(
@@ -34,7 +33,8 @@ def solve(
     """The answer of one solver of qpsolvers as the solver gives it, not yet judged."""
     start = time.perf_counter()
     trait = TRAITS.get(method, Trait())
-    if time_limit < np.inf and not trait.clock and sum(problem.A.shape) > LONG:
+    pace = trait.sparse_pace if problem.has_sparse else trait.pace
+    if not trait.clock and time_limit < pace * sum(problem.A.shape) ** 3:
         return child.run(__name__, problem, method, tolerance, time_limit, warm_start)
     rows = split(problem, trait.box)
     chosen = settings(method, tolerance, time_limit)
@@ -45,8 +45,9 @@ def solve(
         raw = _definite(qp, method, chosen, tolerance, start + time_limit)
     else:
         raw = _run(qp, method, chosen)
-        if not raw.found and trait.rescue and time.perf_counter() < start + time_limit:
-            raw = _run(qp, method, chosen | trait.rescue)
+        left = start + time_limit - time.perf_counter()
+        if not raw.found and trait.rescue and left > 0:
+            raw = _run(qp, method, settings(method, tolerance, left) | dict(trait.rescue))
     return _answer(problem, rows, raw, method, time.perf_counter() - start)
 
 

@@ -53,3 +53,16 @@ def epigraph(
     u[:maxima] = values.max() - values
     l[maxima:] = -0.01
     return Problem(P, q, A, l, u)
+
+
+def random_problem(rng: np.random.Generator, n: int = 8, rank: int = 5, m: int = 12) -> Problem:
+    """A feasible problem with equalities, one- and two-sided rows and open ones; P of some rank."""
+    root = rng.normal(size=(rank, n))
+    A = rng.normal(size=(m, n))
+    center = A @ rng.normal(size=n)
+    l, u = center - rng.random(m), center + rng.random(m)  # noqa: E741
+    kind = np.arange(m) % 4
+    l[kind == 0] = u[kind == 0] = center[kind == 0]
+    l[kind == 1] = -np.inf
+    u[kind == 2] = np.inf
+    return Problem(root.T @ root, root.T @ rng.normal(size=rank), A, l, u)

@@ -13,7 +13,7 @@ LAYERS = (
     "parameters gates",
     "model cell",
     "identify start worst",
-    "calibration simulate",
+    "calibration simulate minimize",
     "calibrate figures",
     "cli",
 )

@@ -149,7 +149,7 @@ def solve(
     x: X,
     qp: Solver,
     settings: Sqp = Sqp(),
-    progress: Callable[[int, float], None] = lambda iteration, value: None,
+    progress: Callable[[Step], None] = lambda step: None,
 ) -> Optimum[X]:
     """Minimise max f from x.  qp: a QP solver whose answers are already verified."""
     lower, upper = problem.lower, problem.upper
@@ -197,7 +197,7 @@ def solve(
         trace.append(
             Step(iteration, float(here.f.max()), kkt.violation, kkt.residual, length, plan.backend)
         )
-        progress(iteration, float(here.f.max()))
+        progress(trace[-1])
         if kkt.residual <= settings.tolerance:
             status = Status.CONVERGED
             break
@@ -212,7 +212,8 @@ def solve(
         if length == 0.0:
             damping = max(10.0 * damping, 1e-3)
             if damping > 1e8:
-                status = Status.STALLED
+                stuck = kkt.violation > settings.tolerance
+                status = Status.INFEASIBLE if stuck else Status.STALLED
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0

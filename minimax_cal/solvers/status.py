@@ -23,8 +23,9 @@ class Status(StrEnum):
 ADVICE = {
     Status.CONVERGED: "",
     Status.ITERATION_LIMIT: "the iteration limit was reached; allow more iterations",
-    Status.STALLED: "no step lowers the error any more, yet the optimality test fails; "
-    "try another QP backend, or fix weakly determined parameters (--fix) or give them priors",
-    Status.INFEASIBLE: "the constraints contradict each other; loosen the distance tolerance",
+    Status.STALLED: "no step lowers the objective any more, yet the optimality test fails; try "
+    "another QP backend, or (in a calibration) fix weakly determined parameters or give priors",
+    Status.INFEASIBLE: "the constraints could not be met and may contradict each other; loosen "
+    "them (in a calibration the distance tolerance)",
     Status.FAILED: "the numbers broke down; check units and joint signs, try another QP backend",
 }

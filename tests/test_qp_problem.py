@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import sparse
+
+from qp_backends import BackendError, Problem
+
+
+def test_data_become_float_arrays_and_far_bounds_open():
+    problem = Problem([[2, 0], [0, 2]], [1, 1], [[1, 1]], [-1e20], [5])
+    assert problem.P.dtype == problem.q.dtype == problem.A.dtype == np.float64
+    assert_array_equal(problem.l, [-np.inf])
+    assert_array_equal(problem.u, [5.0])
+
+
+def test_read_only_data_are_copied():
+    P = np.eye(2)
+    P.flags.writeable = False
+    assert Problem(P, np.zeros(2), np.zeros((0, 2)), [], []).P.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"P": np.ones((2, 3))}, "square"),
+        ({"P": np.ones(2)}, "two dimensions"),
+        ({"P": [[1.0, 1.0], [0.0, 1.0]]}, "both triangles"),
+        ({"q": [1.0]}, r"q has shape \(1,\)"),
+        ({"A": np.ones((1, 3))}, "A has 3 columns"),
+        ({"l": [0.0, 0.0]}, "l has shape"),
+        ({"u": [np.nan]}, "NaN"),
+        ({"q": [np.nan, 0.0]}, "q holds NaN"),
+        ({"A": [[np.inf, 0.0]]}, "A holds NaN or infinite"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(change, message):
+    data = {"P": np.eye(2), "q": np.zeros(2), "A": np.ones((1, 2)), "l": [0.0], "u": [1.0]}
+    with pytest.raises(BackendError, match=message):
+        Problem(**(data | change))
+
+
+def test_row_norm_is_the_same_dense_and_sparse():
+    A = np.array([[3.0, 4.0], [0.0, 0.0], [0.0, -2.0]])
+    bounds = np.zeros(3), np.ones(3)
+    dense = Problem(np.eye(2), np.zeros(2), A, *bounds)
+    thin = Problem(sparse.eye_array(2), np.zeros(2), sparse.coo_array(A), *bounds)
+    assert_allclose(dense.row_norm, [5.0, 1.0, 2.0], rtol=1e-15)
+    assert_allclose(thin.row_norm, dense.row_norm, rtol=1e-15)
+    assert thin.has_sparse
+    assert not dense.has_sparse
