@@ -35,7 +35,7 @@ from minimax_cal.robot import Robot, load_robot
 from minimax_cal.simulate import simulate
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.tables import Table
-from minimax_cal.worst import WorstTarget, measured_distances, worst_target
+from minimax_cal.worst import Worst, measured_distances, worst_of
 from qp_backends import solve as solve_qp
 
 
@@ -46,7 +46,7 @@ class Case:
     robot: Robot
     model: Model
     begin: State
-    worst: Callable[[State], WorstTarget]
+    worst: Callable[[State], Worst]
 
 
 def case_of(poses: int, seed: int) -> Case:
@@ -65,7 +65,7 @@ def case_of(poses: int, seed: int) -> Case:
     )
     model = model.only(found.active)
     distances = measured_distances(data)
-    return Case(robot, model, begin, lambda x: worst_target(model, x, distances, "two-sided"))
+    return Case(robot, model, begin, lambda x: worst_of(model, x, distances, "two-sided", "target"))
 
 
 def ours_squares(case: Case) -> State:

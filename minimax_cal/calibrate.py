@@ -27,7 +27,7 @@ from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_norma
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from minimax_cal.start import Frame
-from minimax_cal.worst import DISTANCE_FORMS, Distances, measured_distances, worst_target
+from minimax_cal.worst import DISTANCE_FORMS, Distances, measured_distances, worst_of
 from qp_backends import BackendError, Problem
 from qp_backends import solve as solve_qp
 
@@ -46,8 +46,9 @@ POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calib
 class Options:
     """How to calibrate.
 
-    objective: sum, minimax, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the
-    poses kept out of the fit.  seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    objective: sum, minimax (the worst target), point (the worst point), or smr:K.
+    qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
+    seed: of that choice.  fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
     distance constraints, two-sided, squared or off.  distance_tolerance: [m], NaN for the
@@ -134,6 +135,7 @@ def calibrate(
         worst=fit.worst,
         distances=fit.distances,
         trace=fit.trace,
+        train_lines=train.line,
         notices=(*notices, *fit.notices),
         provenance=Provenance.of(robot, data, vars(chosen)),
     )
@@ -141,12 +143,12 @@ def calibrate(
 
 def objective_of(objective: str, data: Measurements) -> int:
     """Index of the single target of smr:K, else -1.  Raises OptionError."""
-    if objective in ("sum", "minimax"):
+    if objective in ("sum", "minimax", "point"):
         return -1
     kind, _, which = objective.partition(":")
     if kind != "smr" or not which:
         raise OptionError(
-            f"no objective {objective!r}; choose sum, minimax or smr:K (K as in smr1)"
+            f"no objective {objective!r}; choose sum, minimax, point or smr:K (K as in smr1)"
         )
     if f"smr{which}" not in data.targets:
         raise OptionError(
@@ -235,14 +237,15 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     iterations = int(squares.iterations[0])
     distances = measured_distances(data, options.distance_tolerance)
     worst: tuple[Optimum[State], ...] = ()
-    if options.objective == "minimax" and k > 1:
+    per = {"minimax": "target", "point": "point"}.get(options.objective, "")
+    if per == "point" or (per == "target" and k > 1):
         report("minimax")
-        problem = worst_target(model, state, distances, options.distance)
+        problem = worst_of(model, state, distances, options.distance, per)
         qp = partial(solve_qp, name=options.qp, tolerance=QP_TOLERANCE)
         best = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
-        share = np.maximum(best.mu, FLOOR) / model.counts
+        share = np.maximum(best.mu, FLOOR) / model.counts if per == "target" else share
         notices += tuple(f"QP: {note}" for note in best.notes)
     return Fit(
         names=names,

@@ -88,6 +88,7 @@ class Calibration:
     predicted points under the same keys, NaN where not measured [m].  covariance: (p, p) of all
     parameters, NaN where not identified [SI, base in its own axes].  worst: the minimax answer, if
     one was asked for.  trace: cost at each iterate of the least squares [m^2].
+    train_lines: lines of the file that were fitted.
     """
 
     robot: Robot
@@ -106,6 +107,7 @@ class Calibration:
     worst: tuple[Optimum[State], ...]
     distances: Distances
     trace: tuple[float, ...]
+    train_lines: Array
     notices: tuple[str, ...]
     provenance: Provenance
 
@@ -166,20 +168,46 @@ class Calibration:
         )
 
     def minimax_table(self) -> Table:
-        """What the minimax found: F_i, multipliers, activity; empty without one."""
-        rows: list[tuple[str, float, float, str]] = []
+        """What the minimax found: errors, multipliers, activity; empty without one."""
+        rows: list[tuple[TableCell, ...]] = []
         for best in self.worst:
-            top = best.f.max()
-            for name, sse, f, mu in zip(
-                self.cell.targets, self.worst_mm2, best.f, best.mu, strict=True
-            ):
-                rows.append((name, sse, float(mu), "yes" if f >= top * (1 - 1e-6) else ""))
-        return Table(
-            "worst target on the training poses",
-            ("target", "F_i mm^2", "multiplier", "active"),
-            tuple(rows),
-            ("", ".4f", ".4f", ""),
+            for i in self.telling(best):
+                active = "yes" if self.is_active(best)[i] else ""
+                rows.append((self.labels[i], self.sizes[i], float(best.mu[i]), active))
+        if self.objective == "point":
+            title, size = "points that decide, on the training poses", "distance mm"
+        else:
+            title, size = "worst target on the training poses", "F_i mm^2"
+        header = ("point" if self.objective == "point" else "target", size, "multiplier", "active")
+        return Table(title, header, tuple(rows), ("", ".4f", ".4f", ""))
+
+    def telling(self, best: Optimum[State]) -> list[int]:
+        """The functions worth a row: every target, or the points with a multiplier."""
+        order = np.argsort(-best.mu) if self.objective == "point" else np.arange(len(best.mu))
+        return [int(i) for i in order if self.objective != "point" or best.mu[i] > 1e-6]
+
+    def is_active(self, best: Optimum[State]) -> Array:
+        """True where a function equals the largest to 1e-6."""
+        return np.asarray(best.f >= best.f.max() * (1 - 1e-6))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the functions of the minimax: targets, or points by line of the file."""
+        if self.objective != "point":
+            return self.cell.targets
+        seen = np.isfinite(self.errors["train"][..., 0])
+        return tuple(
+            f"{self.cell.targets[target]} line {self.train_lines[pose]}"
+            for target, pose in np.argwhere(seen)
         )
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """F_i [mm^2] of the targets, or distances of the points [mm], on the training poses."""
+        if self.objective != "point":
+            return self.worst_mm2
+        distance = 1e3 * np.linalg.norm(self.errors["train"], axis=-1)
+        return tuple(distance[np.isfinite(distance)].tolist())
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -229,17 +257,12 @@ class Calibration:
             "provenance": vars(self.provenance),
         }
         for best in self.worst:
+            chosen = self.telling(best)
+            active = self.is_active(best)
             out["minimax"] = {
-                "max_F_over_m_mm2": max(
-                    f / m
-                    for f, m in zip(self.worst_mm2, self.accuracy["train"].counts, strict=True)
-                ),
-                "multipliers": best.mu.tolist(),
-                "active": [
-                    name
-                    for name, f in zip(self.cell.targets, best.f, strict=True)
-                    if f >= best.f.max() * (1 - 1e-6)
-                ],
+                "functions": [self.labels[i] for i in chosen],
+                "multipliers": [float(best.mu[i]) for i in chosen],
+                "active": [self.labels[i] for i in np.flatnonzero(active)],
                 "distances": [
                     {
                         "pair": [self.cell.targets[a], self.cell.targets[b]],

@@ -75,7 +75,7 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     "--objective",
     default=DEFAULTS.objective,
     show_default=True,
-    help="sum of squares, minimax (the worst target), or one target: smr:K.",
+    help="sum, minimax (the worst target), point (the worst point) or one target: smr:K.",
 )
 @click.option("--qp", default=DEFAULTS.qp, show_default=True, help="QP backend of minimax.")
 @click.option(

@@ -229,6 +229,11 @@ def vector(function: Callable[[Array], Any], x: Array) -> Array:
     return np.atleast_1d(np.asarray(function(x)))
 
 
+def unknown(weights: Array) -> Array:
+    """The curvature of functions that only BFGS can tell."""
+    return np.zeros((0, 0))
+
+
 @dataclass(frozen=True, eq=False)
 class MaxOfFunctions:
     """A problem over R^n as `solvers.minimax` wants it; functions are divided by size."""
@@ -255,8 +260,7 @@ class MaxOfFunctions:
     def linearise(self, x: Array) -> Linear:
         """f, c and their derivatives; the curvature is left to BFGS."""
         f, c = self.evaluate(x)
-        n = len(x)
-        return Linear(f, self.slope(x) / self.size, c, self.rows.slopes(x), np.zeros((0, n, n)))
+        return Linear(f, self.slope(x) / self.size, c, self.rows.slopes(x), unknown)
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""

@@ -160,16 +160,25 @@ class Model:
         select = Columns.of(self.names, active)
         cost, slope, gram = np.zeros((3, 1))
         for block in blocks:
-            error, point = self.error_of(state, block)
-            turned = select.jacobian(block, point)
-            if not self.even:
-                turned *= np.sqrt(self.weight[:, None, None, block.rows])
+            error, turned = self.rows_of(state, block, select)
             *batch, k, p, _, c = turned.shape
             flat = turned.reshape(*batch, k, p, 3 * c)
             cost = cost + np.einsum("...kcm,...kcm->...k", error, error)
             slope = slope + (flat @ error.reshape(*batch, k, 3 * c, 1))[..., 0]
             gram = gram + flat @ np.swapaxes(flat, -1, -2)
         return Normal(np.asarray(cost), np.asarray(slope), np.asarray(gram))
+
+    def weighted_rows(self, state: State, block: Block, active: Array) -> tuple[Array, Array]:
+        """Weighted errors (..., k, 3, c) and transposed Jacobian (..., k, p, 3, c) of one block."""
+        return self.rows_of(state, block, Columns.of(self.names, active))
+
+    def rows_of(self, state: State, block: Block, select: Columns) -> tuple[Array, Array]:
+        """`weighted_rows` with the choice of columns at hand."""
+        error, point = self.error_of(state, block)
+        turned = select.jacobian(block, point)
+        if not self.even:
+            turned *= np.sqrt(self.weight[:, None, None, block.rows])
+        return error, turned
 
     def coupling_on(self, state: State, blocks: list[Block]) -> Array:
         """M = sum of w e . d2x/(dr domega) for free lengths r and angles omega: (..., r, omega).

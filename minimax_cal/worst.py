@@ -1,11 +1,13 @@
-"""The worst target's error as a minimax problem, with the distances between targets kept [paper M].
+"""The worst error as a minimax problem, with the distances between targets kept [paper M].
 
-f_i = F_i / m_i, divided by its size at the start; parameters are scaled to unit curvature.  The
-solver then sees numbers near one, whatever the robot's size and the instrument's noise.
+The worst target, f_i = F_i / m_i, as in the paper; or the worst of all measured points.  Values are
+divided by their size at the start and parameters scaled to unit curvature: the solver then sees
+numbers near one, whatever the robot's size and the instrument's noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +15,7 @@ import numpy as np
 from minimax_cal.data import Measurements
 from minimax_cal.errors import OptionError
 from minimax_cal.kinematics import Array
-from minimax_cal.model import Model, Normal
+from minimax_cal.model import Model
 from minimax_cal.parameters import State
 from minimax_cal.solvers.minimax import Linear
 
@@ -62,19 +64,21 @@ def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distanc
 
 
 @dataclass(frozen=True, eq=False)
-class WorstTarget:
-    """min over x of max_i F_i / m_i, as `solvers.minimax` wants it.
+class Worst:
+    """min over x of the largest f_i, as `solvers.minimax` wants it.
 
-    start, normal: where the scaling was found, and the normal equations there.
+    per: "target" for f_i = F_i / m_i, "point" for the squared distance of every measured point.
+    start, first: where the scaling was found, and the derivatives there.
     scale: (free,) divides a step's entries.  size: divides the f_i [m^2].
     form: "two-sided" |e| <= tol, or the paper's "squared" e^2 <= tol^2, whose gradient vanishes
     at e = 0, or "off".
     """
 
+    per: str
     model: Model
     distances: Distances
     start: State
-    normal: Normal
+    first: Sensitivity
     scale: Array
     size: float
     form: str
@@ -106,33 +110,29 @@ class WorstTarget:
             slope, c = 2.0 * c[:, None] * slope, c**2
         return c, slope[:, self.model.active] / self.scale
 
-    def mean_squares(self, x: State, cost: Array) -> Array:
-        """f_i from F_i, the prior added to each in the share it has in the sum of squares."""
-        off = self.model.prior.mean - self.model.values(x)
-        prior = float((self.model.prior.weight * off**2).sum())
-        total = self.model.counts.sum()
-        return np.asarray((cost / self.model.counts + prior / total) / self.size)
-
     def evaluate(self, x: State) -> tuple[Array, Array]:
         """f and c."""
-        return self.mean_squares(x, self.model.cost(x)), self.deviation(x)[0]
+        value, _ = PER[self.per]
+        return (value(self.model, x) + prior_of(self.model, x)) / self.size, self.deviation(x)[0]
 
     def linearise(self, x: State) -> Linear:
         """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""
-        model, active = self.model, self.model.active
-        normal = self.normal if x is self.start else model.normal(x, active)
-        counts, total = model.counts[:, None], model.counts.sum()
-        weight = model.prior.weight[active]
-        off = (model.prior.mean - model.values(x))[active]
-        slope = -2.0 * (normal.slope / counts + weight * off / total)
-        curvature = 2.0 * (normal.gram / counts[..., None] + np.diag(weight) / total)
-        c, of_c = self.deviation(x)
+        model = self.model
+        at = self.first if x is self.start else PER[self.per][1](model, x)
+        total, weight = model.counts.sum(), model.prior.weight[model.active]
+        off = (model.prior.mean - model.values(x))[model.active]
+        c, normal = self.deviation(x)
+
+        def curvature(weights: Array) -> Array:
+            both = at.curvature(weights) + 2.0 * weights.sum() * np.diag(weight) / total
+            return np.asarray(both / self.size / self.scale[:, None] / self.scale)
+
         return Linear(
-            f=self.mean_squares(x, normal.cost),
-            slope=slope / self.size / self.scale,
+            f=(at.f + prior_of(model, x)) / self.size,
+            slope=(at.slope - 2.0 * weight * off / total) / self.size / self.scale,
             c=c,
-            normal=of_c,
-            curvature=curvature / self.size / self.scale[:, None] / self.scale,
+            normal=normal,
+            curvature=curvature,
         )
 
     def step(self, x: State, d: Array) -> State:
@@ -142,17 +142,81 @@ class WorstTarget:
         return x.step(full)
 
 
-def worst_target(model: Model, start: State, distances: Distances, form: str) -> WorstTarget:
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """f (n,) [m^2], its derivative (n, free), and the weighted sum of its curvatures."""
+
+    f: Array
+    slope: Array
+    curvature: Callable[[Array], Array]
+
+
+def prior_of(model: Model, x: State) -> float:
+    """The prior's part of every f_i: the share it has in a mean square [m^2]."""
+    off = model.prior.mean - model.values(x)
+    return float((model.prior.weight * off**2).sum() / model.counts.sum())
+
+
+def target_values(model: Model, x: State) -> Array:
+    """F_i / m_i of every target: (k,) [m^2]."""
+    return np.asarray(model.cost(x) / model.counts)
+
+
+def target_sensitivity(model: Model, x: State) -> Sensitivity:
+    """F_i / m_i and its derivatives."""
+    normal = model.normal(x, model.active)
+    counts = model.counts
+    return Sensitivity(
+        normal.cost / counts,
+        -2.0 * normal.slope / counts[:, None],
+        lambda weights: 2.0 * np.einsum("k,kij->ij", weights / counts, normal.gram),
+    )
+
+
+def point_values(model: Model, x: State) -> Array:
+    """The squared distance of every measured point, target by target: (points,) [m^2]."""
+    parts = [(model.error_of(x, block)[0] ** 2).sum(axis=-2) for block in model.blocks(x)]
+    return np.asarray(np.concatenate(parts, axis=-1)[model.seen])
+
+
+def point_sensitivity(model: Model, x: State) -> Sensitivity:
+    """Squared distances and their derivatives."""
+    blocks = model.blocks(x)
+    rows = [model.weighted_rows(x, block, model.active) for block in blocks]
+    f = np.concatenate([(error**2).sum(axis=-2) for error, _ in rows], axis=-1)
+    slopes = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
+    slope = np.concatenate(slopes, axis=1)
+
+    def curvature(weights: Array) -> Array:
+        spread = np.zeros(model.seen.shape)
+        spread[model.seen] = np.sqrt(weights)
+        total = np.zeros((slope.shape[-1],) * 2)
+        for block, (_, turned) in zip(blocks, rows, strict=True):
+            part = turned * spread[:, None, None, block.rows]
+            flat = np.moveaxis(part, 1, 0).reshape(len(total), -1)
+            total += flat @ flat.T
+        return 2.0 * total
+
+    return Sensitivity(f[model.seen], slope[model.seen], curvature)
+
+
+PER = {
+    "target": (target_values, target_sensitivity),
+    "point": (point_values, point_sensitivity),
+}
+
+
+def worst_of(model: Model, start: State, distances: Distances, form: str, per: str) -> Worst:
     """The minimax problem scaled at a start.  Raises OptionError for an unknown form."""
     if form not in DISTANCE_FORMS:
         raise OptionError(f"distance form {form!r}; choose {', '.join(DISTANCE_FORMS)}")
     if form == "off":
         none = np.zeros(0)
         distances = Distances(np.zeros((0, 2), dtype=int), none, none)
-    normal = model.normal(start, model.active)
-    size = float((normal.cost / model.counts).max())
+    first = PER[per][1](model, start)
+    size = float(first.f.max())
     size = size if size > 0.0 else 1e-18
-    mean = np.diag((normal.gram / model.counts[:, None, None]).mean(axis=0))
+    mean = 0.5 * np.diag(first.curvature(np.full(len(first.f), 1.0 / len(first.f))))
     mean = mean + model.prior.weight[model.active] / model.counts.sum()
     scale = np.sqrt(np.maximum(2.0 * mean / size, 1e-30))
-    return WorstTarget(model, distances, start, normal, scale, size, form)
+    return Worst(per, model, distances, start, first, scale, size, form)

@@ -30,6 +30,20 @@ def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> N
     assert_allclose(f / f.max(), best.f / best.f.max(), rtol=1e-9)
 
 
+def test_worst_point_is_lowered(robot: mc.Robot, noisy: Simulation) -> None:
+    total = mc.calibrate(robot, noisy.data, "sum")
+    point = mc.calibrate(robot, noisy.data, "point")
+    assert point.status == "converged"
+    assert point.accuracy["train"].max_mm < 0.8 * total.accuracy["train"].max_mm
+    table = point.minimax_table()
+    assert "line" in str(table.rows[0][0])
+    assert table.rows[0][1] == pytest.approx(point.accuracy["train"].max_mm, rel=1e-6)
+    # a certificate: no direction lowers all active points, since the multipliers balance them
+    (best,) = point.worst
+    assert best.kkt.residual < 1e-6
+    assert best.mu.sum() == pytest.approx(1.0)
+
+
 def test_single_target_objective_fits_that_target_alone(robot: mc.Robot, noisy: Simulation) -> None:
     fit = mc.calibrate(robot, noisy.data, "smr:2", holdout=0.0)
     alone = mc.calibrate(robot, noisy.data.only(1), "sum", holdout=0.0)

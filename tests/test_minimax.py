@@ -15,9 +15,14 @@ from minimax_cal.simulate import Simulation
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Linear, Sqp
 from minimax_cal.solvers.status import Status
-from minimax_cal.worst import WorstTarget, measured_distances, worst_target
+from minimax_cal.worst import Distances, Worst, measured_distances, worst_of
 from qp_backends import available
 from qp_backends import solve as solve_qp
+
+
+def worst_target(model: Model, x: State, distances: Distances, form: str) -> Worst:
+    return worst_of(model, x, distances, form, "target")
+
 
 BACKENDS = ("daqp", "quadprog", "clarabel", "osqp", "proxqp")
 
@@ -50,7 +55,7 @@ class Plain:
         slope = np.array([[g(s).imag / 1e-30 for s in steps] for g in self.functions])
         normal = np.array([[g(s).imag / 1e-30 for s in steps] for g in self.constraints])
         n = len(x)
-        return Linear(f, slope, c, normal.reshape(-1, n), np.zeros((0, n, n)))
+        return Linear(f, slope, c, normal.reshape(-1, n), lambda mu: np.zeros((0, 0)))
 
     def step(self, x: np.ndarray, d: np.ndarray) -> np.ndarray:
         return x + d
@@ -149,7 +154,7 @@ def test_backends_end_at_the_same_value(backend: str, robot: mc.Robot, noisy: Si
     assert_allclose(value_of(robot, noisy.data, backend), reference, rtol=1e-6)
 
 
-def slsqp_value(problem: WorstTarget, x: State) -> float:
+def slsqp_value(problem: Worst, x: State) -> float:
     size = int(problem.model.active.sum())
 
     def inequality(u: np.ndarray) -> np.ndarray:

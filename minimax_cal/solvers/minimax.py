@@ -42,14 +42,15 @@ class Linear:
     """Values and first derivatives at a point.
 
     f: (k,).  slope: (k, p) of f.  c: (l,).  normal: (l, p) of c.
-    curvature: (k, p, p) second derivatives of the f_i, or (0, p, p) when BFGS is to find them.
+    curvature: from weights (k,) to the weighted sum of the f_i's second derivatives (p, p), or to
+    an empty matrix where only BFGS can find them.
     """
 
     f: Array
     slope: Array
     c: Array
     normal: Array
-    curvature: Array
+    curvature: Callable[[Array], Array]
 
 
 class Minimax(Protocol[X]):
@@ -80,7 +81,8 @@ class Sqp:
     tolerance: on stationarity, complementarity and violation (problem scaled to about one).
     iterations: at most so many QPs.  floor: least weight of a function in the Gauss-Newton
     Hessian, which an inactive function would otherwise leave singular.
-    hessian: "gauss-newton" (weighted by the multipliers) or "bfgs" (damped, Powell).
+    hessian: "gauss-newton" (the problem's own curvature, weighted by the multipliers) or "bfgs"
+    (damped, Powell; it starts from the problem's curvature where there is one).
     """
 
     tolerance: float = 1e-8
@@ -157,7 +159,7 @@ def solve(
     k, p = here.slope.shape
     mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
     quasi = Bfgs.start(here, p)
-    exact = settings.hessian == "gauss-newton" and len(here.curvature) > 0
+    exact = settings.hessian == "gauss-newton"
     penalty, damping = 0.0, 0.0
     status = Status.ITERATION_LIMIT
     trace: list[Step] = []
@@ -168,7 +170,7 @@ def solve(
         if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.slope))):
             status = Status.FAILED
             break
-        hessian = weighted(here.curvature, mu, settings.floor) if exact else quasi.matrix
+        hessian = here.curvature(np.maximum(mu, settings.floor)) if exact else quasi.matrix
         hessian = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-8))
 
         def resolve(f: Array, c: Array, here: Linear = here, hessian: Array = hessian) -> Plan:
@@ -330,11 +332,6 @@ def excess(c: Array, lower: Array, upper: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(c - upper, lower - c), 0.0))
 
 
-def weighted(curvature: Array, mu: Array, floor: float) -> Array:
-    """The Gauss-Newton Hessian of the Lagrangian, every function with at least the floor weight."""
-    return np.asarray(np.einsum("k,kij->ij", np.maximum(mu, floor), curvature))
-
-
 def search(
     problem: Minimax[X], x: X, here: Linear, plan: Plan, penalty: float, resolve: Resolve
 ) -> tuple[float, Array, Linear]:
@@ -386,9 +383,9 @@ class Bfgs:
     @staticmethod
     def start(here: Linear, size: int) -> Bfgs:
         """The mean Gauss-Newton Hessian where there is one, else the identity."""
-        if len(here.curvature):
-            ridge = 1e-3 * np.diag(np.einsum("kii->i", here.curvature) / len(here.curvature))
-            return Bfgs(here.curvature.mean(axis=0) + ridge, fresh=False)
+        mean = here.curvature(np.full(len(here.f), 1.0 / len(here.f)))
+        if len(mean):
+            return Bfgs(mean + 1e-3 * np.diag(np.diag(mean)), fresh=False)
         return Bfgs(np.eye(size), fresh=True)
 
     def update(self, s: Array, before: Linear, after: Linear, mu: Array, lam: Array) -> Bfgs:
