@@ -27,6 +27,7 @@ import numpy as np
 from scipy import optimize
 
 from minimax_cal import identify, kinematics, start
+from minimax_cal.data import Measurements
 from minimax_cal.files import json_text, write_whole
 from minimax_cal.kinematics import Array
 from minimax_cal.model import Model, SumOfSquares, model_of
@@ -53,6 +54,13 @@ def case_of(poses: int, seed: int) -> Case:
     """IRB 2600, three targets, geometric errors, some compliance, tracker noise."""
     robot = load_robot("irb2600")
     data = simulate(robot, poses, 3, seed).data
+    model, begin = identified(robot, data)
+    distances = measured_distances(data)
+    return Case(robot, model, begin, lambda x: worst_of(model, x, distances, "two-sided", "target"))
+
+
+def identified(robot: Robot, data: Measurements) -> tuple[Model, State]:
+    """The model with its identified parameters free, and the nominal start."""
     model = model_of(robot, data)
     begin = start.fit_frame(model, robot.mdh).state
     found = identify.identify(
@@ -63,9 +71,14 @@ def case_of(poses: int, seed: int) -> Case:
         reference=identify.plenty_of_poses(robot, model),
         known=np.zeros(model.names.count, dtype=bool),
     )
-    model = model.only(found.active)
-    distances = measured_distances(data)
-    return Case(robot, model, begin, lambda x: worst_of(model, x, distances, "two-sided", "target"))
+    return model.only(found.active), begin
+
+
+def fitted(robot: Robot, data: Measurements) -> tuple[Model, State]:
+    """The same with its least-squares fit."""
+    model, begin = identified(robot, data)
+    found = least_squares.solve(SumOfSquares(model), begin.batch(), 1, float(model.counts.sum()))
+    return model, found.x.take(np.array(0))
 
 
 def ours_squares(case: Case) -> State:

@@ -1,0 +1,174 @@
+"""Quadratic programs to judge solvers on: from calibrations, from the literature, and hard ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+from scipy.io import loadmat
+
+from minimax_cal.kinematics import Array
+from minimax_cal.robot import load_robot
+from minimax_cal.simulate import simulate
+from minimax_cal.solvers import minimax
+from minimax_cal.worst import measured_distances, worst_of
+from qp_backends import Problem, Solution
+from qp_backends import solve as solve_qp
+
+SHARED = Path(__file__).parents[2] / "shared" / "data" / "maros_meszaros"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem and what is known of it: solvable, infeasible or unbounded."""
+
+    name: str
+    problem: Problem
+    kind: str = "solvable"
+
+
+def recorded(per: str, poses: int, seed: int) -> list[Case]:
+    """The QPs that one minimax calibration really solves, in order."""
+    from experiments.speed import fitted
+
+    robot = load_robot("irb2600")
+    data = simulate(robot, poses, 3, seed).data
+    model, state = fitted(robot, data)
+    problem = worst_of(model, state, measured_distances(data), "two-sided", per)
+    seen: list[Problem] = []
+
+    def listen(qp: Problem) -> Solution:
+        seen.append(qp)
+        return solve_qp(qp, "daqp", tolerance=1e-9)
+
+    minimax.solve(problem, state, listen)
+    rows = len(seen[0].l)
+    return [Case(f"{per} {rows} rows, seed {seed}, QP {i + 1}", p) for i, p in enumerate(seen)]
+
+
+def calibration_small(quick: bool) -> list[Case]:
+    """Worst of three targets with three distance rows."""
+    return [case for seed in range(3 if quick else 20) for case in recorded("target", 100, seed)]
+
+
+def calibration_large(quick: bool) -> list[Case]:
+    """Worst of 300 points with three distance rows."""
+    return [case for seed in range(1 if quick else 4) for case in recorded("point", 100, seed)]
+
+
+def maros_meszaros(quick: bool) -> list[Case]:
+    """The problems in shared data, if there: Maros and Meszaros 1999, in the OSQP form."""
+    paths = sorted(SHARED.glob("*.mat"))
+    cases = []
+    for path in paths:
+        data = loadmat(path)
+        P, A = sparse.csc_array(data["P"]), sparse.csc_array(data["A"])
+        low, high = data["l"].ravel(), data["u"].ravel()
+        low = np.where(low <= -1e20, -np.inf, low)  # the set's way to write infinity
+        high = np.where(high >= 1e20, np.inf, high)
+        cases.append(Case(path.stem, Problem(P, data["q"].ravel(), A, low, high)))
+    return [case for case in cases if len(case.problem.q) < 200] if quick else cases
+
+
+def hard(quick: bool) -> list[Case]:
+    """Degenerate, nearly singular, badly scaled, infeasible and unbounded problems."""
+    rng = np.random.default_rng(0)
+    cases = []
+    for trial in range(2 if quick else 6):
+        n, m = 20, 30
+        root = rng.normal(size=(n, n))
+        x = rng.normal(size=n)
+        rows = rng.normal(size=(m, n))
+        at = rows @ x
+        room = rng.uniform(0.1, 1.0, m)
+        q = rng.normal(size=n)
+        open_below = np.full(m, -np.inf)
+        make = partial(problem_of, x=x)
+        cases += [
+            Case(f"degenerate {trial}", make(root @ root.T, rows, q, np.zeros(m))),
+            Case(
+                f"repeated rows {trial}",
+                Problem(
+                    root @ root.T,
+                    q,
+                    np.repeat(rows, 2, axis=0),
+                    *(np.repeat(side, 2) for side in (open_below, at + room)),
+                ),
+            ),
+            Case(
+                f"nearly singular {trial}",
+                Problem(spectrum(rng, n, 1e-9), q, rows, at - room, at + room),
+            ),
+            Case(
+                f"singular {trial}",
+                Problem(root[:, :4] @ root[:, :4].T, q, rows, at - room, at + room),
+            ),
+            Case(
+                f"badly scaled {trial}",
+                scaled(rng, Problem(root @ root.T, q, rows, at - room, at + room)),
+            ),
+            Case(
+                f"infeasible {trial}",
+                Problem(
+                    root @ root.T,
+                    q,
+                    np.vstack([rows, rows[:1]]),
+                    np.append(open_below, at[0] + 2.0),
+                    np.append(at + room, np.inf),
+                ),
+                "infeasible",
+            ),
+            Case(f"unbounded {trial}", unbounded(rng, n), "unbounded"),
+        ]
+    return cases
+
+
+def problem_of(P: Array, rows: Array, q: Array, room: Array, x: Array) -> Problem:
+    """More active rows than unknowns meet in x, which is the solution."""
+    count = len(x) + 5
+    y = np.where(np.arange(len(rows)) < count, 1.0, 0.0)
+    pull = -P @ x - rows.T @ y  # stationarity at x
+    slack = np.where(y > 0, 0.0, 1.0) + room
+    return Problem(P, pull, rows, np.full(len(rows), -np.inf), rows @ x + slack)
+
+
+def spectrum(rng: np.random.Generator, n: int, least: float) -> Array:
+    """A symmetric matrix with eigenvalues from 1 down to least."""
+    basis, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    matrix = (basis * np.geomspace(1.0, least, n)) @ basis.T
+    return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def scaled(rng: np.random.Generator, problem: Problem) -> Problem:
+    """The same problem in units that differ by up to 1e8, rows by up to 1e6."""
+    unit = 10.0 ** rng.uniform(-4, 4, len(problem.q))
+    row = 10.0 ** rng.uniform(-3, 3, len(problem.l))
+    return Problem(
+        problem.P * np.outer(unit, unit),
+        problem.q * unit,
+        problem.A * np.outer(row, unit),
+        problem.l * row,
+        problem.u * row,
+    )
+
+
+def unbounded(rng: np.random.Generator, n: int) -> Problem:
+    """No curvature and no bound along one direction, downhill."""
+    away = rng.normal(size=n)
+    away /= np.linalg.norm(away)
+    across = np.eye(n) - np.outer(away, away)
+    root = across @ rng.normal(size=(n, n))
+    rows = rng.normal(size=(8, n)) @ across
+    P = root @ root.T
+    return Problem(0.5 * (P + P.T), -away, rows, -np.ones(8), np.ones(8))
+
+
+SETS = {
+    "calibration, 6 rows": calibration_small,
+    "calibration, 303 rows": calibration_large,
+    "Maros-Meszaros": maros_meszaros,
+    "hard": hard,
+}

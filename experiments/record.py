@@ -1,0 +1,70 @@
+"""What every study leaves behind: tables, figures, and what they were made on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from minimax_cal.figures import save
+from minimax_cal.files import json_text, write_whole
+from minimax_cal.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
+
+
+def environment(packages: Iterable[str] = ()) -> Table:
+    """The machine and the versions that a table was made with."""
+    rows = [
+        ("system", platform.platform(terse=True)),
+        ("processor", processor()),
+        ("cores", str(os.cpu_count())),
+        ("threads", os.environ.get("OMP_NUM_THREADS", "as the libraries choose")),
+        ("python", platform.python_version()),
+    ]
+    for package in (*PACKAGES, *packages):
+        try:
+            rows.append((package, version(package)))
+        except PackageNotFoundError:
+            continue
+    return Table("made on", ("what", "value"), tuple(rows))
+
+
+def processor() -> str:
+    """The processor's name where the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    for line in cpuinfo.read_text().splitlines() if cpuinfo.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.machine()
+
+
+def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
+    """Write tables as name.md, name.tex and one CSV each, and show them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / f"{name}.md", "\n".join(table.markdown() for table in tables))
+    write_whole(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
+    for number, table in enumerate(tables, start=1):
+        write_whole(folder / f"{name}_{number}.csv", table.csv())
+        click.echo(table.text(130) + "\n")
+
+
+def save_figure(folder: Path, name: str, figure: Figure) -> None:
+    """Write a figure as PNG and SVG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for suffix in ("png", "svg"):
+        save(figure, folder / f"{name}.{suffix}")
+
+
+def save_json(path: Path, content: dict[str, object]) -> None:
+    """Write the figures of a study for other programs."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json_text({"schema": 1, **content}))

@@ -1,0 +1,497 @@
+"""What each QP backend is worth: accuracy, reliability and time, by one judge.
+
+    python -m experiments.solver_accuracy [--quick] [--out FOLDER] [--json FILE] [--seed N]
+
+On the QPs that calibrations really produce, on the Maros-Meszaros problems in shared data, and on
+hard ones.  Each backend is asked three times: through qpsolvers with its own defaults, and through
+our `solve` (no fallback) at a loose and at a tight tolerance.  A problem counts as solved where the
+judge finds primal, dual and gap at most 1e-6 relative to the problem's own scale
+(`qp_backends.accuracy` says how that is defined), whatever the solver claims.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+import qpsolvers
+from rich.progress import track
+from scipy import sparse
+
+from experiments.qp_cases import SETS, Case
+from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.speed import fitted
+from minimax_cal.kinematics import Array
+from minimax_cal.robot import load_robot
+from minimax_cal.simulate import simulate
+from minimax_cal.solvers import minimax
+from minimax_cal.tables import Cell, Table
+from minimax_cal.worst import measured_distances, worst_of
+from qp_backends import Accuracy, Problem, Solution, Status, accuracy, available
+from qp_backends import solve as solve_qp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SOLVED = 1e-6  # relative residual at which an answer counts as right
+LOOSE, TIGHT = 1e-6, 1e-9
+SETTINGS = ("own defaults", "ours 1e-6", "ours 1e-9")
+SHIFT = 1e-3  # of the shifted geometric mean of times [s]
+LIMIT = 10.0  # time for one problem [s]
+DIRECT = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
+ACROSS = "fallback order"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One backend on one problem: worst relative and the absolute residuals, and its claim."""
+
+    set: str
+    case: str
+    kind: str
+    backend: str
+    setting: str
+    status: str
+    worst: float
+    primal: float
+    dual: float
+    gap: float
+    objective: float
+    seconds: float
+
+    @property
+    def right(self) -> bool:
+        """Solved to the judge's satisfaction, or rightly called infeasible or unbounded."""
+        if self.kind != "solvable":
+            return self.status == self.kind
+        return self.worst <= SOLVED
+
+    @property
+    def lie(self) -> bool:
+        """Claimed solved, or a certificate, wrongly."""
+        claims = {"solved", "infeasible", "unbounded"}
+        return self.status in claims and not self.right
+
+
+def direct(problem: Problem, name: str) -> tuple[Callable[[], Any], Callable[[Any], Solution]]:
+    """A call of qpsolvers with the solver's defaults on ready data, and how to read its answer."""
+    sparse_form = sparse.issparse(problem.P) or sparse.issparse(problem.A)
+    low, high = problem.l, problem.u
+    same = low == high
+    above, below = np.isfinite(high) & ~same, np.isfinite(low) & ~same
+    A: Any = problem.A
+    A = A.tocsr() if sparse_form and hasattr(A, "tocsr") else A
+    stack = sparse.vstack if sparse_form else np.vstack
+    G, h = None, None
+    if above.any() or below.any():
+        G = stack([A[np.flatnonzero(above)], -A[np.flatnonzero(below)]])
+        h = np.concatenate([high[above], -low[below]])
+    E, b = (A[np.flatnonzero(same)], high[same]) if same.any() else (None, None)
+    P = problem.P
+    if name in ("daqp", "quadprog") and sparse_form:
+        P, G, E = (None if m is None else dense(m) for m in (P, G, E))
+    elif name not in ("daqp", "quadprog"):
+        P, G, E = (None if m is None else sparse.csc_matrix(m) for m in (P, G, E))
+    data = qpsolvers.Problem(P, problem.q, G, h, E, b)
+
+    def call() -> Any:
+        return qpsolvers.solve_problem(data, solver=name)
+
+    def answer(found: Any) -> Solution:
+        x, y = np.full(len(problem.q), np.nan), np.full(len(low), np.nan)
+        if found is not None and found.x is not None:
+            x = np.asarray(found.x, dtype=float)
+            y = np.zeros(len(low))
+            z = np.zeros(0) if found.z is None else np.asarray(found.z, dtype=float)
+            if len(z) == above.sum() + below.sum():
+                y[above] += z[: above.sum()]
+                y[below] -= z[above.sum() :]
+            if found.y is not None and same.any():
+                y[same] = np.asarray(found.y, dtype=float)[: same.sum()]
+        claim = found is not None and bool(found.found)
+        return Solution(x, y, Status.SOLVED if claim else Status.FAILED, 0.0, name)
+
+    return call, answer
+
+
+def dense(matrix: Any) -> Array:
+    """A matrix as an array."""
+    return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
+
+
+def attempt(case: Case, group: str, backend: str, setting: str) -> Run:
+    """Run one backend in one setting on one problem, and judge it."""
+    problem = case.problem
+    began = time.perf_counter()
+    solution = Solution(np.zeros(0), np.zeros(0), Status.FAILED, 0.0, backend)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # solvers warn about what the judge measures
+        try:
+            if setting == "own defaults":
+                call, answer = direct(problem, backend)
+                began = time.perf_counter()
+                found = call()
+                seconds = time.perf_counter() - began
+                solution = answer(found)
+            else:
+                tolerance = LOOSE if setting == "ours 1e-6" else TIGHT
+                name = "daqp" if backend == ACROSS else backend
+                solution = solve_qp(
+                    problem, name, tolerance=tolerance, time_limit=LIMIT, fallback=backend == ACROSS
+                )
+                seconds = time.perf_counter() - began
+        except Exception:  # a third-party solver may raise anything; the row then says failed
+            seconds = time.perf_counter() - began
+    judged = accuracy(problem, solution)
+    return Run(
+        group,
+        case.name,
+        case.kind,
+        backend,
+        setting,
+        solution.status.name.lower(),
+        judged.worst,
+        judged.primal,
+        judged.dual,
+        judged.gap,
+        judged.objective,
+        seconds,
+    )
+
+
+def references(cases: Sequence[Case]) -> dict[str, float]:
+    """Objectives by problem from the most accurate answer of several solvers; NaN without one."""
+    values = {}
+    for case in cases:
+        best = (np.inf, np.nan)
+        for name in ("daqp", "quadprog", "piqp", "clarabel", "highs"):
+            if case.kind == "solvable" and name in available() and best[0] > 1e-13:
+                solution = solve_qp(
+                    case.problem, name, tolerance=1e-11, time_limit=LIMIT, fallback=False
+                )
+                judged = accuracy(case.problem, solution)
+                best = min(best, (judged.worst, judged.objective))
+        values[case.name] = best[1] if best[0] <= 1e-8 else np.nan
+    return values
+
+
+def shifted_mean(times: Sequence[float]) -> float:
+    """Shifted geometric mean [s], robust against both very fast and very slow problems."""
+    return float(np.exp(np.mean(np.log(np.array(times) + SHIFT))) - SHIFT)
+
+
+def table_of(group: str, runs: Sequence[Run], reference: dict[str, float]) -> Table:
+    """One set of problems: a row a backend and setting."""
+    rows: list[tuple[Cell, ...]] = []
+    keys = dict.fromkeys((run.backend, run.setting) for run in runs)
+    for backend, setting in keys:
+        mine = [run for run in runs if (run.backend, run.setting) == (backend, setting)]
+        solved = [run for run in mine if run.right and run.kind == "solvable"]
+        off = [
+            abs(run.objective - reference[run.case]) / max(1.0, abs(reference[run.case]))
+            for run in solved
+            if np.isfinite(reference[run.case])
+        ]
+
+        def largest(values: Sequence[float]) -> float:
+            return max(values, default=np.nan)
+
+        rows.append(
+            (
+                backend,
+                setting,
+                len(mine),
+                float(100.0 * np.mean([run.right for run in mine])),
+                sum(run.lie for run in mine),
+                largest([run.worst for run in solved]),
+                largest([run.primal for run in solved]),
+                largest([run.dual for run in solved]),
+                largest([run.gap for run in solved]),
+                largest(off),
+                1e3 * shifted_mean([run.seconds for run in mine]),
+            )
+        )
+    return Table(
+        f"{group}: residuals are the largest over the problems solved",
+        ("backend", "setting", "problems", "right %", "wrongly claimed", "worst relative",
+         "primal abs", "dual abs", "gap abs", "objective error", "ms (shifted mean)"),
+        tuple(rows),
+        ("", "", "d", ".1f", "d", *[".1e"] * 5, ".3f"),
+    )  # fmt: skip
+
+
+def detail(group: str, runs: Sequence[Run]) -> Table:
+    """Every problem of a set with the answer of our fallback order."""
+    mine = [run for run in runs if run.backend == ACROSS and run.setting == "ours 1e-6"]
+    rows = tuple(
+        (run.case, run.status, run.worst, run.primal, run.dual, run.gap, run.objective,
+         1e3 * run.seconds)
+        for run in mine
+    )  # fmt: skip
+    return Table(
+        f"{group}, problem by problem: our fallback order at 1e-6",
+        ("problem", "status", "worst relative", "primal abs", "dual abs", "gap abs", "objective",
+         "ms"),
+        rows,
+        ("", "", ".1e", ".1e", ".1e", ".1e", ".8g", ".2f"),
+    )  # fmt: skip
+
+
+def overhead(cases: Sequence[Case], backends: Sequence[str], repeats: int) -> Table:
+    """Our `solve`, its check included, against qpsolvers.solve_problem on the same data."""
+    rows: list[tuple[Cell, ...]] = []
+    for backend in backends:
+        ratios, ours_all, theirs_all = [], [], []
+        for case in cases:
+            call, _ = direct(case.problem, backend)
+            ours = partial(solve_qp, case.problem, backend, tolerance=LOOSE, fallback=False)
+            mine: list[float] = []
+            theirs: list[float] = []
+            for _ in range(repeats + 1):
+                for run, times in ((ours, mine), (call, theirs)):
+                    began = time.perf_counter()
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")
+                        run()
+                    times.append(time.perf_counter() - began)
+            ours_all.append(statistics.median(mine[1:]))
+            theirs_all.append(statistics.median(theirs[1:]))
+            ratios.append(ours_all[-1] / theirs_all[-1])
+        rows.append(
+            (
+                backend,
+                1e6 * statistics.median(ours_all),
+                1e6 * statistics.median(theirs_all),
+                statistics.median(ratios),
+            )
+        )
+    return Table(
+        "our solve with its check at 1e-6 against qpsolvers.solve_problem (small calibration QPs)",
+        ("backend", "ours us", "qpsolvers us", "ratio"),
+        tuple(rows),
+        ("", ".0f", ".0f", ".2f"),
+    )
+
+
+def subgradient(cases: Sequence[Case], most: int) -> tuple[Table, dict[str, Array]]:
+    """Relative objective error of the subgradient methods against iterations."""
+    from qp_backends.subgradient import METHODS, iterate
+
+    marks = [10**k for k in range(1, 7) if 10**k <= most]
+    reference = references(cases)
+    curves: dict[str, Array] = {}
+    rows: list[tuple[Cell, ...]] = []
+    for method in METHODS:
+        reach = [mark for mark in marks if method == "restarted" or mark <= most // 10]
+        errors = np.full((len(cases), len(marks)), np.nan)
+        judged_well = np.zeros(len(cases), dtype=bool)
+        for i, case in enumerate(cases):
+            pending = list(enumerate(reach))
+            error = np.inf
+            for answer in iterate(case.problem, method, every=10):
+                while pending and answer.iterations > pending[0][1]:
+                    errors[i, pending.pop(0)[0]] = error
+                judged = accuracy(case.problem, answer)
+                error = shortfall(judged, reference[case.name])
+                judged_well[i] |= judged.worst <= SOLVED
+                if not pending or error < 1e-13:
+                    break
+            for j, _ in pending:
+                errors[i, j] = error
+        curves[method] = errors
+        hit = 100.0 * np.mean(np.nanmin(errors, axis=1) <= SOLVED)
+        middle = [float(np.median(column)) for column in errors.T]
+        rows.append((method, float(hit), float(100.0 * judged_well.mean()), *middle))
+    table = Table(
+        f"primal-dual subgradient on {len(cases)} calibration QPs: median error (of the objective, "
+        "relative to max f, or of the rows) against iterations; share within 1e-6, and share that "
+        "the judge finds solved",
+        ("method", "within 1e-6 %", "judged solved %", *(f"{mark:g}" for mark in marks)),
+        tuple(rows),
+        ("", ".1f", ".1f", *[".1e"] * len(marks)),
+    )
+    return table, {"iterations": np.array(marks, dtype=float), **curves}
+
+
+def shortfall(judged: Accuracy, target: float) -> float:
+    """Error of an iterate: of its objective, or of its constraints where that is larger.
+
+    The QP's values are relative to max f = 1, so 1 is the scale of the objective.
+    """
+    if not np.isfinite(judged.worst):
+        return float("inf")
+    return max(abs(judged.objective - target) / max(1.0, abs(target)), judged.primal_relative)
+
+
+def sqp_values(backends: Sequence[str], seed: int) -> Table:
+    """The max F_i / m_i that the calibration's SQP reaches with each backend."""
+    robot = load_robot("irb2600")
+    data = simulate(robot, 100, 3, seed).data
+    model, state = fitted(robot, data)
+    problem = worst_of(model, state, measured_distances(data), "two-sided", "target")
+    rows: list[tuple[Cell, ...]] = []
+    best = np.nan
+    for backend in backends:
+        loose = backend.startswith("subgradient")
+        qp = partial(
+            solve_qp,
+            name=backend,
+            tolerance=1e-6 if loose else 1e-9,
+            fallback=not loose,
+            time_limit=60.0 if loose else np.inf,
+        )
+        began = time.perf_counter()
+        settings = minimax.Sqp(tolerance=1e-5 if loose else 1e-8, iterations=50)
+        found = minimax.solve(problem, state, qp, settings)
+        seconds = time.perf_counter() - began
+        value = found.value * problem.size * 1e6
+        best = value if np.isnan(best) else min(best, value)
+        rows.append((backend, str(found.status), found.iterations, value, value / best - 1.0,
+                     found.kkt.residual, 1e3 * seconds))  # fmt: skip
+    return Table(
+        "minimax calibration (IRB 2600, 100 poses, three targets) with each backend",
+        ("backend", "status", "QPs", "max F_i/m mm^2", "above the first", "KKT residual", "ms"),
+        tuple(rows),
+        ("", "", "d", ".9f", ".1e", ".1e", ".1f"),
+    )
+
+
+def profile(group: str, runs: Sequence[Run]) -> Figure:
+    """Performance profile: share of problems solved within a factor of the fastest time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    ours = [run for run in runs if run.setting == "ours 1e-6"]
+    names = dict.fromkeys(run.case for run in ours)
+    fastest = {
+        name: min((run.seconds for run in ours if run.case == name and run.right), default=np.nan)
+        for name in names
+    }
+    for number, backend in enumerate(dict.fromkeys(run.backend for run in ours)):
+        ratio = np.sort(
+            [
+                run.seconds / fastest[run.case] if run.right else np.inf
+                for run in ours
+                if run.backend == backend
+            ]
+        )
+        share = 100.0 * (np.arange(len(ratio)) + 1) / len(ratio)
+        shown = np.isfinite(ratio)
+        style = ("-", "--", ":")[number // 10 % 3]
+        axes.step(ratio[shown], share[shown], where="post", label=backend, linestyle=style)
+    axes.set(xscale="log", xlabel="time / fastest time", ylabel="problems solved to 1e-6 (%)",
+             ylim=(0, 102), title=group)  # fmt: skip
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend(fontsize="small", loc="lower right")
+    return figure
+
+
+def convergence_figure(curves: dict[str, Array]) -> Figure:
+    """Error of the subgradient methods against iterations: median and quartiles."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    marks = curves["iterations"]
+    for method, errors in curves.items():
+        if method == "iterations":
+            continue
+        known = ~np.isnan(errors).any(axis=0)
+        finite = np.maximum(errors[:, known], 1e-17)
+        middle = np.median(finite, axis=0)
+        (line,) = axes.plot(marks[known], middle, "o-", label=method)
+        low, high = np.quantile(finite, (0.25, 0.75), axis=0)
+        axes.fill_between(marks[known], low, high, color=line.get_color(), alpha=0.2)
+    axes.set(xscale="log", yscale="log", xlabel="iterations", ylabel="error of objective or rows")
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def backends_here(quick: bool) -> list[str]:
+    """Installed backends worth a row, the fallback order last."""
+    found = [name for name in (*DIRECT, "ecos", "qpalm", "cvxpy") if name in available()]
+    return [*found, "subgradient", ACROSS] if not quick else [*found, ACROSS]
+
+
+def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
+    """All runs by set, and the problems."""
+    runs: dict[str, list[Run]] = {}
+    problems: dict[str, list[Case]] = {}
+    for group, make in SETS.items():
+        cases = make(quick)
+        problems[group] = cases
+        jobs = [
+            (case, backend, setting)
+            for backend in backends_here(quick)
+            for setting in SETTINGS
+            if not (setting == "own defaults" and backend not in DIRECT)
+            and not (backend == "subgradient" and (setting == "ours 1e-9" or "calib" not in group))
+            for case in cases
+        ]
+        runs[group] = [
+            attempt(case, group, backend, setting)
+            for case, backend, setting in track(jobs, description=group, transient=True)
+        ]
+    return runs, problems
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Few problems of each kind: a minute or two.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("results/solver_accuracy"),
+              show_default=True, help="Folder for tables and figures.")  # fmt: skip
+@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write figures here.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the SQP comparison.")
+def main(quick: bool, out: Path, json_path: Path | None, seed: int) -> None:
+    """Tables and profiles of QP accuracy, reliability and time."""
+    runs, problems = study(quick)
+    tables = [environment(available().keys() - {"proxqp", "highs", "subgradient"})]
+    summary: dict[str, object] = {}
+    for group, found in runs.items():
+        if not found:
+            click.echo(f"{group}: no problems here (shared data absent)")
+            continue
+        reference = references(problems[group])
+        tables.append(table_of(group, found, reference))
+        if group == "Maros-Meszaros":
+            tables.append(detail(group, found))
+        save_figure(out, "profile_" + group.replace(",", "").replace(" ", "_"),
+                    profile(group, found))  # fmt: skip
+        summary[group] = [
+            {"backend": row[0], "setting": row[1], "right_percent": row[3], "lies": row[4]}
+            for row in tables[-2 if group == "Maros-Meszaros" else -1].rows
+        ]
+    small = problems["calibration, 6 rows"]
+    direct_ones = [name for name in DIRECT if name in available()]
+    timing = overhead(small[:4] if quick else small[:20], direct_ones, 5 if quick else 21)
+    sub, curves = subgradient(small[:4] if quick else small, 10_000 if quick else 100_000)
+    values = sqp_values([*direct_ones, "cvxpy", "subgradient"], seed)
+    tables += [timing, sub, values]
+    save_figure(out, "subgradient", convergence_figure(curves))
+    save_tables(out, "solver_accuracy", tables)
+    summary["overhead_ratio"] = {str(row[0]): row[3] for row in timing.rows}
+    summary["subgradient_reach_percent"] = {str(row[0]): row[1] for row in sub.rows}
+    summary["sqp_above_best"] = {str(row[0]): row[4] for row in values.rows}
+    if json_path:
+        save_json(json_path, summary)
+    lies = [run for found in runs.values() for run in found if run.lie and "ours" in run.setting]
+    if lies:
+        raise click.ClickException(f"{len(lies)} wrong answers were passed on as right")
+
+
+if __name__ == "__main__":
+    main()
