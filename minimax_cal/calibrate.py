@@ -38,6 +38,8 @@ TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zero
 ASIDE = 1e-9
 FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
+LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
+WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 FEW = 30  # poses that are enough to test a slip of units or signs
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 
@@ -90,6 +92,9 @@ def calibrate(
     a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended is in the
     result's `status`.
     """
+    for name in ("fix", "free"):
+        if isinstance(options.get(name), str):
+            options[name] = tuple(filter(None, str(options[name]).replace(" ", "").split(",")))
     chosen = Options(objective=objective, qp=qp, **options)  # type: ignore[arg-type]
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
@@ -97,19 +102,19 @@ def calibrate(
     objective_of(chosen.objective, data)
     check_options(chosen)
     gates.check_joints(robot, data)
+    gates.check_spread(data)
     train, held, notices = split(data, chosen.holdout, chosen.seed)
     notices = (*data.notices, *gates.limit_notices(robot, data), *notices)
-    if not held.poses:
-        notices += ("no pose is held out: nothing here says how the fit does on new poses",)
+    few = train.seen.sum(axis=0) < LEAST_POSES
+    if few.any() and not few.all():
+        names = ", ".join(np.array(data.targets)[few])
+        notices += (f"left out: {names}, measured at fewer than {LEAST_POSES} training poses",)
+        data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
+        objective_of(chosen.objective, data)
+    if len(np.unique(groups(train))) >= LEAST_POSES:
+        check_sense(robot, data)
     report("start")
     fit = fit_cell(robot, train, chosen, report)
-    if chosen.objective == "minimax" and len(data.targets) == 1:
-        notices += ("there is one target: minimax and sum are the same",)
-    if gates.collinear(train):
-        notices += (
-            "the targets lie nearly on a line: positions are fine, but orientations about that "
-            "line would not be determined",
-        )
     calibrated = Cell.of(robot, fit.state, data.targets)
     nominal = Cell.of(robot, fit.nominal, data.targets)
     errors = {
@@ -118,6 +123,10 @@ def calibrate(
         "holdout": calibrated.error(held),
         "nominal_train": nominal.error(train),
     }
+    notices += fit.notices
+    notices += tuple(remarks(chosen, data, train, held))
+    notices += tuple(gates.outliers(data, np.linalg.norm(calibrated.error(data), axis=-1)))
+    notices += tuple(doubts(robot, fit, errors["nominal_train"]))
     return Calibration(
         robot=calibrated.robot,
         cell=calibrated,
@@ -136,9 +145,26 @@ def calibrate(
         distances=fit.distances,
         trace=fit.trace,
         train_lines=train.line,
-        notices=(*notices, *fit.notices),
+        notices=notices,
         provenance=Provenance.of(robot, data, vars(chosen)),
     )
+
+
+def remarks(
+    options: Options, data: Measurements, train: Measurements, held: Measurements
+) -> list[str]:
+    """What the reader should know about the data behind a result."""
+    out = []
+    if not held.poses:
+        out.append("no pose is held out: nothing here says how the fit does on new poses")
+    if options.objective == "minimax" and len(data.targets) == 1:
+        out.append("there is one target: minimax and sum are the same")
+    if gates.collinear(train):
+        out.append(
+            "the targets lie nearly on a line: positions are fine, but orientations about that "
+            "line would not be determined"
+        )
+    return out
 
 
 def objective_of(objective: str, data: Measurements) -> int:
@@ -169,8 +195,10 @@ def check_options(options: Options) -> None:
             raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
-    if options.distance_tolerance <= 0.0:
-        raise OptionError(f"distance tolerance {options.distance_tolerance:g} m: must be positive")
+    if options.distance_tolerance <= 0.0 or np.isinf(options.distance_tolerance):
+        raise OptionError(
+            f"distance tolerance {options.distance_tolerance:g} m: must be positive and finite"
+        )
     for pattern, sigma in options.priors.items():
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
@@ -216,7 +244,6 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     poses, known = len(np.unique(groups(telling))), int(np.isfinite(sigma[allowed]).sum())
     gates.check_count(telling, poses, unknowns - spare, known)
     frame = start.fit_frame(base, robot.mdh)
-    check_sense(robot, data, base, frame)
 
     report("identifiable parameters")
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
@@ -332,18 +359,24 @@ def wider(
     return found, notices
 
 
-def check_sense(robot: Robot, data: Measurements, model: Model, frame: Frame) -> None:
-    """Raise DataError for slips that show once base and targets are fitted."""
-    found = gates.swapped(cross_errors(model, frame.state))
-    if found:
-        lines = ", ".join(str(data.line[row]) for row, _ in found[:8])
-        more = f" and {len(found) - 8} more" if len(found) > 8 else ""
-        moved = [data.targets[i] for i, j in enumerate(found[0][1]) if i != j]
-        raise DataError(
-            f"{data.source}:{data.line[found[0][0]]}: targets look swapped ({', '.join(moved)}); "
-            f"{len(found)} such rows: lines {lines}{more}; put their columns right or delete them"
-        )
-    if np.sqrt(frame.mean_square) <= POOR_FIT * robot.reach():
+def check_sense(robot: Robot, data: Measurements) -> None:
+    """Raise DataError for slips that show once base and targets are fitted: names, units, signs.
+
+    All rows are looked at, those held out too: they judge the fit.
+    """
+    model = model_of(robot, data)
+    frame = start.fit_frame(model, robot.mdh)
+    limit = POOR_FIT * robot.reach()
+    if len(data.targets) > 1:
+        rows = misnamed(robot, data, model, frame)
+        if len(rows):
+            lines = ", ".join(str(data.line[row]) for row in rows[:8])
+            more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+            raise DataError(
+                f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
+                f"lines {lines}{more}; put their columns right or delete them"
+            )
+    if np.sqrt(frame.mean_square) <= limit:
         return
     trials = [("the measurement frame looks left-handed; reverse one of its axes", frame.mirrored)]
     few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
@@ -352,12 +385,52 @@ def check_sense(robot: Robot, data: Measurements, model: Model, frame: Frame) ->
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
-    good = np.sqrt(mean_square) <= 4.0 * POOR_FIT * robot.reach()
-    if good and mean_square < 0.04 * frame.mean_square:
+    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < 0.04 * frame.mean_square:
         raise DataError(
             f"{data.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(frame.mean_square):.3g} mm)"
         )
+
+
+def misnamed(robot: Robot, data: Measurements, model: Model, frame: Frame) -> Array:
+    """Rows whose targets stand under each other's names.
+
+    Swapped rows pull the frame that is to find them: rename, fit again, until nothing changes.
+    """
+    names = np.arange(len(data.targets))
+    given = np.repeat(names[None], data.poses, axis=0)
+    order, fitted = given, frame
+    for _ in range(10):
+        better, _, _ = gates.best_orders(cross_errors(model, fitted.state))
+        if np.array_equal(better, order):
+            break
+        order = better
+        y = np.empty_like(data.y)
+        np.put_along_axis(y, np.repeat(order[..., None], 3, axis=2), data.y, axis=1)
+        fitted = start.fit_frame(model_of(robot, data.with_y(y)), robot.mdh)
+    good = np.sqrt(fitted.mean_square) <= 4.0 * POOR_FIT * robot.reach()
+    return gates.swapped(cross_errors(model, fitted.state)) if good else np.zeros(0, dtype=int)
+
+
+def doubts(robot: Robot, fit: Fit, nominal_error: Array) -> list[str]:
+    """Notices where the result is no calibration of this robot but of another one."""
+    reach, notices = robot.reach(), []
+    miss = float(np.sqrt(np.nanmean(np.nansum(nominal_error**2, axis=-1))))
+    if miss > POOR_FIT * reach:
+        notices.append(
+            f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
+            "measurements, with their joint signs, zero positions and units"
+        )
+    change = (fit.state.mdh - fit.nominal.mdh).T.reshape(-1)
+    length = fit.names.linear[: len(change)]
+    wild = np.abs(change) > np.where(length, 0.02 * reach, WILD_ANGLE)
+    if wild.any():
+        named = ", ".join(
+            f"{fit.names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
+            for i in np.flatnonzero(wild)[:5]
+        )
+        notices.append(f"implausibly large changes: {named}; is the robot file the right one?")
+    return notices
 
 
 def cross_errors(model: Model, state: State) -> Array:
@@ -393,25 +466,25 @@ def covariance(model: Model, state: State, share: Array) -> Array:
 
 
 def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
-    """Every parameter in the contract's units; base entries in measurement axes."""
-    names, state, nominal = fit.names, fit.state, fit.nominal
-    n = robot.joints
-    turn = np.eye(names.count)
-    for first in (5 * n, 5 * n + 3):
-        turn[first : first + 3, first : first + 3] = state.rotation
-    spread = fit.covariance
+    """Every parameter, link by link.
+
+    Base entries are measured along the nominal base's own axes: its origin as seen from the
+    instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
+    """
+    names, n = fit.names, robot.joints
     known = fit.identification.active
-    whole = np.where(np.outer(known, known), spread, 0.0)
-    sigma = np.sqrt(np.maximum(np.diag(turn @ whole @ turn.T), 0.0))
-    sigma = np.where(known & np.isfinite(np.diag(spread)), sigma, np.nan)
+    variance = np.diag(fit.covariance)
+    sigma = np.where(known, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    axes = fit.nominal.rotation
 
     def values(x: State) -> Array:
-        base = Rotation.from_matrix(x.rotation).as_rotvec()
-        return np.concatenate([links_of(x.mdh), x.origin, base, x.targets.reshape(-1)])
+        turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
+        return np.concatenate([links_of(x.mdh), axes.T @ x.origin, turn, x.targets.reshape(-1)])
 
+    before, linear = values(fit.nominal), names.linear
+    value = np.where(known, values(fit.state), before)
     order = [kind * n + joint for joint in range(n) for kind in range(5)]
     order += range(5 * n, names.count)
-    value, before, linear = values(state), values(nominal), names.linear
     return tuple(
         Parameter(
             name=names.all[i],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.data import Measurements
+from minimax_cal.data import FARTHEST, Measurements
 from minimax_cal.errors import CalibrationError, DataError
 from minimax_cal.files import read_text
 from minimax_cal.gates import check_joints
@@ -75,6 +75,11 @@ class Cell:
 
 def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     """A cell from the JSON of a calibration.  Raises CalibrationError."""
+    if content.get("schema", 1) != 1 or content.get("kind", "calibration") != "calibration":
+        raise CalibrationError(
+            f"{source}: is a {content.get('kind', 'file')} of schema {content.get('schema')}; "
+            "expected a calibration of schema 1"
+        )
     try:
         base = np.eye(4)
         turn = np.array(content["base"]["rotation_vector_rad"], dtype=float)
@@ -88,8 +93,9 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
             f"{source}: is not a saved calibration (robot, base, targets_mm: {error}); "
             "write one with minimax-cal calibrate -o"
         ) from error
-    if not (np.all(np.isfinite(base)) and np.all(np.isfinite(spots))):
-        raise CalibrationError(f"{source}: base or targets are not finite numbers")
+    large = np.abs(np.concatenate([base[:3, 3], spots.reshape(-1)])).max()
+    if not (np.all(np.isfinite(base)) and large <= FARTHEST):
+        raise CalibrationError(f"{source}: base or targets are not plausible numbers")
     return Cell(robot_from_dict(robot, source), base, tuple(map(str, targets)), spots)
 
 

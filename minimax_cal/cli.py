@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 
 import qp_backends
-from minimax_cal.calibrate import Options, calibrate
+from minimax_cal import gates
+from minimax_cal.calibrate import POOR_FIT, Options, calibrate
 from minimax_cal.cell import evaluate, load_cell
 from minimax_cal.data import read_measurements, write_measurements
 from minimax_cal.errors import CalibrationError, OptionError
-from minimax_cal.figures import save_errors
-from minimax_cal.files import json_text, write_whole
+from minimax_cal.figures import PICTURES, save_errors
+from minimax_cal.files import check_writable, json_text, write_whole
+from minimax_cal.kinematics import MDH_NAMES
 from minimax_cal.robot import builtin_robots, load_robot
 from minimax_cal.simulate import Truth, simulate
 from minimax_cal.solvers.least_squares import METHODS
@@ -25,13 +29,18 @@ from minimax_cal.tables import Table
 
 DEFAULTS, TRUTH = Options(), Truth()
 UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
+LENGTHS = ("mm", "um", "m")
 FAILED, MISUSED = 1, 2  # exit codes of the contract
 
 
 def prior_of(text: str) -> tuple[str, float]:
     """NAME=SIGMA with its unit, as ``a*=0.5mm`` or ``theta2=1mrad``."""
     name, equals, size = text.partition("=")
+    kind = name.rstrip("0123456789*")
     for unit in sorted(UNITS, key=len, reverse=True):
+        if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTHS):
+            what = "a length: give mm" if kind in "ad" else "an angle: give mrad or deg"
+            raise OptionError(f"--prior {text!r}: {name} is {what}")
         if equals and name and size.endswith(unit):
             try:
                 return name, float(size.removesuffix(unit)) * UNITS[unit]
@@ -146,6 +155,10 @@ def calibrate_command(
     **choices: Any,
 ) -> int:
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
+    if output:
+        check_writable(output)
+    if figure:
+        check_writable(figure, PICTURES)
     notes = Console(stderr=True, quiet=quiet, highlight=False)
     millimetres = float("nan") if distance_tolerance is None else distance_tolerance
     with notes.status("reading") as status:
@@ -184,9 +197,17 @@ def calibrate_command(
 @QUIET
 def evaluate_command(fit: Path, data: Path, as_json: bool, output: Path | None, quiet: bool) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted."""
+    if output:
+        check_writable(output)
     cell, measured = load_cell(fit), read_measurements(data)
     found = evaluate(cell, measured)
-    for notice in () if quiet else measured.notices:
+    doubts = gates.outliers(measured, np.linalg.norm(cell.error(measured), axis=-1))
+    if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
+        doubts.append(
+            f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
+            "the same robot, measurement frame, units and order of targets"
+        )
+    for notice in () if quiet else (*measured.notices, *doubts):
         click.echo(f"notice: {notice}", err=True)
     text = json_text(
         {
@@ -275,6 +296,9 @@ def simulate_command(
     """Measurements of an imperfect copy of ROBOT, from a tracker at a random place."""
     if output is None:
         raise OptionError("simulate needs -o FILE for the measurements")
+    for path in (output, truth_path):
+        if path:
+            check_writable(path)
     truth = Truth(
         length_error * 1e-3,
         angle_error * 1e-3,
@@ -332,6 +356,9 @@ def show(*tables: Table) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; every outcome is an exit code and at most one line of error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without the letter shows another
     try:
         code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except (CalibrationError, qp_backends.BackendError) as error:
@@ -345,9 +372,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = complain(error.format_message() + hint)
     except (KeyboardInterrupt, click.Abort):
         code = complain("interrupted", 130)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output went away: nothing is wrong
-        code = 0
+    except OSError as error:
+        code = complain(f"the output cannot be written ({error.strerror})", FAILED)
     sys.exit(code or 0)
 
 

@@ -8,7 +8,7 @@ import hashlib
 import io
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ OPTIONAL = {
         "base": r"base\d+_[xyz]_(mm|m)",
     }.items()
 }
+FARTHEST = 1e5  # no instrument measures farther [m]
 TEXT = {"session", "pose", "split"}  # labels, compared but never computed with
 
 
@@ -51,6 +52,7 @@ class Measurements:
     sliding: (n,) True where the joint column has a unit of length.
     line: (m,) line of the file, for messages.
     columns: the optional columns by name; numbers in SI, labels as text.
+    unknown: columns that nothing uses, as text, by their name in the file.
     notices: what the reader should know about the file.
     source, digest: path and SHA-256 of the file.
     """
@@ -61,6 +63,7 @@ class Measurements:
     sliding: Array
     line: Array
     columns: Mapping[str, Array]
+    unknown: Mapping[str, Array] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
     source: str = "measurements"
     digest: str = ""
@@ -77,8 +80,20 @@ class Measurements:
 
     def take(self, rows: Array) -> Measurements:
         """The measurements at some rows only.  rows: indices or a mask."""
-        columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(self, q=self.q[rows], y=self.y[rows], line=self.line[rows], columns=columns)
+        return replace(
+            self,
+            q=self.q[rows],
+            y=self.y[rows],
+            line=self.line[rows],
+            columns={name: column[rows] for name, column in self.columns.items()},
+            unknown={name: column[rows] for name, column in self.unknown.items()},
+        )
+
+    def keep(self, targets: Array) -> Measurements:
+        """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
+        names = tuple(name for name, kept in zip(self.targets, targets, strict=True) if kept)
+        some = replace(self, y=self.y[:, targets], targets=names)
+        return some.take(np.asarray(some.seen.any(axis=1)))
 
     def only(self, target: int) -> Measurements:
         """One target alone, at the poses where it was measured."""
@@ -103,6 +118,11 @@ def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
     names = tuple(f"smr{i + 1}" for i in range(y.shape[1]))
     sliding = np.zeros(q.shape[1], dtype=bool)
     extra = {name: np.asarray(column) for name, column in columns.items()}
+    for name, column in extra.items():
+        if len(column) != len(q):
+            raise DataError(
+                f"column {name} has {len(column)} entries, but there are {len(q)} poses"
+            )
     return check_finite(Measurements(q, y, names, sliding, np.arange(len(q)) + 1, extra))
 
 
@@ -120,6 +140,41 @@ def check_finite(data: Measurements) -> Measurements:
             f"{data.source}:{data.line[row]}: {data.targets[target]} has some of x, y, z only; "
             "give all three, or leave all three empty where it was not measured"
         )
+    if np.nanmax(np.abs(data.y), initial=0.0) > FARTHEST:
+        row, target, _ = np.argwhere(np.abs(data.y) > FARTHEST)[0]
+        raise DataError(
+            f"{data.source}:{data.line[row]}: {data.targets[target]} is more than "
+            f"{FARTHEST / 1e3:g} km away; check the number and its unit"
+        )
+    unmeasured = ~data.seen.any(axis=0)
+    if unmeasured.all():
+        raise DataError(f"{data.source}: no target was measured at any pose")
+    if unmeasured.any():
+        name = data.targets[int(np.argmax(unmeasured))]
+        raise DataError(f"{data.source}: {name} is measured at no pose; delete its columns")
+    for target, name in enumerate(data.targets):
+        points = data.y[data.seen[:, target], target]
+        if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
+            raise DataError(f"{data.source}: all points of {name} are the same")
+    return check_u95(data)
+
+
+def check_u95(data: Measurements) -> Measurements:
+    """The data, if every given `u95` is positive.  Raises DataError."""
+    if "u95" not in data.columns:
+        return data
+    u95 = data.columns["u95"]
+    wrong = u95 <= 0.0
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(
+            f"{data.source}:{data.line[row]}: column u95_mm: {1e3 * u95[row]:g} is not positive; "
+            "leave the cell empty where it is not known"
+        )
+    if not np.isfinite(u95).any():
+        columns = {name: column for name, column in data.columns.items() if name != "u95"}
+        notice = f"{data.source}: column u95_mm is empty and not used"
+        return replace(data, columns=columns, notices=(*data.notices, notice))
     return data
 
 
@@ -160,7 +215,7 @@ def read_measurements(path: Path | str) -> Measurements:
         if m := TARGET.fullmatch(name):
             y[:, found.index(int(m[1])), "xyz".index(m[2])] = number(name, unit=m[3], empty=True)
     columns: dict[str, Array] = {}
-    unknown: list[str] = []
+    unknown: dict[str, Array] = {}
     for name in header:
         kind, match = optional_kind(name)
         if kind in TEXT:
@@ -170,8 +225,7 @@ def read_measurements(path: Path | str) -> Measurements:
             stem = name.removesuffix(f"_{unit}")
             columns[stem] = number(name, unit=unit, empty=True)
         elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
-            columns[name] = np.array(cells[name])
-            unknown.append(name)
+            unknown[name] = np.array(cells[name])
     notices = [f"{path}: column {name} is not used{near(name)}" for name in unknown]
     data = Measurements(
         q=q,
@@ -180,16 +234,15 @@ def read_measurements(path: Path | str) -> Measurements:
         sliding=np.array([unit in ("m", "mm") for _, unit, _ in joints]),
         line=line,
         columns=columns,
+        unknown=unknown,
         source=str(path),
         digest=digest,
     )
-    check_finite(data)
+    data = check_finite(data)
     blind = np.asarray(~data.seen.any(axis=1))
-    if blind.all():
-        raise DataError(f"{path}: no target was measured at any pose")
     if blind.any():
         notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
-    return replace(data.take(~blind), notices=tuple(notices))
+    return replace(data.take(~blind), notices=(*data.notices, *notices))
 
 
 def header_check(path: Path | str, header: list[str]) -> None:
@@ -230,7 +283,7 @@ def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty
         if not cell and empty:
             continue
         try:
-            out[i] = float(cell)
+            out[i] = float(cell if "_" not in cell else "no number")
         except ValueError:
             what = f"{cell!r} is not a number" if cell else "is empty"
             comma = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
@@ -313,6 +366,8 @@ def split(
     A `split` column decides where there is one; else a seeded random share of the poses is held
     out, all rows of a pose together.  Raises OptionError, DataError.
     """
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
     if not 0.0 <= holdout < 1.0:
         raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
     if "split" in data.columns:
@@ -328,7 +383,11 @@ def split(
         held = labels == "holdout"
         if held.all():
             raise DataError(f"{data.source}: column split leaves no row for training")
-        return data.take(~held), data.take(held), ("the split column decides what is held out",)
+        notices: tuple[str, ...] = ("the split column decides what is held out",)
+        shared = groups(data)
+        if np.isin(shared[held], shared[~held]).any():
+            notices += ("some poses stand both in training and in the held-out rows",)
+        return data.take(~held), data.take(held), notices
     group = groups(data)
     poses = np.unique(group)
     count = round(holdout * len(poses))

@@ -15,8 +15,11 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
 
     Raises CalibrationError when the folder does not exist or cannot be written.
     """
-    path = Path(path)
+    path = Path(path).resolve()  # a link keeps pointing at what is written
     raw = content.encode("utf-8") if isinstance(content, str) else content
+    if path.exists() and not path.is_file():
+        write_into(path, raw)
+        return
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
@@ -31,6 +34,29 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     except OSError as error:
         Path(name).unlink(missing_ok=True)
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def write_into(path: Path, raw: bytes) -> None:
+    """Write to what is no regular file: a pipe or a device, never replaced."""
+    try:
+        with path.open("wb") as stream:
+            stream.write(raw)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
+    """Raise CalibrationError now, before the work, if path cannot be written later.
+
+    suffixes: the endings that are allowed, any if empty.
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise CalibrationError(f"{path}: the file's ending must be one of {', '.join(suffixes)}")
+    if path.is_dir():
+        raise CalibrationError(f"{path}: is a folder; name a file")
+    if not path.resolve().parent.is_dir():
+        raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
 
 
 def json_text(content: object) -> str:

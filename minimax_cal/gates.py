@@ -13,6 +13,7 @@ from minimax_cal.errors import DataError
 from minimax_cal.kinematics import Array
 from minimax_cal.robot import Robot
 
+STANDS_OUT = 15.0  # times the typical error: a point worth a look
 TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
 
 
@@ -88,11 +89,13 @@ def suspicions(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurem
         replace(data, q=np.where(turning, data.q / factor, data.q)),
     )
     yield (
-        "the points look like millimetres given as metres; name the columns smr1_x_mm, ...",
+        "the points look like millimetres given as metres: name the columns smr1_x_mm, ... (or the "
+        "robot file gives metres under the unit mm)",
         data.with_y(data.y * 1e-3),
     )
     yield (
-        "the points look like metres given as millimetres; name the columns smr1_x_m, ...",
+        "the points look like metres given as millimetres: name the columns smr1_x_m, ... (or the "
+        "robot file gives millimetres under the unit m)",
         data.with_y(data.y * 1e3),
     )
     for i, j in ((2, 1), (1, 2)):
@@ -117,23 +120,56 @@ def suspicions(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurem
             )
 
 
-def swapped(error_of: Array) -> list[tuple[int, tuple[int, ...]]]:
-    """Rows whose targets fit far better under other names: (row, order of the targets).
+def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
+    """Under which names the targets of each row fit best.
 
-    error_of: (k, k, m) distance from measured target i to predicted target j at each pose,
-    NaN where i was not measured [m].
+    error_of: (k, k, m) distance from measured target i to predicted target j at each pose, NaN
+    where i was not measured [m].  Returns the order (m, k) of the targets, its sum of squares and
+    that of the names as given, (m,) each [m^2].
     """
     k = len(error_of)
-    if k < 2:
-        return []
     squared = error_of**2
     orders = list(permutations(range(k))) if k <= 4 else transpositions(k)
     cost = np.stack([np.nansum(squared[range(k), order, :], axis=0) for order in orders])
     best = cost.argmin(axis=0)
-    own = cost[0]
-    usual = np.median(own)
-    odd = (cost.min(axis=0) < 0.1 * own) & (own > 25.0 * usual)
-    return [(int(row), tuple(orders[best[row]])) for row in np.flatnonzero(odd)]
+    return np.array(orders)[best], cost.min(axis=0), cost[0]
+
+
+def swapped(error_of: Array) -> Array:
+    """Rows whose targets fit far better under other names.  error_of: as `best_orders`."""
+    _, least, own = best_orders(error_of)
+    usual = float(np.median(least))
+    return np.flatnonzero((least < 0.1 * own) & (own > 25.0 * usual))
+
+
+def outliers(data: Measurements, distance: Array) -> list[str]:
+    """Points that miss by far more than the others.  distance: (k, m), NaN where not measured."""
+    usual = float(np.nanmedian(distance))
+    with np.errstate(invalid="ignore"):
+        far = distance > STANDS_OUT * max(usual, 1e-7)
+    found = np.argwhere(far)
+    if not len(found):
+        return []
+    worst = sorted(found, key=lambda at: -distance[tuple(at)])[:5]
+    named = ", ".join(
+        f"line {data.line[pose]} {data.targets[target]} {1e3 * distance[target, pose]:.3g} mm"
+        for target, pose in worst
+    )
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    return [
+        f"{data.source}: points that stand out (typical error {1e3 * usual:.3g} mm): {named}{more}"
+    ]
+
+
+def check_spread(data: Measurements) -> None:
+    """Raise DataError if one target's points spread a hundred times more than another's."""
+    spread = np.array([np.nanstd(data.y[:, i], axis=0).max() for i in range(len(data.targets))])
+    if spread.max() > 100.0 * spread.min() and np.all(data.seen.sum(axis=0) > 5):
+        big, small = (data.targets[i] for i in (int(spread.argmax()), int(spread.argmin())))
+        raise DataError(
+            f"{data.source}: the points of {big} spread over {spread.max():.3g} m, those of "
+            f"{small} over {spread.min():.3g} m; one of them has the wrong unit"
+        )
 
 
 def transpositions(k: int) -> list[tuple[int, ...]]:

@@ -127,6 +127,8 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
     with a clear share in what is left of the null space goes, and takes one null vector along.
     """
     chosen = np.flatnonzero(active)
+    if not len(chosen):
+        return []
     scale = np.sqrt(np.diag(gram)[chosen])
     scale = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(gram[np.ix_(chosen, chosen)] / np.outer(scale, scale))

@@ -20,6 +20,7 @@ from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
+HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
 BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
 
 
@@ -364,7 +365,8 @@ def model_of(robot: Robot, data: Measurements) -> Model:
     if "u95" in data.columns:
         u95 = data.columns["u95"]
         usual = np.nanmedian(u95)
-        weight = weight * np.where(np.isfinite(u95), (usual / u95) ** 2, 1.0)
+        least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
+        weight = weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
     names = Names(robot.joints, data.targets)
     mean = np.zeros(names.count)
     mean[names.links] = links_of(robot.mdh)

@@ -111,10 +111,22 @@ class Names:
         return self.all.index(name)
 
     def match(self, patterns: Iterable[str], option: str) -> Array:
-        """(p,) True where a name matches a pattern, as ``beta*``.  Raises OptionError."""
+        """(p,) True where the name of a link parameter matches.  Raises OptionError.
+
+        ``a*`` is every a (not alpha), ``*2`` all of joint 2, ``*`` every link parameter.
+        """
         names, chosen = self.all, np.zeros(self.count, dtype=bool)
+        kinds = np.array([name.rstrip("0123456789") for name in names])
         for pattern in patterns:
             hits = np.array([fnmatchcase(name, pattern) for name in names])
+            if pattern.endswith("*") and pattern[:-1] in MDH_NAMES:
+                hits = kinds == pattern[:-1]
+            if "*" in pattern:
+                hits &= self.links
+            if (hits & ~self.links).any():
+                raise OptionError(
+                    f"{option} {pattern}: base and targets have no nominal value to keep"
+                )
             if not hits.any():
                 close = difflib.get_close_matches(pattern, names, 1)
                 hint = f"did you mean {close[0]}?" if close else "try a1, theta2, beta*, base_z"

@@ -18,13 +18,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from minimax_cal import kinematics
 from minimax_cal.errors import RobotError
 from minimax_cal.files import json_text, read_text, write_whole
-from minimax_cal.kinematics import Array
+from minimax_cal.kinematics import MDH_NAMES, Array
 
 CONVENTION = "Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
 METRES = {"mm": 1e-3, "m": 1.0}
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
 Vector = tuple[Finite, Finite, Finite]
 
 
@@ -113,8 +114,8 @@ class Robot:
         return pose.reshape(*q.shape[:-1], 4, 4)
 
     def reach(self) -> float:
-        """Length of the stretched arm without its slides, a scale to judge errors by [m]."""
-        return float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum())
+        """Length of the stretched arm without its slides, at least 0.1: a scale for errors [m]."""
+        return max(0.1, float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum()))
 
     def to_dict(self) -> dict[str, Any]:
         """The robot in the file schema, in millimetres and radians."""
@@ -177,13 +178,20 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     if np.any(lower >= upper):
         number = int(np.argmax(lower >= upper)) + 1
         raise RobotError(f"{source}: joint {number}: lower must be less than upper")
+    scale = np.array([metre, metre, radian, radian, radian])
+    mdh = np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in joints]) * scale
+    huge = np.abs(mdh) > [LONGEST, LONGEST, TURNED, TURNED, TURNED]
+    if huge.any():
+        joint, column = np.argwhere(huge)[0]
+        raise RobotError(
+            f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
+        )
     up = np.array(schema.up)
     if np.linalg.norm(up) < 1e-9:
         raise RobotError(f"{source}: up: is a zero vector; give the vertical, e.g. [0, 0, 1]")
-    scale = np.array([metre, metre, radian, radian, radian])
     return Robot(
         name=schema.name,
-        mdh=np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in joints]) * scale,
+        mdh=mdh,
         sign=np.array([float(j.sign) for j in joints]),
         prismatic=prismatic,
         lower=lower,
@@ -226,11 +234,11 @@ def load_robot(source: Path | str) -> Robot:
         text = (resources.files("minimax_cal") / "robots" / f"{source}.json").read_text("utf-8")
         return robot_from_dict(json.loads(text), str(source))
     if path.suffix.lower() not in PARSERS:
-        if path.exists():
+        if len(str(source)) < 200 and path.exists():
             raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}")
         near = difflib.get_close_matches(str(source), builtin_robots(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
-        raise RobotError(f"no robot called {str(source)!r}; {hint}, or give a robot file")
+        raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")
     parse, failure = PARSERS[path.suffix.lower()]
     text = read_text(path, kind=RobotError)
     try:

@@ -15,6 +15,7 @@ from minimax_cal.gravity import torques
 from minimax_cal.kinematics import Array
 from minimax_cal.robot import Robot
 
+MOST_POSES, MOST_TARGETS = 1_000_000, 20
 MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
 
 
@@ -56,8 +57,16 @@ def simulate(
 
     Raises OptionError for counts that make no sense.
     """
-    if poses < 1 or targets < 1:
-        raise OptionError("simulate needs at least one pose and one target")
+    if not (1 <= poses <= MOST_POSES and 1 <= targets <= MOST_TARGETS):
+        raise OptionError(
+            f"simulate needs at least one pose and one target, at most {MOST_POSES} and "
+            f"{MOST_TARGETS}"
+        )
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    for name, value in vars(truth).items():
+        if not (np.isfinite(value) and value >= 0.0):
+            raise OptionError(f"simulate: {name} {value:g} must be a finite number, 0 or more")
     rng = np.random.default_rng(seed)
     n = robot.joints
     errors = rng.normal(size=(n, 5)) * ([truth.length] * 2 + [truth.angle] * 3)

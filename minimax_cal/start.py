@@ -18,6 +18,7 @@ from minimax_cal.parameters import State
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
+ENOUGH = 60  # poses that tell one basin from another
 OCTAHEDRAL = Rotation.create_group("O").as_matrix()  # the 24 turns of a cube
 
 
@@ -126,17 +127,22 @@ def search(
 ) -> LeastSquares[State]:
     """The best fit over base rotations when the geometry's angles may be far off.
 
-    The 24 turns of a cube, each with the best lengths, take a few damped steps; the best few are
-    then finished.  Returns the finished ones, best first.
+    The 24 turns of a cube, each with the best lengths, take a few damped steps on some of the
+    poses; the best few go on, and the two best are finished on all.  Returns these, best first.
     """
     k = model.y.shape[0]
+    few = thinned(model, ENOUGH)
     centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
     origin = np.broadcast_to(centre, (24, 3))
     starts = State(np.broadcast_to(mdh, (24, *mdh.shape)), OCTAHEDRAL, origin, np.zeros((24, k, 3)))
-    problem = SumOfSquares(model)
-    first = least_squares.solve(problem, starts, 24, points, limits=Limits(1e-9, screen))
+    some = float(few.counts.sum())
+    first = least_squares.solve(SumOfSquares(few), starts, 24, some, limits=Limits(1e-9, screen))
     chosen = np.argsort(first.cost)[:keep]
-    final = least_squares.solve(problem, first.x.take(chosen), keep, points)
+    second = least_squares.solve(
+        SumOfSquares(few), first.x.take(chosen), keep, some, limits=Limits(1e-9, 100)
+    )
+    best = np.argsort(second.cost)[:2]  # the others are other minima, or the same one
+    final = least_squares.solve(SumOfSquares(model), second.x.take(best), len(best), points)
     order = np.argsort(final.cost)
     return replace(
         final,
@@ -146,3 +152,11 @@ def search(
         status=tuple(final.status[i] for i in order),
         trace=final.trace[:, order],
     )
+
+
+def thinned(model: Model, most: int) -> Model:
+    """The model with at most so many poses, spread evenly over the rows."""
+    m = len(model.q)
+    rows = np.linspace(0, m - 1, min(m, most)).astype(int)
+    thin = replace(model, q=model.q[rows], y=model.y[..., rows], weight=model.weight[:, rows])
+    return thin if np.all(thin.counts >= 3) else model

@@ -37,7 +37,7 @@ class Distances:
 
 
 def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distances:
-    """The distances of all pairs measured together, and how well they are known.
+    """The distances of all pairs measured together three times or more, and how well known.
 
     tolerance: for all pairs [m].  NaN takes the instrument's own accuracy: sqrt(2) times the
     typical `u95` where there is such a column, else the scatter of each measured distance.
@@ -47,10 +47,10 @@ def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distanc
         for b in range(a + 1, len(data.targets)):
             distance = np.linalg.norm(data.y[:, a] - data.y[:, b], axis=-1)
             distance = distance[np.isfinite(distance)]
-            if len(distance):
+            if len(distance) > 2:
                 pairs.append((a, b))
                 mean.append(distance.mean())
-                spread.append(distance.std(ddof=1) if len(distance) > 1 else np.inf)
+                spread.append(distance.std(ddof=1))
     scatter = np.array(spread)
     if "u95" in data.columns and np.isfinite(data.columns["u95"]).any():
         scatter = np.full(len(pairs), np.sqrt(2.0) * float(np.nanmedian(data.columns["u95"])))

@@ -87,8 +87,9 @@ def test_sigma_is_the_scatter_over_repeated_measurements(robot: mc.Robot) -> Non
 
 
 def test_fixed_parameters_stay_and_freed_ones_are_kept(robot: mc.Robot, noisy: Simulation) -> None:
-    fit = mc.calibrate(robot, noisy.data, "sum", fix=["a*", "beta2"], free=["d1"])
+    fit = mc.calibrate(robot, noisy.data, "sum", fix="a*, beta2", free=["d1"])
     by_name = {p.name: p for p in fit.parameters}
+    assert by_name["alpha2"].identifiable  # a* is every a, not every name with an a in front
     assert by_name["a2"].value == by_name["a2"].nominal == 0.9
     assert np.isnan(by_name["a2"].sigma)
     assert by_name["a2"].reason == "fixed by the user"
@@ -97,6 +98,20 @@ def test_fixed_parameters_stay_and_freed_ones_are_kept(robot: mc.Robot, noisy: S
     free = mc.calibrate(robot, noisy.data, "sum", free=["d1", "theta1"])
     plain = mc.calibrate(robot, noisy.data, "sum")
     assert_allclose(free.accuracy["holdout"].rms_mm, plain.accuracy["holdout"].rms_mm, rtol=1e-9)
+
+
+def test_fixing_every_link_leaves_base_and_targets(robot: mc.Robot, noisy: Simulation) -> None:
+    fit = mc.calibrate(robot, noisy.data, "sum", fix=["*"])
+    assert sum(p.identifiable for p in fit.parameters) == 15
+    assert_allclose(fit.accuracy["train"].rms_mm, fit.accuracy["nominal_train"].rms_mm, rtol=1e-9)
+
+
+def test_parameters_that_are_not_identified_keep_their_value() -> None:
+    for name in ("scara_600", "irb2600"):
+        robot = mc.load_robot(name)
+        fit = mc.calibrate(robot, simulate(robot, 60, 3, seed=4).data, free=["d1"])
+        for p in fit.parameters:
+            assert p.identifiable or p.value == p.nominal
 
 
 def test_priors_help_when_poses_are_few(robot: mc.Robot) -> None:
@@ -201,6 +216,9 @@ def test_collinear_targets_are_a_notice(robot: mc.Robot) -> None:
         ({"fix": ["theta9"]}, "no parameter called 'theta9'"),
         ({"fix": ["d1"], "free": ["d1"]}, "both fixed and freed"),
         ({"priors": {"base_x": 1e-3}}, "no nominal value"),
+        ({"fix": ["base_x"]}, "no nominal value"),
+        ({"seed": -1}, "seed -1"),
+        ({"distance_tolerance": float("inf")}, "distance tolerance inf"),
         ({"priors": {"a2": -1.0}}, "must be positive"),
         ({"holdout": 1.5}, "not a fraction"),
         ({"method": "newton"}, "no method 'newton'"),

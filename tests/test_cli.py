@@ -120,8 +120,18 @@ def test_the_same_seed_gives_the_same_numbers(
         (("calibrate", "irb2600", "CSV", "--holdout", "2"), "fraction"),
         (("calibrate", "irb2600", "CSV", "--prior", "a2"), "NAME=SIGMA"),
         (("calibrate", "irb2600", "CSV", "--prior", "a2=3inch"), "NAME=SIGMA"),
+        (("calibrate", "irb2600", "CSV", "--prior", "a*=0.5mrad"), "a length"),
+        (("calibrate", "irb2600", "CSV", "--seed", "-1"), "seed -1"),
+        (("calibrate", "x" * 5000, "CSV"), "no robot called"),
+        (
+            ("calibrate", "irb2600", "CSV", "-o", "two.json", "--figure", "no/x.svg"),
+            "no such folder",
+        ),
+        (("calibrate", "irb2600", "CSV", "-o", "."), "is a folder"),
+        (("simulate", "irb2600", "--noise", "nan", "-o", "x.csv"), "finite"),
+        (("simulate", "irb2600", "--poses", "10000000000", "-o", "x.csv"), "at most"),
         (("calibrate", "irb2600", "CSV", "--colour", "red"), "--colour"),
-        (("calibrate", "irb2600", "CSV", "--figure", "x.bmp"), ".png, .svg or .pdf"),
+        (("calibrate", "irb2600", "CSV", "--figure", "x.bmp"), ".png, .svg, .pdf"),
         (("calibrate", "irb2600", "CSV", "-o", "/no/such/folder/fit.json"), "cannot be written"),
         (("calibrate", "irb2600", "absent.csv"), "absent.csv"),
         (("calibrate", "irb26", "CSV"), "irb2600"),
@@ -194,3 +204,17 @@ def test_console_script_runs(csv: Path) -> None:
     assert ended.returncode == 2
     assert ended.stderr.startswith("error: no robot called 'nothing'")
     assert len(ended.stderr.splitlines()) == 1
+
+
+def test_evaluate_doubts_data_that_do_not_belong(
+    csv: Path, tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit, wrong = tmp_path / "fit.json", tmp_path / "wrong.csv"
+    assert run("calibrate", "irb2600", csv, "-o", fit) == 0
+    mc.write_measurements(wrong, noisy.data.with_y(noisy.data.y * 1e-3))
+    capsys.readouterr()
+    assert run("evaluate", fit, wrong) == 0
+    assert "the same robot, measurement frame, units" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text('{"schema": 1, "kind": "diagnosis"}')
+    assert run("evaluate", tmp_path / "other.json", csv) == 2
+    assert "is a diagnosis" in capsys.readouterr().err

@@ -37,7 +37,7 @@ def test_unknown_columns_are_kept_with_a_notice(tmp_path: Path) -> None:
     data = read(GOOD.replace("z_mm\n", "z_mm,operator,tempeture_C\n").replace("\n", ",\n")
                 .replace("3,\n", "3,ann,20\n").replace("6,\n", "6,bob,21\n").replace("_C,", "_C"),
                 tmp_path)  # fmt: skip
-    assert list(data.columns["operator"]) == ["ann", "bob"]
+    assert list(data.unknown["operator"]) == ["ann", "bob"]
     assert any("column operator is not used" in note for note in data.notices)
     assert any("did you mean temperature_C" in note for note in data.notices)
 
@@ -68,6 +68,14 @@ def test_byte_order_mark_crlf_and_trailing_commas_are_fine(tmp_path: Path) -> No
         (GOOD.replace("4,5,6", "4,5,6,7"), ":3: 6 cells, but the header has 5"),
         (GOOD.replace("4,5,6", '"4,5",5,6'), "use a decimal point"),
         (HEAD + "\n0,0,,,\n", "no target was measured"),
+        (HEAD + ",smr2_x_mm,smr2_y_mm,smr2_z_mm\n0,0,1,2,3,,,\n", "smr2 is measured at no pose"),
+        (HEAD + "\n0,0,1,2,3\n1,0,1,2,3\n2,0,1,2,3\n", "all points of smr1 are the same"),
+        (GOOD.replace("4,5,6", "4,5,1e12"), ":3: smr1 is more than 100 km away"),
+        (GOOD.replace("4,5,6", "4,5,1_000"), "'1_000' is not a number"),
+        (
+            GOOD.replace("z_mm", "z_mm,u95_mm").replace("3\n", "3,0\n").replace("6\n", "6,1\n"),
+            ":2: column u95_mm: 0 is not positive",
+        ),
         (b"\xff\xfe\x00", "is not UTF-8"),
         (b"q1_rad\x00", "not a text file"),
     ],
@@ -121,7 +129,7 @@ def test_the_split_column_decides(tmp_path: Path) -> None:
 
 
 def test_the_same_seed_gives_the_same_split() -> None:
-    data = mc.measurements(np.arange(40.0).reshape(20, 2), np.ones((20, 3)))
+    data = mc.measurements(np.arange(40.0).reshape(20, 2), np.eye(20)[:, :3])
     first, second, other = (split(data, 0.25, seed)[1].q for seed in (3, 3, 4))
     assert_array_equal(first, second)
     assert not np.array_equal(first, other)

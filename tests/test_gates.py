@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import shared
 
 import minimax_cal as mc
 from minimax_cal.simulate import Simulation, simulate
@@ -57,13 +58,57 @@ def test_coupled_joints(robot: mc.Robot, noisy: Simulation) -> None:
 def test_targets_swapped_in_some_rows(
     order: tuple[int, ...], robot: mc.Robot, noisy: Simulation
 ) -> None:
+    """Every swapped row is named, held out or not."""
     y = noisy.data.y.copy()
     rows = [3, 17, 40]
     y[rows] = y[rows][:, order]
     message = refused(robot, noisy.data.with_y(y))
-    assert "targets look swapped" in message
-    trained = [line for line in (4, 18, 41) if f" {line}" in message]  # line = row + 1 in memory
-    assert trained  # those of the three that are not held out
+    assert "targets look swapped in 3 rows" in message
+    assert "lines 5, 19, 42" in message  # as in a file: line = row + 2
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.33])
+def test_a_third_of_the_rows_swapped_on_a_real_equilateral_triangle(share: float) -> None:
+    robot, path = shared("irb120")
+    data = mc.read_measurements(path)
+    rng = np.random.default_rng(int(100 * share))
+    rows = np.sort(rng.permutation(data.poses)[: int(share * data.poses)])
+    y = data.y.copy()
+    y[rows] = y[rows][:, [1, 0, 2]]
+    message = refused(mc.load_robot(robot), data.with_y(y))
+    assert f"targets look swapped in {len(rows)} rows" in message
+
+
+def test_a_target_seen_too_rarely_is_left_out(robot: mc.Robot, noisy: Simulation) -> None:
+    for count in (1, 2):
+        y = noisy.data.y.copy()
+        y[count:, 2] = np.nan
+        fit = mc.calibrate(robot, noisy.data.with_y(y))
+        assert fit.cell.targets == ("smr1", "smr2")
+        assert any("left out: smr3" in note for note in fit.notices)
+        assert fit.json()
+
+
+def test_one_target_in_another_unit(robot: mc.Robot, noisy: Simulation) -> None:
+    message = refused(robot, noisy.data.with_y(noisy.data.y * np.array([1, 1e3, 1])[:, None]))
+    assert "smr2" in message
+    assert "wrong unit" in message
+
+
+def test_an_outlier_is_named_wherever_it_is(robot: mc.Robot, noisy: Simulation) -> None:
+    y = noisy.data.y.copy()
+    y[30, 1] += [0.0, 0.05, 0.0]
+    for seed in range(3):
+        fit = mc.calibrate(robot, noisy.data.with_y(y), seed=seed)
+        assert any("stand out" in note and "line 32 smr2" in note for note in fit.notices)
+    assert not any("stand out" in note for note in mc.calibrate(robot, noisy.data).notices)
+
+
+def test_another_robot_is_doubted(noisy: Simulation) -> None:
+    fit = mc.calibrate("irb120", noisy.data)
+    text = " ".join(fit.notices)
+    assert "nominal robot misses" in text
+    assert "implausibly large changes" in text
 
 
 def test_one_pose_repeated(robot: mc.Robot, noisy: Simulation) -> None:

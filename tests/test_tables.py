@@ -38,5 +38,27 @@ def test_files_are_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         write_whole(path, "second")
     assert path.read_text() == "first"
     assert list(tmp_path.iterdir()) == [path]  # no scrap left
+    monkeypatch.undo()
+    link = tmp_path / "link.json"
+    link.symlink_to(path)
+    write_whole(link, "third")
+    assert link.is_symlink()
+    assert path.read_text() == "third"
     with pytest.raises(ValueError, match="JSON"):
         json_text({"x": math.nan})
+
+
+def test_a_pipe_is_written_into_not_replaced(tmp_path: Path) -> None:
+    import os
+    import stat
+    import threading
+
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    received: list[str] = []
+    reader = threading.Thread(target=lambda: received.append(pipe.read_text()))
+    reader.start()
+    write_whole(pipe, "through")
+    reader.join(timeout=10)
+    assert received == ["through"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)

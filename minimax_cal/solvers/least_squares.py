@@ -106,14 +106,17 @@ def solve(
     method: Method = METHODS["snllm"],
     limits: Limits = Limits(),
     progress: Callable[[int], None] = lambda iteration: None,
+    *,
+    trace: bool = True,
 ) -> LeastSquares[X]:
     """Minimise from each of `count` starts [paper S, Algorithm 1; damping by Nielsen's rule].
 
     points: number of residual points, which turns a sum of squares into a mean motion.
+    trace: whether to keep the cost of every iteration; else only those of start and end.
     """
     at = examine(problem, start, method)
     x, cost = at.x, at.cost
-    trace = [cost]
+    costs = [cost]
     status = [Status.ITERATION_LIMIT] * count
     iterations = np.zeros(count, dtype=int)
     damping, growth = np.full(count, 1e-3), np.full(count, 2.0)
@@ -146,7 +149,8 @@ def solve(
         at = trial if accept.all() else at.put(np.flatnonzero(accept), trial)
         cost = cost.copy()
         cost[alive] = at.cost
-        trace.append(cost)
+        if trace:
+            costs.append(cost)
         iterations[alive] = iteration
         if ended.any():
             for i in np.flatnonzero(ended):
@@ -156,7 +160,9 @@ def solve(
             alive, at = alive[stay], at.take(stay)
     if len(alive):
         x = x.put(alive, at.x)
-    return LeastSquares(x, cost, iterations, tuple(status), np.stack(trace))
+    return LeastSquares(
+        x, cost, iterations, tuple(status), np.stack(costs if trace else [*costs, cost])
+    )
 
 
 @dataclass(frozen=True, eq=False)

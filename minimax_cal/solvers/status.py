@@ -22,7 +22,8 @@ class Status(StrEnum):
 
 ADVICE = {
     Status.CONVERGED: "",
-    Status.ITERATION_LIMIT: "the iteration limit was reached; allow more iterations",
+    Status.ITERATION_LIMIT: "the iteration limit was reached: the robot file may not describe this "
+    "arm (check lengths, joint signs, units), or some parameters are weakly determined",
     Status.STALLED: "no step lowers the objective any more, yet the optimality test fails; try "
     "another QP backend, or (in a calibration) fix weakly determined parameters or give priors",
     Status.INFEASIBLE: "the constraints could not be met and may contradict each other; loosen "
