@@ -55,7 +55,7 @@ class Setting:
     """What is measured: poses, seed, base angle [rad], standard deviations, transmission error.
 
     transmission: amplitude of a once-a-turn error of every joint [rad]; it sets the RMS at the
-    minimum, about the paper's 1.5 mm.
+    minimum, about the paper's 1.5 mm.  span: joints turn so far to either side of zero [rad].
     """
 
     seed: int = 0
@@ -64,13 +64,14 @@ class Setting:
     length: float = 0.5e-3
     angle: float = 1.0e-3
     noise: float = 20e-6
-    transmission: float = 1.0e-3
+    transmission: float = 4.0e-3
+    span: float = 1.0
 
 
 def measured(setting: Setting) -> tuple[Robot, Measurements]:
     """The simulated measurements of a setting."""
     robot = load_robot("irb2600")
-    truth = Truth(setting.length, setting.angle, 0.0, 0.0, 0.0)
+    truth = Truth(setting.length, setting.angle, 0.0, 0.0, 0.0, span=setting.span)
     made = simulate(robot, setting.poses, 1, setting.seed, truth)
     rng = np.random.default_rng(setting.seed + 1)
     axis = rng.normal(size=3)

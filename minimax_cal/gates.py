@@ -13,7 +13,7 @@ from minimax_cal.errors import DataError
 from minimax_cal.kinematics import Array
 from minimax_cal.robot import Robot
 
-STANDS_OUT = 15.0  # times the typical error: a point worth a look
+STANDS_OUT = 8.0  # times the typical error, and 4 times what 95 % keep to: worth a look
 TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
 
 
@@ -146,7 +146,7 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
     """Points that miss by far more than the others.  distance: (k, m), NaN where not measured."""
     usual = float(np.nanmedian(distance))
     with np.errstate(invalid="ignore"):
-        far = distance > STANDS_OUT * max(usual, 1e-7)
+        far = distance > max(STANDS_OUT * usual, 4.0 * np.nanquantile(distance, 0.95), 1e-6)
     found = np.argwhere(far)
     if not len(found):
         return []

@@ -36,6 +36,7 @@ class Truth:
     noise_per_metre: float = 2.5e-6
     distance: float = 3.0
     circle: float = 0.1
+    span: float = np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def simulate(
     angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets
     spots = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0.0 * angle], axis=1) * truth.circle
     cell = Cell(real, base, tuple(f"smr{i + 1}" for i in range(targets)), spots)
-    q = random_poses(robot, poses, rng)
+    q = random_poses(robot, poses, rng, truth.span)
     y = cell.predict(q + truth.compliance * gravity(real, q))
     spread = truth.noise + truth.noise_per_metre * np.linalg.norm(y, axis=-1, keepdims=True)
     y = y + spread * rng.normal(size=y.shape)
@@ -94,10 +95,12 @@ def simulate(
     return Simulation(data, cell)
 
 
-def random_poses(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+def random_poses(
+    robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi
+) -> Array:
     """Joint values (count, n) within the limits and one turn, the flange above the floor."""
-    span = np.where(robot.prismatic, 0.5, np.pi)
-    lower, upper = np.maximum(robot.lower, -span), np.minimum(robot.upper, span)
+    most = np.where(robot.prismatic, 0.5, span)
+    lower, upper = np.maximum(robot.lower, -most), np.minimum(robot.upper, most)
     chosen = np.empty((0, robot.joints))
     for _ in range(100):
         q = rng.uniform(lower, upper, (4 * count, robot.joints))
