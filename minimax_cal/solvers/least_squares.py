@@ -98,6 +98,7 @@ class LeastSquares(Generic[X]):
     trace: Array
 
 
+@np.errstate(over="ignore", invalid="ignore")  # an undamped step may diverge: a status says so
 def solve(
     problem: Separable[X],
     start: X,
@@ -126,7 +127,7 @@ def solve(
             break
         progress(iteration)
         damp = damping[alive] if method.damped else np.zeros(len(alive))
-        short, gain = damped_step(at.matrix, at.target, damp)
+        short, gain = damped_step(at, damp)
         square = np.einsum("bi,bij,bj->b", short, at.matrix, short)
         motion = np.sqrt(np.maximum(square, 0.0) / points)
         move = lift(problem.linear, short, at.slope, at.gram, method)
@@ -171,6 +172,8 @@ class Examined(Generic[X]):
 
     cost: (B,).  slope: (B, p), gram: (B, p, p) over all parameters.  target, matrix: right side and
     matrix of the reduced problem in the angles alone (Schur complement), or again over all.
+    scale: size of the matrix's columns, but not less than a part in 1e5 of what they were before
+    the lengths took theirs: what is left of a redundant angle is rounding, not to be scaled up.
     """
 
     x: X
@@ -179,10 +182,11 @@ class Examined(Generic[X]):
     gram: Array
     target: Array
     matrix: Array
+    scale: Array
 
     def take(self, rows: Array) -> Examined[X]:
         """Some members of the batch."""
-        arrays = (self.cost, self.slope, self.gram, self.target, self.matrix)
+        arrays = (self.cost, self.slope, self.gram, self.target, self.matrix, self.scale)
         return Examined(self.x.take(rows), *(array[rows] for array in arrays))
 
     def put(self, rows: Array, other: Examined[X]) -> Examined[X]:
@@ -195,9 +199,11 @@ class Examined(Generic[X]):
             self.gram.copy(),
             self.target.copy(),
             self.matrix.copy(),
+            self.scale.copy(),
         )
         out.cost[rows], out.slope[rows], out.gram[rows] = chosen.cost, chosen.slope, chosen.gram
         out.target[rows], out.matrix[rows] = chosen.target, chosen.matrix
+        out.scale[rows] = chosen.scale
         return out
 
 
@@ -205,7 +211,7 @@ def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
     """Cost and (reduced) normal equations; separable methods move x to its best lengths first."""
     if not method.separable:
         cost, slope, gram = problem.normal(x)
-        return Examined(x, cost, slope, gram, slope, gram)
+        return Examined(x, cost, slope, gram, slope, gram, column_size(gram))
     x, cost, slope, gram, coupled = problem.reduced(x, full=method.full)
     r, w = problem.linear, ~problem.linear
     lengths, mixed = gram[:, r][:, :, r], gram[:, r][:, :, w]
@@ -215,7 +221,13 @@ def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
     angles = mixed.shape[-1]
     matrix = gram[:, w][:, :, w] - np.swapaxes(mixed, -1, -2) @ solved[..., :angles]
     matrix = matrix + np.swapaxes(coupled, -1, -2) @ solved[..., angles:]
-    return Examined(x, cost, slope, gram, slope[:, w], matrix)
+    size = np.maximum(column_size(matrix), 1e-5 * column_size(gram)[:, w])
+    return Examined(x, cost, slope, gram, slope[:, w], matrix, size)
+
+
+def column_size(gram: Array) -> Array:
+    """Norms of the Jacobian's columns: (B, p)."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("bii->bi", gram), 1e-300)))
 
 
 def lift(linear: Array, short: Array, slope: Array, gram: Array, method: Method) -> Array:
@@ -230,22 +242,26 @@ def lift(linear: Array, short: Array, slope: Array, gram: Array, method: Method)
     return out
 
 
-def damped_step(matrix: Array, slope: Array, damping: Array) -> tuple[Array, Array]:
-    """(H + mu D) step = slope with D = diag H, and the predicted decrease of the cost."""
-    scale = np.sqrt(np.maximum(np.einsum("bii->bi", matrix), 1e-300))
-    scaled = matrix / scale[:, :, None] / scale[:, None, :]
-    right = slope / scale
-    eye = np.eye(matrix.shape[-1])
-    step = solve_normal(scaled + damping[:, None, None] * eye, right[..., None])[..., 0]
+def damped_step(at: Examined[X], damping: Array) -> tuple[Array, Array]:
+    """(H + mu D) step = slope with D = scale^2, and the predicted decrease of the cost."""
+    scaled = at.matrix / at.scale[:, :, None] / at.scale[:, None, :]
+    right = at.target / at.scale
+    eye = np.eye(right.shape[-1])
+    step = solve_normal(scaled + damping[:, None, None] * eye, right[..., None], rescale=False)
+    step = step[..., 0]
     model = 2.0 * right * step - step * (scaled @ step[..., None])[..., 0]
-    return step / scale, model.sum(-1)
+    return step / at.scale, model.sum(-1)
 
 
-def solve_normal(matrix: Array, right: Array) -> Array:
-    """Solve a batch of symmetric positive semi-definite systems; the least solution if singular."""
+def solve_normal(matrix: Array, right: Array, *, rescale: bool = True) -> Array:
+    """Solve a batch of symmetric positive semi-definite systems; the least solution if singular.
+
+    rescale: bring the diagonal to one first, which a matrix in bad units needs.
+    """
     if not matrix.shape[-1]:
         return np.zeros_like(right)
-    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", matrix), 1e-300))
+    diagonal = np.maximum(np.einsum("...ii->...i", matrix), 1e-300)
+    scale = np.sqrt(diagonal) if rescale else np.ones_like(diagonal)
     scaled = matrix / scale[..., :, None] / scale[..., None, :]
     try:
         np.linalg.cholesky(scaled - 1e-14 * np.eye(matrix.shape[-1]))
