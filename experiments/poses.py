@@ -1,0 +1,245 @@
+"""Poses measured by three reflectors, their errors, and Gauss-Newton fits to them [paper M].
+
+A pose is a (4, 4) matrix.  A twist is (v, w): a point p moves by v + w x p, in the axes of the
+frame that the pose is given in (a spatial twist) [m, rad].
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.identify import RESOLUTION
+from minimax_cal.kinematics import Array, hat, rotation
+from minimax_cal.solvers.status import Status
+from minimax_cal.start import project
+
+X = TypeVar("X")
+CENTROID = np.zeros(3)  # the origin of a measured pose
+
+
+def triangle(y: Array) -> Array:
+    """Three reflectors in a frame of their own, from their mean distances: (3, 3) [m].
+
+    y: (m, 3, 3) pose, reflector, coordinate [m].  Origin in the centroid, x from the first to the
+    second, z normal to the plane, so that the third lies at y > 0.
+    """
+    pairs = ((0, 1), (1, 2), (2, 0))
+    ab, bc, ca = (np.linalg.norm(y[:, i] - y[:, j], axis=-1).mean() for i, j in pairs)
+    along = (ab**2 + ca**2 - bc**2) / (2.0 * ab)
+    corners = np.array([[0, 0, 0], [ab, 0, 0], [along, np.sqrt(max(ca**2 - along**2, 0.0)), 0]])
+    return np.asarray(corners - corners.mean(axis=0))
+
+
+def poses_of(shape: Array, y: Array) -> Array:
+    """Poses (m, 4, 4) that bring a shape nearest to measured points [Kabsch 1976].
+
+    shape: (k, 3) centred, its points not on a line.  y: (m, k, 3) [m].
+    """
+    centre = y.mean(axis=1)
+    turn = project(np.einsum("mka,kb->mab", y - centre[:, None], shape))
+    return pose(turn, centre)
+
+
+def pose(turn: Array, shift: Array) -> Array:
+    """(..., 4, 4) from a rotation (..., 3, 3) and a translation (..., 3) [m]."""
+    out = np.zeros((*turn.shape[:-2], 4, 4), dtype=np.result_type(turn, shift))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = turn, shift, 1.0
+    return out
+
+
+def inverse(T: Array) -> Array:
+    """Inverse of poses (..., 4, 4)."""
+    back = np.swapaxes(T[..., :3, :3], -1, -2)
+    return pose(back, -(back @ T[..., :3, 3, None])[..., 0])
+
+
+def points(T: Array, spots: Array) -> Array:
+    """Points fixed in moving frames: (m, k, 3) [m].  T: (m, 4, 4).  spots: (k, 3)."""
+    return np.asarray(np.einsum("mij,kj->mki", T[:, :3, :3], spots) + T[:, None, :3, 3])
+
+
+def log(turn: Array) -> Array:
+    """Rotation vectors (..., 3) of rotations (..., 3, 3) [rad]."""
+    return Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:-1])
+
+
+def position_error(measured: Array, computed: Array, tool: Array = CENTROID) -> Array:
+    """Distance between measured and computed places of a tool point: (m,) [m; M eq. 3].
+
+    tool: (3,) in the frame of the pose [m].
+    """
+    places = [T[..., :3, :3] @ tool + T[..., :3, 3] for T in (measured, computed)]
+    return np.asarray(np.linalg.norm(places[0] - places[1], axis=-1))
+
+
+def orientation_error(measured: Array, computed: Array) -> Array:
+    """Angle between measured and computed orientations, |log(R_m' R_c)|: (m,) [rad; M eq. 5]."""
+    back = np.swapaxes(measured[..., :3, :3], -1, -2)
+    return np.asarray(np.linalg.norm(log(back @ computed[..., :3, :3]), axis=-1))
+
+
+def euler_deviation(measured: Array, computed: Array) -> Array:
+    """Deviations |a_m - a_c|, |b_m - b_c|, |c_m - c_c| of R = Rz(c) Ry(b) Rx(a) [rad; M eq. 4].
+
+    ISO 9283 states orientation accuracy so.  Near b = +-90 degrees (gimbal lock) a and c are not
+    determined: they may differ by any amount although the orientations agree (M's 75th pose).
+    Returns (m, 3).
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # scipy's, about the gimbal lock
+        angles = [
+            Rotation.from_matrix(T[..., :3, :3]).as_euler("xyz") for T in (measured, computed)
+        ]
+    return np.abs((angles[0] - angles[1] + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def lever(shape: Array) -> float:
+    """Length that makes an angle comparable to a position: sqrt(2/3) of the RMS radius [m].
+
+    With it |e_p|^2 + lever^2 |e_R|^2 is a third of the sum of squares over the three points, the
+    directions of the turn averaged: a small turn w moves them by sum |w x s_k|^2.
+    """
+    return float(np.sqrt(2.0 / 3.0 * (shape**2).sum(axis=1).mean()))
+
+
+def pose_residual(measured: Array, computed: Array, length: float) -> Array:
+    """Position p_c - p_m and length times log(R_m' R_c): (m, 6) [m]."""
+    turn = log(np.swapaxes(measured[:, :3, :3], -1, -2) @ computed[:, :3, :3])
+    return np.concatenate([computed[:, :3, 3] - measured[:, :3, 3], length * turn], axis=1)
+
+
+def pose_slope(measured: Array, computed: Array, twists: Array, length: float) -> Array:
+    """Derivative of `pose_residual`: (m, 6, p).  twists: (m, 6, p) of the computed poses.
+
+    log(R_m' exp(w) R_c) = log(exp(R_m' w) R_m' R_c) changes by Jl^-1(log(R_m' R_c)) R_m' w.
+    """
+    back = np.swapaxes(measured[:, :3, :3], -1, -2)
+    turn = inverse_left_jacobian(log(back @ computed[:, :3, :3])) @ back @ twists[:, 3:]
+    return np.concatenate([point_slope(computed[:, :3, 3], twists), length * turn], axis=1)
+
+
+def point_slope(point: Array, twists: Array) -> Array:
+    """Motion v + w x p of points (m, 3) under twists (m, 6, p): (m, 3, p)."""
+    return np.asarray(twists[:, :3] - hat(point) @ twists[:, 3:])
+
+
+def left_jacobian(w: Array) -> Array:
+    """V with exp(v, w) = [exp(w), V v] and d exp(w) exp(-w) = hat(V dw).  w: (..., 3) [rad].
+
+    Returns (..., 3, 3).
+    """
+    squared = (w * w).sum(-1)[..., None, None]
+    small = np.real(squared) < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, squared))
+    first = np.where(small, 0.5 - squared / 24.0, 2.0 * (np.sin(0.5 * angle) / angle) ** 2)
+    second = np.where(small, 1.0 / 6.0 - squared / 120.0, (angle - np.sin(angle)) / angle**3)
+    k = hat(w)
+    return np.asarray(np.eye(3) + first * k + second * (k @ k))
+
+
+def inverse_left_jacobian(w: Array) -> Array:
+    """Inverse of `left_jacobian`, for angles below 2 pi: (..., 3, 3)."""
+    squared = (w * w).sum(-1)[..., None, None]
+    small = squared < 1e-4
+    half = 0.5 * np.sqrt(np.where(small, 1.0, squared))
+    series = 1.0 / 12.0 + squared / 720.0
+    k = hat(w)
+    factor = np.where(small, series, (1.0 - half / np.tan(half)) / np.where(small, 1.0, squared))
+    return np.asarray(np.eye(3) - 0.5 * k + factor * (k @ k))
+
+
+def exp(twist: Array) -> Array:
+    """Motion (..., 4, 4) of a unit time with twist (..., 6).  Any dtype."""
+    v, w = twist[..., :3], twist[..., 3:]
+    return pose(rotation(w), (left_jacobian(w) @ v[..., None])[..., 0])
+
+
+def adjoint(T: Array) -> Array:
+    """Matrix that takes twists of the inner frame of T to its outer frame: (..., 6, 6)."""
+    turn, zero = T[..., :3, :3], np.zeros_like(T[..., :3, :3])
+    shift = hat(T[..., :3, 3]) @ turn
+    top, bottom = np.concatenate([turn, shift], -1), np.concatenate([zero, turn], -1)
+    return np.concatenate([top, bottom], axis=-2)
+
+
+@dataclass(frozen=True, eq=False)
+class Found(Generic[X]):
+    """x: where Gauss-Newton ended.  cost: sum of squares there [m^2].
+
+    parameters, identified: number of columns, and rank of the last Jacobian.
+    """
+
+    x: X
+    cost: float
+    iterations: int
+    parameters: int
+    identified: int
+    status: Status
+
+
+def gauss_newton(
+    linearise: Callable[[X], tuple[Array, Array]],
+    step: Callable[[X, Array], X],
+    x: X,
+    resolution: float = RESOLUTION,
+    iterations: int = 100,
+) -> Found[X]:
+    """Gauss-Newton for redundant parameters: the least step of all that fit equally well.
+
+    linearise: residuals (r,) [m] and Jacobian (r, p).  Columns are scaled to unit norm; singular
+    values below resolution times the largest are cut off (truncated SVD), so that combinations
+    the data do not show keep their start.  A step that raises the cost is halved.  Ends where the
+    step moves the residuals by less than 1e-11 m (root mean square).
+    """
+    residual, slope = linearise(x)
+    cost, status, taken, rank = float(residual @ residual), Status.ITERATION_LIMIT, 0, 0
+    while taken < iterations:
+        taken += 1
+        scale = np.linalg.norm(slope, axis=0)
+        largest = scale.max()  # a column that is nothing but rounding must not be blown up
+        scale = np.where(scale > 1e-9 * largest, scale, largest)
+        u, s, vt = np.linalg.svd(slope / scale, full_matrices=False)
+        rank = int(np.count_nonzero(s > resolution * s[0]))
+        pull = -(u[:, :rank].T @ residual)
+        move = vt[:rank].T @ (pull / s[:rank]) / scale
+        share = 1.0
+        for _ in range(30):
+            trial = step(x, share * move)
+            after, after_slope = linearise(trial)
+            if float(after @ after) <= cost * (1.0 + 1e-12) + 1e-24:
+                break
+            share *= 0.5
+        else:
+            status = Status.STALLED
+            break
+        x, residual, slope, cost = trial, after, after_slope, float(after @ after)
+        if np.linalg.norm(pull) <= 1e-11 * np.sqrt(len(residual)):
+            status = Status.CONVERGED
+            break
+    return Found(x, cost, taken, slope.shape[1], rank, status)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A calibrated arm: predict (m, n) joints -> (m, 3, 3) points [m], and what it took.
+
+    identified: rank of the Jacobian, or number of parameters freed.
+    """
+
+    predict: Callable[[Array], Array]
+    parameters: int
+    identified: int
+    iterations: int
+    status: str
+
+
+def fit_of(predict: Callable[[Array], Array], found: Found[X]) -> Fit:
+    """A fit by our Gauss-Newton."""
+    status = str(found.status)
+    return Fit(predict, found.parameters, found.identified, found.iterations, status)
