@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,16 @@ from minimax_cal.errors import DataError, OptionError
 from minimax_cal.identify import Identification
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import accuracy
-from minimax_cal.model import Model, Prior, SumOfSquares, in_base, model_of
+from minimax_cal.model import (
+    NO_MIX,
+    Model,
+    Prior,
+    SumOfSquares,
+    in_base,
+    model_of,
+    pose_weights,
+    with_poses,
+)
 from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares, minimax
@@ -48,7 +57,8 @@ POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calib
 class Options:
     """How to calibrate.
 
-    objective: sum, minimax (the worst target), point (the worst point), or smr:K.
+    objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.
+    lever: metres that a radian counts as in the pose objective, NaN for the targets' own.
     qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
     seed: of that choice.  fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
@@ -65,6 +75,7 @@ class Options:
     free: Sequence[str] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
     method: str = "snllm"
+    lever: float = np.nan
     hessian: str = "gauss-newton"
     distance: str = "two-sided"
     distance_tolerance: float = np.nan
@@ -169,12 +180,12 @@ def remarks(
 
 def objective_of(objective: str, data: Measurements) -> int:
     """Index of the single target of smr:K, else -1.  Raises OptionError."""
-    if objective in ("sum", "minimax", "point"):
+    if objective in ("sum", "minimax", "point", "pose"):
         return -1
     kind, _, which = objective.partition(":")
     if kind != "smr" or not which:
         raise OptionError(
-            f"no objective {objective!r}; choose sum, minimax, point or smr:K (K as in smr1)"
+            f"no objective {objective!r}; choose sum, minimax, point, pose or smr:K (K as in smr1)"
         )
     if f"smr{which}" not in data.targets:
         raise OptionError(
@@ -195,6 +206,8 @@ def check_options(options: Options) -> None:
             raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    if options.lever <= 0.0 or np.isinf(options.lever):
+        raise OptionError(f"lever {options.lever:g} m: must be positive and finite")
     if options.distance_tolerance <= 0.0 or np.isinf(options.distance_tolerance):
         raise OptionError(
             f"distance tolerance {options.distance_tolerance:g} m: must be positive and finite"
@@ -247,7 +260,12 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
 
     report("identifiable parameters")
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
+    weights = NO_MIX
     model = base.emphasise(share)
+    if options.objective == "pose":
+        check_poses(data)
+        weights = pose_weights(data, options.lever)
+        model = with_poses(model, weights)
     found = identify.identify(
         model,
         frame.state,
@@ -279,7 +297,9 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         nominal=frame.state,
         state=state,
         identification=found,
-        covariance=covariance(base.only(found.active).with_prior(model.prior), state, share),
+        covariance=covariance(
+            base.only(found.active).with_prior(model.prior), state, share, weights
+        ),
         status=status,
         iterations=iterations,
         worst=worst,
@@ -287,6 +307,17 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         trace=tuple(float(value) for value in squares.trace[:, 0]),
         notices=notices,
     )
+
+
+def check_poses(data: Measurements) -> None:
+    """Raise OptionError if the targets give no orientation."""
+    if len(data.targets) < 3 or gates.collinear(data):
+        raise OptionError("objective pose needs three targets that are not on a line")
+    whole = int(data.seen.all(axis=1).sum())
+    if whole < LEAST_POSES:
+        raise OptionError(
+            f"objective pose needs poses at which all targets were measured; there are {whole}"
+        )
 
 
 def wishes(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, Array]:
@@ -442,12 +473,13 @@ def cross_errors(model: Model, state: State) -> Array:
     return np.where(model.seen[:, None], distance, np.nan)
 
 
-def covariance(model: Model, state: State, share: Array) -> Array:
+def covariance(model: Model, state: State, share: Array, weights: Array) -> Array:
     """Covariance (p, p) of an estimator that weighs target i by share_i; NaN where not estimated.
 
     The sandwich H^-1 V H^-1 with H = sum share_i J_i'J_i and V = sum share_i^2 s_i^2 J_i'J_i, where
     s_i is the residual noise of target i per coordinate, its degrees of freedom counted.  Errors
     are taken as independent: model error that the poses share makes the true uncertainty larger.
+    With pose weights W (m, 3k, 3k) H = J'WJ and V = s^2 J'W^2 J.
     """
     out = np.full((model.names.count,) * 2, np.nan)
     normal = model.normal(state, model.active)
@@ -459,6 +491,11 @@ def covariance(model: Model, state: State, share: Array) -> Array:
     prior = np.diag(model.prior.weight[model.active]) * share.max()
     bread = np.einsum("k,kij->ij", share, normal.gram) + prior
     filling = np.einsum("k,kij->ij", share**2 * noise, normal.gram)
+    if len(weights):
+        gram = with_poses(model, weights).normal(state, model.active).gram
+        bread = gram.sum(axis=0) + prior
+        squared = replace(model, mix=weights).normal(state, model.active).gram
+        filling = squared.sum(axis=0) * float(noise.mean())
     filling = filling + prior * share.max() * float(noise.mean())
     inverse = solve_normal(bread, np.eye(len(bread)))
     out[np.ix_(model.active, model.active)] = inverse @ filling @ inverse

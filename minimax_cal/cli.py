@@ -84,7 +84,7 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     "--objective",
     default=DEFAULTS.objective,
     show_default=True,
-    help="sum, minimax (the worst target), point (the worst point) or one target: smr:K.",
+    help="sum, minimax (worst target), point (worst point), pose, or one target: smr:K.",
 )
 @click.option("--qp", default=DEFAULTS.qp, show_default=True, help="QP backend of minimax.")
 @click.option(
@@ -128,6 +128,12 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     help="Form of the distance constraints: two-sided, squared or off.",
 )
 @click.option(
+    "--lever",
+    type=float,
+    metavar="MM",
+    help="What a radian counts as in the pose objective [default: the targets' own].",
+)
+@click.option(
     "--distance-tolerance",
     type=float,
     metavar="MM",
@@ -147,6 +153,7 @@ def calibrate_command(
     prior: Sequence[str],
     fix: Sequence[str],
     free: Sequence[str],
+    lever: float | None,
     distance_tolerance: float | None,
     figure: Path | None,
     as_json: bool,
@@ -169,6 +176,7 @@ def calibrate_command(
             free=names_of(free),
             priors=dict(map(prior_of, prior)),
             distance_tolerance=millimetres * 1e-3,
+            lever=float("nan") if lever is None else lever * 1e-3,
             report=status.update,
             **choices,
         )

@@ -8,20 +8,24 @@ arithmetic costs.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from minimax_cal import kinematics
 from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array, Chain
+from minimax_cal.kinematics import Array, Chain, hat
 from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
 HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
+SHAPE = 1e-6  # share of the plain sum in the pose objective
 BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
+
+
+NO_MIX: Array = np.zeros((0, 0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,8 @@ class Model:
     weight: (k, m) weight of each point, 0 where not measured.
     names: the parameters.  active: (p,) True where a parameter is free.
     prior: on the parameters, in the order of `names`.
+    mix: (m, 3k, 3k) matrices that each pose's errors (all targets, measurement axes) are multiplied
+    by, so that the sum of squares weighs position and orientation; empty for plain points.
     """
 
     q: Array
@@ -82,6 +88,7 @@ class Model:
     names: Names
     active: Array
     prior: Prior
+    mix: Array = field(default_factory=lambda: NO_MIX)
 
     @property
     def counts(self) -> Array:
@@ -142,7 +149,28 @@ class Model:
         error = in_base(state, self.y[..., block.rows]) - point
         if not self.even:
             error *= np.sqrt(self.weight[:, None, block.rows])
-        return error, point
+        return self.mixed(state, error, block.rows), point
+
+    def mixed(self, state: State, rows: Array, poses: slice) -> Array:
+        """Rows (..., k, 3, c) in base axes times the mix, if there is one."""
+        if not len(self.mix):
+            return rows
+        turned = state.rotation[..., None, :, :] @ rows
+        *batch, k, _, c = rows.shape
+        flat = turned.reshape(*batch, 3 * k, c)
+        mixed = np.einsum("cab,...bc->...ac", self.mix[poses], flat)
+        return np.asarray(mixed.reshape(rows.shape))
+
+    def pulled(self, state: State, error: Array, poses: slice) -> Array:
+        """Weighted errors times the transposed weight, in base axes: what pulls at each point."""
+        if len(self.mix):
+            *batch, k, _, c = error.shape
+            flat = error.reshape(*batch, 3 * k, c)
+            back = np.einsum("cba,...bc->...ac", self.mix[poses], flat).reshape(error.shape)
+            error = np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ back
+        if not self.even:
+            error = error * np.sqrt(self.weight[:, None, poses])
+        return error
 
     def cost(self, state: State) -> Array:
         """F_i: (..., k) [m^2], the prior left out."""
@@ -179,6 +207,11 @@ class Model:
         turned = select.jacobian(block, point)
         if not self.even:
             turned *= np.sqrt(self.weight[:, None, None, block.rows])
+        if len(self.mix):  # parameter by parameter, the targets of a pose together
+            axis = turned.ndim - 4
+            one = replace(state, rotation=state.rotation[..., None, :, :])
+            turned = self.mixed(one, np.moveaxis(turned, axis, axis + 1), block.rows)
+            turned = np.ascontiguousarray(np.moveaxis(turned, axis + 1, axis))
         return error, turned
 
     def coupling_on(self, state: State, blocks: list[Block]) -> Array:
@@ -192,9 +225,7 @@ class Model:
         total = np.zeros(1)
         for block in blocks:
             links = block.links
-            error, _ = self.error_of(state, block)
-            if not self.even:
-                error = error * np.sqrt(self.weight[:, None, block.rows])
+            error = self.pulled(state, self.error_of(state, block)[0], block.rows)
             *batch, _, _, c = error.shape
             axis, _ = block.screws
             base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
@@ -379,3 +410,33 @@ def model_of(robot: Robot, data: Measurements) -> Model:
         active=np.ones(names.count, dtype=bool),
         prior=Prior(mean, np.zeros(names.count)),
     )
+
+
+def pose_weights(data: Measurements, lever: float) -> Array:
+    """W (m, 3k, 3k) that turns the errors of three or more targets into pose errors, squared.
+
+    e'We = k |e_c|^2 + k lever^2 |e_w|^2 per pose: e_c is the error of the targets' centroid, e_w
+    the small turn that fits their errors best.  A trace of the plain sum stays in, which settles
+    the targets' own shape.  lever: metres that a radian counts as; NaN for the one with which
+    the sum over the directions of a turn is that of the points.  Rows where a target is missing
+    are zero.
+    """
+    k = len(data.targets)
+    whole = np.asarray(data.seen.all(axis=1))
+    arm = np.where(whole[:, None, None], data.y - data.y.mean(axis=1, keepdims=True), 0.0)
+    inertia = (arm**2).sum((1, 2))[:, None, None] * np.eye(3) - np.swapaxes(arm, 1, 2) @ arm
+    inertia[~whole] = np.eye(3)
+    if not np.isfinite(lever):
+        lever = float(np.sqrt(np.trace(inertia[whole].mean(axis=0)) / 3.0 / k))
+    centre = np.tile(np.eye(3) / k, k)
+    turn = np.linalg.solve(inertia, np.concatenate(np.moveaxis(hat(arm), 1, 0), axis=-1))
+    weight = k * (centre.T @ centre + lever**2 * np.swapaxes(turn, 1, 2) @ turn)
+    return np.where(whole[:, None, None], weight + SHAPE * np.eye(3 * k), 0.0)
+
+
+def with_poses(model: Model, weight: Array) -> Model:
+    """The model whose sum of squares is that of pose errors.  weight: as `pose_weights`."""
+    mix = np.zeros_like(weight)
+    whole = np.asarray(weight.any(axis=(1, 2)))
+    mix[whole] = np.swapaxes(np.linalg.cholesky(weight[whole]), 1, 2)
+    return replace(model, mix=mix)

@@ -95,9 +95,7 @@ def simulate(
     return Simulation(data, cell)
 
 
-def random_poses(
-    robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi
-) -> Array:
+def random_poses(robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi) -> Array:
     """Joint values (count, n) within the limits and one turn, the flange above the floor."""
     most = np.where(robot.prismatic, 0.5, span)
     lower, upper = np.maximum(robot.lower, -most), np.minimum(robot.upper, most)

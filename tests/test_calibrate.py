@@ -30,6 +30,30 @@ def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> N
     assert_allclose(f / f.max(), best.f / best.f.max(), rtol=1e-9)
 
 
+def test_pose_objective_trades_position_for_orientation(robot: mc.Robot, noisy: Simulation) -> None:
+    from experiments.poses import orientation_error, poses_of, triangle
+
+    def turn(fit: mc.Calibration) -> float:
+        measured = noisy.data.y
+        shape = triangle(measured)
+        pose = [poses_of(shape, y) for y in (measured, fit.predict(noisy.data.q))]
+        return float(np.sqrt(np.mean(orientation_error(*pose) ** 2)))
+
+    total = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
+    own = mc.calibrate(robot, noisy.data, "pose", holdout=0.0)
+    wide = mc.calibrate(robot, noisy.data, "pose", holdout=0.0, lever=3.0)
+    assert own.status == wide.status == "converged"
+    assert turn(wide) < turn(own) < 1.02 * turn(total)
+    assert wide.accuracy["train"].rms_mm > total.accuracy["train"].rms_mm
+    assert own.accuracy["train"].rms_mm < 1.02 * total.accuracy["train"].rms_mm
+
+
+def test_pose_needs_a_triangle(robot: mc.Robot, noisy: Simulation) -> None:
+    two = noisy.data.keep(np.array([True, True, False]))
+    with pytest.raises(mc.OptionError, match="three targets"):
+        mc.calibrate(robot, two, "pose")
+
+
 def test_worst_point_is_lowered(robot: mc.Robot, noisy: Simulation) -> None:
     total = mc.calibrate(robot, noisy.data, "sum")
     point = mc.calibrate(robot, noisy.data, "point")

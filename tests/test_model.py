@@ -136,3 +136,51 @@ def test_prior_rows_count_like_measurements(robot: mc.Robot, rng: np.random.Gene
     assert_allclose(cost, expected, rtol=1e-13)
     assert_allclose(slope - plain, -weight * off, rtol=0, atol=1e-10)
     assert_allclose(gram - bare, np.diag(weight), rtol=0, atol=1e-10)
+
+
+def test_pose_weights_are_position_and_orientation_errors(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    """A rigid motion of the measured triangle by (shift, small turn) has the cost it should."""
+    from minimax_cal.model import SHAPE, pose_weights
+
+    y = rng.normal(size=(7, 3, 3))
+    data = mc.measurements(rng.uniform(-2, 2, (7, 6)), y)
+    shift, turn, lever = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), 0.7
+    arm = y - y.mean(axis=1, keepdims=True)
+    error = shift[:, None] + np.cross(turn[:, None], arm)
+    flat = error.reshape(7, 9)
+    cost = np.einsum("ma,mab,mb->m", flat, pose_weights(data, lever), flat)
+    expected = 3 * ((shift**2).sum(1) + lever**2 * (turn**2).sum(1)) + SHAPE * (flat**2).sum(1)
+    assert_allclose(cost, expected, rtol=1e-12)
+    bent = rng.normal(size=(7, 9))  # an error of the triangle's own shape costs nothing else
+    pose = np.concatenate([np.tile(np.eye(3), (3, 1))[None].repeat(7, 0),
+                           np.moveaxis(np.stack([np.cross(e, arm) for e in np.eye(3)]), 0, -1)
+                           .reshape(7, 9, 3)], axis=-1)  # fmt: skip
+    bent -= np.einsum("mab,mb->ma", pose @ np.linalg.pinv(pose), bent)
+    cost = np.einsum("ma,mab,mb->m", bent, pose_weights(data, lever), bent)
+    assert_allclose(cost, SHAPE * (bent**2).sum(1), rtol=1e-6)
+
+
+def test_mixed_normal_equations_are_explicit_ones(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    from minimax_cal.model import pose_weights, with_poses
+
+    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))
+    plain = model_of(robot, data)
+    weight = pose_weights(data, 0.3)
+    mixed = with_poses(plain, weight)
+    x = somewhere(robot, rng)
+    every = np.ones(plain.names.count, dtype=bool)
+    found = mixed.normal(x, every)
+    jacobian = np.einsum("ab,kmbp->kmap", x.rotation, plain.jacobian(x))
+    flat = np.moveaxis(jacobian, 0, 1).reshape(30, 9, -1)
+    error = np.moveaxis(plain.error(x) @ x.rotation.T, 0, 1).reshape(30, 9)
+    gram = np.einsum("map,mab,mbq->pq", flat, weight, flat)
+    assert_allclose(found.gram.sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())
+    slope = np.einsum("map,mab,mb->p", flat, weight, error)
+    assert_allclose(found.slope.sum(0), slope, rtol=0, atol=1e-11 * np.abs(slope).max())
+    assert_allclose(found.cost.sum(), np.einsum("ma,mab,mb", error, weight, error), rtol=1e-12)
+    batch = mixed.normal(x.repeat(3), every)
+    assert_allclose(batch.gram[1].sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())
