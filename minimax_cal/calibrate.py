@@ -265,7 +265,6 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     if options.objective == "pose":
         check_poses(data)
         weights = pose_weights(data, options.lever)
-        model = with_poses(model, weights)
     found = identify.identify(
         model,
         frame.state,
@@ -278,6 +277,11 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     report("least squares")
     model, squares = least(model.only(found.active), frame, sigma, options)
     squares, notices = wider(robot, model, squares, report)
+    if len(weights):
+        # the turn that fits the errors best vanishes for half a turn too: start near the answer
+        problem = SumOfSquares(with_poses(model, weights))
+        points = float(model.counts.sum())
+        squares = least_squares.solve(problem, squares.x, 1, points, METHODS[options.method])
     state, status = squares.x.take(np.array(0)), squares.status[0]
     iterations = int(squares.iterations[0])
     distances = measured_distances(data, options.distance_tolerance)

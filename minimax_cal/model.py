@@ -21,7 +21,6 @@ from minimax_cal.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 
 HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
-SHAPE = 1e-6  # share of the plain sum in the pose objective
 BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
 
 
@@ -415,10 +414,11 @@ def model_of(robot: Robot, data: Measurements) -> Model:
 def pose_weights(data: Measurements, lever: float) -> Array:
     """W (m, 3k, 3k) that turns the errors of three or more targets into pose errors, squared.
 
-    e'We = k |e_c|^2 + k lever^2 |e_w|^2 per pose: e_c is the error of the targets' centroid, e_w
-    the small turn that fits their errors best.  A trace of the plain sum stays in, which settles
-    the targets' own shape.  lever: metres that a radian counts as; NaN for the one with which
-    the sum over the directions of a turn is that of the points.  Rows where a target is missing
+    e'We = k |e_c|^2 + k lever^2 |e_w|^2 + stiffness |e_s|^2 per pose: e_c is the error of the
+    targets' centroid, e_w the small turn that fits their errors best, e_s what no rigid motion
+    explains.  e_s depends on the targets' places alone, and must weigh as much as the turn: a
+    smaller triangle would turn errors into small ones.  lever: metres that a radian counts as; NaN
+    for the targets' own, with which W is nearly the plain sum.  Rows where a target is missing
     are zero.
     """
     k = len(data.targets)
@@ -426,12 +426,16 @@ def pose_weights(data: Measurements, lever: float) -> Array:
     arm = np.where(whole[:, None, None], data.y - data.y.mean(axis=1, keepdims=True), 0.0)
     inertia = (arm**2).sum((1, 2))[:, None, None] * np.eye(3) - np.swapaxes(arm, 1, 2) @ arm
     inertia[~whole] = np.eye(3)
-    if not np.isfinite(lever):
-        lever = float(np.sqrt(np.trace(inertia[whole].mean(axis=0)) / 3.0 / k))
+    own = float(np.sqrt(np.trace(inertia[whole].mean(axis=0)) / 3.0 / k))
+    lever = lever if np.isfinite(lever) else own
     centre = np.tile(np.eye(3) / k, k)
-    turn = np.linalg.solve(inertia, np.concatenate(np.moveaxis(hat(arm), 1, 0), axis=-1))
-    weight = k * (centre.T @ centre + lever**2 * np.swapaxes(turn, 1, 2) @ turn)
-    return np.where(whole[:, None, None], weight + SHAPE * np.eye(3 * k), 0.0)
+    turned = np.concatenate(np.moveaxis(hat(arm), 1, 0), axis=-1)
+    turn = np.linalg.solve(inertia, turned)
+    back = np.swapaxes(turn, 1, 2)
+    shape = np.eye(3 * k) - k * (centre.T @ centre) - np.swapaxes(turned, 1, 2) @ turn
+    weight = k * (centre.T @ centre + lever**2 * back @ turn) + max(1.0, lever / own) ** 2 * shape
+    weight = 0.5 * (weight + np.swapaxes(weight, 1, 2)) + 1e-12 * np.eye(3 * k)
+    return np.where(whole[:, None, None], weight, 0.0)
 
 
 def with_poses(model: Model, weight: Array) -> Model:

@@ -38,6 +38,7 @@ class Accuracy:
         return max(self.primal_relative, self.dual_relative, self.gap_relative)
 
 
+HUGE = 1e100  # what is larger is as good as infinite, and its square may be
 NOWHERE = Accuracy(*(7 * [math.inf]))
 
 
@@ -60,12 +61,13 @@ def accuracy(problem: Problem, solution: Solution) -> Accuracy:
     """
     if solution.x.shape != problem.q.shape or solution.y.shape != problem.l.shape:
         return NOWHERE
-    with np.errstate(over="ignore", invalid="ignore"):  # x may be as wrong as it likes
-        return _judged(problem, solution.x, solution.y)
+    return _judged(problem, solution.x, solution.y)
 
 
 def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     """The residuals of an x and y of the right shape."""
+    if not (_size(x) < HUGE and _size(y) < HUGE):
+        return NOWHERE
     P, q, A, l, u = problem.P, problem.q, problem.A, problem.l, problem.u  # noqa: E741
     bound = np.where(y > 0, u, l)
     bound[y == 0] = 0.0
@@ -81,7 +83,7 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     outside = Ax - np.minimum(np.maximum(Ax, l), u)
     slope, dual = _size(q), _size(Px + q + Aty)
     delta = max(slope, _size(Px), _size(Aty))
-    curvature = float(P.diagonal().max(initial=0.0))  # the largest entry, P being psd
+    curvature = problem.curvature
     if slope == 0.0:
         delta = max(delta, (curvature or 1.0) * _reach(problem))
     step = min(1.0, delta / curvature) if curvature > 0 else 1.0

@@ -129,6 +129,11 @@ class Problem:
         return np.where(norm > 0, norm, 1.0)
 
     @cached_property
+    def curvature(self) -> float:
+        """The largest entry of P, which stands on the diagonal, P being semi-definite."""
+        return float(self.P.diagonal().max(initial=0.0))
+
+    @cached_property
     def has_sparse(self) -> bool:
         """Whether P or A came as a sparse matrix."""
         return is_sparse(self.P) or is_sparse(self.A)

@@ -61,29 +61,30 @@ def split(problem: Problem, boxed: bool = False) -> Rows:
     few = not boxed or 2 * l.size < problem.q.size
     if few and l.max(initial=-np.inf) == -np.inf and u.max(initial=-np.inf) < np.inf:
         return Rows(A, u, A[:0], EMPTY, ALL, NO_INDEX, NO_INDEX, ())  # worth no copy of A
-    box, free = ((), np.ones(l.shape, dtype=bool)) if few else _box(problem)
+    box, l, u = ((), l, u) if few else _box(problem)  # noqa: E741
     same = l == u
-    above = np.flatnonzero((u < np.inf) & ~same & free)
-    below = np.flatnonzero((l > -np.inf) & ~same & free)
-    equal = np.flatnonzero(same & free)
+    equal, E, b = NO_INDEX, A[:0], EMPTY
+    if same.any():
+        equal = np.flatnonzero(same)
+        E, b = A[equal], u[equal]
+        l, u = np.where(same, -np.inf, l), np.where(same, np.inf, u)  # noqa: E741
+    above, below = np.flatnonzero(u < np.inf), np.flatnonzero(l > -np.inf)
+    top = A if above.size == u.size else A[above]
     if not below.size:
-        G = A[above]
-    elif is_sparse(A):
-        G = sparse.vstack([A[above], -A[below]], format="csc")
-    else:
-        G = np.concatenate([A[above], -A[below]])
-    h = np.concatenate([u[above], -l[below]])
-    return Rows(G, h, A[equal], u[equal], above, below, equal, box)
+        return Rows(top, u[above], E, b, above, below, equal, box)
+    both = [top, -A[below]]
+    G: Matrix = sparse.vstack(both, format="csc") if is_sparse(A) else np.concatenate(both)
+    return Rows(G, np.concatenate([u[above], -l[below]]), E, b, above, below, equal, box)
 
 
-def _box(problem: Problem) -> tuple[tuple[Box, ...], NDArray[np.bool_]]:
-    """The rows that are bounds, and (m,) which rows are not; bounds only if they are many."""
+def _box(problem: Problem) -> tuple[tuple[Box, ...], Array, Array]:
+    """The rows that are bounds, if they are many, and l and u with these rows opened."""
     n, m = problem.q.size, problem.l.size
     by_row = sparse.csr_array(problem.A)
     by_row.eliminate_zeros()
     single = np.diff(by_row.indptr) == 1
     if 2 * np.count_nonzero(single) < n:
-        return (), np.ones(m, dtype=bool)
+        return (), problem.l, problem.u
     where = np.flatnonzero(single)
     column = by_row.indices[by_row.indptr[where]]
     entry = np.ones(m)
@@ -96,7 +97,8 @@ def _box(problem: Problem) -> tuple[tuple[Box, ...], NDArray[np.bool_]]:
     below, above = np.zeros(n, dtype=np.intp), np.zeros(n, dtype=np.intp)
     for owner, tight in ((below, low == lower[column]), (above, high == upper[column])):
         owner[column[tight]] = where[tight]
-    return (Box(lower, upper, below, above, entry),), ~single
+    open_l, open_u = np.where(single, -np.inf, problem.l), np.where(single, np.inf, problem.u)
+    return (Box(lower, upper, below, above, entry),), open_l, open_u
 
 
 def multipliers(rows: Rows, size: int, z: Array, y: Array, bounds: Array) -> Array:

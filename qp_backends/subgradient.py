@@ -132,18 +132,22 @@ class Scaled:
 def scaled(problem: Problem) -> Scaled:
     """Whiten: coordinates in which P is the identity where it has curvature.
 
-    A direction with (nearly) none gets the scale at which the rows feel it as much as the others.
+    A direction with (nearly) none gets the scale at which the rows that feel it feel it as much as
+    all the others together: a much larger one would make these rows nearly parallel.
     """
     P, A = dense(problem.P), dense(problem.A)
     curvature, V = np.linalg.eigh(P)
     largest = float(curvature.max(initial=0.0))
     bent = curvature > 1e-7 * largest
     B = A @ V
-    column = np.sqrt(np.einsum("ij,ij->j", B, B))
     scale = 1.0 / np.sqrt(np.where(bent, curvature, 1.0))
-    felt = float((column * scale)[bent].max(initial=0.0)) or 1.0
-    flat = ~bent & (column > 0)
-    scale[flat] = felt / column[flat]
+    square = B**2
+    felt = square.sum(axis=0)
+    feel = square > 1e-16 * felt
+    others = (square * np.where(bent, scale, 0.0) ** 2).sum(axis=1) @ feel
+    others /= np.maximum(np.minimum(feel.sum(axis=0), np.count_nonzero(bent)), 1)
+    flat = ~bent & (felt > 0)
+    scale[flat] = np.sqrt(np.where(others[flat] > 0, others[flat], 1.0) / felt[flat])
     B = B * scale
     row = np.sqrt(np.einsum("ij,ij->i", B, B))
     row = np.where(row > 0, row, 1.0)

@@ -73,7 +73,7 @@ TRAITS = {
     "proxqp": Trait(
         tolerances=("eps_abs",),
         warm="all",
-        fixed={"eps_rel": 0.0, "max_iter": 10_000},
+        fixed={"eps_rel": 0.0, "max_iter": 1_000},
         rescue={"rho": 1e-2},  # without curvature it takes feasible problems for infeasible
     ),
     "highs": Trait(
@@ -82,8 +82,8 @@ TRAITS = {
         tolerances=("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
         finest=1e-10,
         clock="time_limit",
-        # what HiGHS adds to P makes it robust, and wrong by as much
-        fixed={"qp_regularization_value": 0.0},
+        # what HiGHS adds to P makes it robust, and wrong by as much; without it it may cycle
+        fixed={"qp_regularization_value": 0.0, "qp_iteration_limit": 20_000},
         rescue={"qp_regularization_value": 1e-7},
     ),
     "scs": Trait(

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 cp: Any = import_module("cvxpy")  # it has no types
 LARGEST_COMPILED = 40_000  # entries of P and A up to which compiling a model with parameters pays
+LINEAR_ONLY = ("SCIPY", "GLPK", "GLPK_MI", "CBC", "PDLP")
 _lock = Lock()  # a compiled model is shared, and is not to be solved twice at a time
 
 
@@ -80,9 +81,14 @@ def solve(
     return found
 
 
+def solvers() -> list[str]:
+    """Those of cvxpy's installed solvers that take a quadratic objective."""
+    return [solver for solver in cp.installed_solvers() if solver not in LINEAR_ONLY]
+
+
 def check(name: str) -> str:
     """cvxpy's name of a solver; its default for QPs is OSQP, where it is installed."""
-    known = [solver for solver in cp.installed_solvers() if solver != "SCIPY"]
+    known = solvers()
     if name and name.upper() not in known:
         raise BackendError(f"cvxpy has no QP solver {name!r} here; choose one of {known}")
     return name.upper() or ("OSQP" if "OSQP" in known else known[0])

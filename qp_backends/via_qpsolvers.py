@@ -34,7 +34,8 @@ def solve(
     start = time.perf_counter()
     trait = TRAITS.get(method, Trait())
     pace = trait.sparse_pace if problem.has_sparse else trait.pace
-    if not trait.clock and time_limit < pace * sum(problem.A.shape) ** 3:
+    watched = trait.clock and trait.storage != "dense"  # what DAQP does first has no clock
+    if not watched and time_limit < pace * sum(problem.A.shape) ** 3:
         return child.run(__name__, problem, method, tolerance, time_limit, warm_start)
     rows = split(problem, trait.box)
     chosen = settings(method, tolerance, time_limit)

@@ -10,7 +10,7 @@ from scipy.io import loadmat
 
 from qp_backends import Problem
 
-MAROS_MESZAROS = Path("/work/shared/data/maros_meszaros")
+MAROS_MESZAROS = Path(__file__).parents[2] / "shared" / "data" / "maros_meszaros"
 
 
 def maros_meszaros(path: Path) -> Problem:
@@ -66,3 +66,27 @@ def random_problem(rng: np.random.Generator, n: int = 8, rank: int = 5, m: int =
     l[kind == 1] = -np.inf
     u[kind == 2] = np.inf
     return Problem(root.T @ root, root.T @ rng.normal(size=rank), A, l, u)
+
+
+def any_problem(rng: np.random.Generator) -> Problem:
+    """A small problem that may be anything: degenerate, singular, contradictory, unbounded."""
+    n, m = int(rng.integers(1, 8)), int(rng.integers(0, 12))
+    whole = rng.random() < 0.5
+
+    def draw(*shape: int) -> np.ndarray:
+        return rng.integers(-2, 3, size=shape).astype(float) if whole else rng.normal(size=shape)
+
+    root = draw(int(rng.integers(0, n + 1)), n)
+    A = draw(m, n) * (rng.random((m, n)) < 0.7)
+    if rng.random() < 0.3:
+        A = A * 10.0 ** rng.integers(-3, 4, size=(m, 1))
+    center = A @ draw(n)
+    l, u = center - np.abs(draw(m)), center + np.abs(draw(m))  # noqa: E741
+    kind = rng.integers(0, 5, size=m)
+    l[kind == 0] = u[kind == 0] = center[kind == 0]
+    l[kind == 1] = -np.inf
+    u[kind == 2] = np.inf
+    if m and rng.random() < 0.2:
+        l[0] += 3.0
+        u[0] = max(u[0], l[0])
+    return Problem(root.T @ root, draw(n) * (rng.random() < 0.9), A, l, u)

@@ -7,13 +7,11 @@ from problems_qp import epigraph
 
 from qp_backends import Problem, solve
 
-cvxpy = pytest.importorskip("cvxpy")
-from qp_backends import via_cvxpy  # noqa: E402
-
-SOLVERS = [name for name in cvxpy.installed_solvers() if name != "SCIPY"]
+pytest.importorskip("cvxpy")
+from qp_backends import via_cvxpy
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", via_cvxpy.solvers())
 def test_each_of_its_solvers_gives_x_and_multipliers(name):
     problem = epigraph(np.random.default_rng(0))
     exact = solve(problem, "daqp")

@@ -1,0 +1,383 @@
+"""Many independent jobs, on this machine or a Dask cluster, resumed where they were interrupted.
+
+    results = sweep(function, jobs, name="any_base")                          # all cores
+    results = sweep(function, jobs, name="any_base", cluster="tcp://host:8786")
+
+joblib does the scheduling.  Each result is kept on disk as it arrives, under a key of all that it
+depends on, so that the same call goes on from there.  Workers of a cluster must run the same code,
+one job at a time: start them in the project's folder with
+``python -m dask worker tcp://host:8786 --nworkers N --nthreads 1``.
+
+A study takes its options from `study_options` and ends with ``start(__file__)``.
+"""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import dataclasses
+import functools
+import hashlib
+import inspect
+import pickle
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+import minimax_cal
+import qp_backends
+from minimax_cal.errors import CalibrationError, OptionError
+from minimax_cal.files import write_whole
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+CACHE = Path("results/cache")
+PATIENCE = 5.0  # for a scheduler, and for its first worker, to answer [s]
+LIBRARIES = tuple(Path(package.__path__[0]) for package in (minimax_cal, qp_backends))
+SOLVERS = ("daqp", "osqp", "clarabel", "proxsuite", "quadprog", "piqp", "highspy", "scs")
+NUMERICS = ("numpy", "scipy", "qpsolvers", "cvxpy", *SOLVERS)
+OUTPUT = {"__init__", "__main__", "index", "record", "sweep"}  # files that shape no result
+
+
+def sweep(
+    function: Callable[[J], R],
+    jobs: Sequence[J],
+    *,
+    name: str,
+    description: str = "",
+    jobs_in_parallel: int = -1,
+    cluster: str = "",
+    folder: Path = CACHE,
+    fresh: bool = False,
+) -> list[R]:
+    """The function's result for each job, in the order of the jobs.
+
+    function: pure, at the top of a module.  jobs: plain data, holding their own seeds.
+    jobs_in_parallel: processes on this machine, -1 for one a core; a cluster uses all it has.
+    cluster: address of a Dask scheduler.  fresh: do not use what is kept in folder.
+    Raises OptionError for what a user can mend.
+    """
+    if "<" in function.__qualname__ or function.__module__ == "__main__":
+        raise TypeError(f"{function.__qualname__} must be at the top of a module; see `start`")
+    if jobs_in_parallel == 0:
+        raise OptionError("--jobs 0: give the number of processes, or -1 for one a core")
+    code = fingerprint(function)
+    paths = [folder / name / f"{key(name, function, job, code)}.part" for job in jobs]
+    kept = [[] if fresh else read_part(path) for path in paths]
+    results: dict[int, R] = {number: found[0] for number, found in enumerate(kept) if found}
+    if results:
+        click.echo(f"{name}: {len(results)} of {len(jobs)} parts were kept", err=True)
+    waiting = [number for number in range(len(jobs)) if number not in results]
+    calls = [(function, number, jobs[number], code if cluster else "") for number in waiting]
+    try:
+        with closing(run(calls, jobs_in_parallel, cluster, description or name)) as arriving:
+            for number, result in arriving:
+                write_part(paths[number], result)
+                results[number] = result
+    finally:
+        if len(results) < len(jobs):
+            say = f"{name}: {len(results)} of {len(jobs)} parts are kept in {folder / name}"
+            click.echo(f"{say}; the same command goes on from there", err=True)
+    return [results[number] for number in range(len(jobs))]
+
+
+Call = tuple[Callable[..., Any], int, Any, str]  # what `part` takes
+
+
+def part(function: Callable[[J], R], number: int, job: J, code: str) -> tuple[int, R]:
+    """One job where it runs; code, if any, is the fingerprint that it must find there."""
+    if code and fingerprint(function) != code:
+        raise OptionError(
+            "a worker of the cluster runs other code or other versions of numpy, scipy or the QP "
+            "solvers; bring it to the state of this machine and start it again"
+        )
+    return number, function(job)
+
+
+def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
+    """The same items, with a bar and the time left on stderr if that is a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield from bar.track(items, total=total, description=description)
+
+
+# ---- where jobs run --------------------------------------------------------------------------
+
+
+def run(
+    calls: Sequence[Call], jobs_in_parallel: int, cluster: str, description: str
+) -> Generator[tuple[int, Any], None, None]:
+    """Results of `part` for each call, in the order they finish."""
+    if calls:
+        arriving = on_cluster(calls, cluster) if cluster else here(calls, jobs_in_parallel)
+        with closing(arriving):
+            yield from progress(arriving, len(calls), description)
+
+
+def here(calls: Sequence[Call], jobs_in_parallel: int) -> Generator[tuple[int, Any], None, None]:
+    """Run calls by joblib in processes of one thread each on this machine."""
+    joblib = needed("joblib", "experiments")
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=jobs_in_parallel, return_as="generator_unordered")
+        arriving = parallel(joblib.delayed(part)(*call) for call in calls)
+        try:
+            yield from arriving
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
+                arriving.close()
+
+
+def on_cluster(calls: Sequence[Call], cluster: str) -> Generator[tuple[int, Any], None, None]:
+    """Run calls on a Dask cluster, which deals with workers that come and go.
+
+    Not by joblib's Dask backend (1.6): it waits for ever when Dask itself fails, as where a job
+    kills its worker or the scheduler lacks a module, and it runs on this machine alone while the
+    cluster has one worker.
+    """
+    distributed = needed("distributed", "distributed")
+    with connected(cluster) as client:
+        futures = client.map(part, *zip(*calls, strict=True), pure=False, retries=0)
+        try:
+            for _, found in distributed.as_completed(futures, loop=client.loop, with_results=True):
+                if isinstance(found, BaseException):
+                    raise found
+                yield found
+        except (ModuleNotFoundError, distributed.client.FuturesCancelledError) as error:
+            raise OptionError(f"{cluster}: {error}") from error
+
+
+@contextmanager
+def connected(cluster: str) -> Iterator[Any]:
+    """A client of the Dask scheduler, which has at least one worker.  Raises OptionError."""
+    distributed = needed("distributed", "distributed")
+    look_for(cluster)
+    with distributed.Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError as error:
+            raise OptionError(
+                f"{cluster}: the scheduler has no workers; start some in the project's folder: "
+                f"python -m dask worker {cluster} --nworkers N --nthreads 1"
+            ) from error
+        yield client
+
+
+def look_for(cluster: str) -> None:
+    """Raises OptionError unless a Dask scheduler answers soon; a client might wait for ever."""
+    distributed = needed("distributed", "distributed")
+
+    async def identity() -> Any:
+        async with distributed.rpc(cluster, timeout=PATIENCE) as scheduler:
+            return await scheduler.identity()
+
+    try:
+        found = asyncio.run(asyncio.wait_for(identity(), PATIENCE))["type"]
+    except Exception as error:  # no such host, no answer, or an answer of something else
+        what = " ".join(str(error).split()) or f"no answer in {PATIENCE:g} s"
+        raise OptionError(
+            f"no Dask scheduler at {cluster!r} ({what}); start one with python -m dask scheduler "
+            "and give its address as tcp://host:port"
+        ) from error
+    if found != "Scheduler":
+        raise OptionError(f"{cluster} is a Dask {found.lower()}; give the scheduler's address")
+
+
+def needed(module: str, extra: str) -> Any:
+    """An optional module.  Raises OptionError with the command that installs it."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise OptionError(
+            f"this needs {error.name!r}: pip install 'minimax-cal[{extra}]'"
+        ) from error
+
+
+# ---- what is kept ----------------------------------------------------------------------------
+
+
+def key(name: str, function: Callable[..., Any], job: object, code: str) -> str:
+    """Names a result by all that it depends on."""
+    joblib = needed("joblib", "experiments")
+    return str(joblib.hash((name, function.__module__, function.__qualname__, job, code)))
+
+
+def read_part(path: Path) -> list[Any]:
+    """[result], or [] where there is none or it is damaged.
+
+    Pickle is safe only for files that nobody else can write, as those of our own cache are; the
+    digest finds damage, not malice.
+    """
+    try:
+        digest, content = path.read_bytes().split(b"\n", 1)
+        if digest.decode() != hashlib.sha256(content).hexdigest():
+            return []
+        return [pickle.loads(content)]
+    except Exception:  # whatever is wrong with a kept part, it can be computed again
+        return []
+
+
+def write_part(path: Path, result: object) -> None:
+    """Keep a result: whole, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
+    write_whole(path, hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+
+
+def fingerprint(function: Callable[..., Any]) -> str:
+    """Digest of the libraries, of the study's own files and of the packages that compute.
+
+    A study's files are the one with the function and those beside it that it imports.
+    """
+    files = library_files() + study_files(Path(inspect.getfile(function)))
+    parts = [f"{path.name} {file_digest(path)}" for path in files] + versions()
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+@functools.cache
+def library_files() -> tuple[Path, ...]:
+    """Code and robots of our packages."""
+    files = [path for folder in LIBRARIES for path in sorted(folder.rglob("*"))]
+    return tuple(path for path in files if path.suffix in (".py", ".json"))
+
+
+@functools.cache
+def study_files(path: Path) -> tuple[Path, ...]:
+    """The file and those in its folder that it imports, directly or not."""
+    found: set[Path] = set()
+    waiting = [path]
+    while waiting:
+        here = waiting.pop()
+        if here not in found and (here == path or here.stem not in OUTPUT) and here.exists():
+            found.add(here)
+            waiting += [here.with_name(f"{name}.py") for name in imported(here)]
+    return tuple(sorted(found))
+
+
+def imported(path: Path) -> set[str]:
+    """Every part of every dotted name that a file imports."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names += [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
+            names.append(node.module or "")
+    return {word for name in names for word in name.split(".") if word}
+
+
+@functools.cache
+def file_digest(path: Path) -> str:
+    """Digest of a file as this process first saw it: its imports do not change later either."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def versions() -> list[str]:
+    """The packages whose numbers end in results."""
+    found = []
+    for package in NUMERICS:
+        with suppress(PackageNotFoundError):
+            found.append(f"{package} {version(package)}")
+    return found
+
+
+# ---- options of every study ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Study:
+    """What the options of every study say."""
+
+    name: str
+    quick: bool
+    json: Path | None
+    out: Path
+    seed: int
+    jobs: int
+    cluster: str
+    fresh: bool
+
+    def sweep(
+        self, function: Callable[[J], R], jobs: Sequence[J], description: str = ""
+    ) -> list[R]:
+        """The function's result for each job, as these options ask for."""
+        return sweep(
+            function,
+            jobs,
+            name=self.name,
+            description=description,
+            jobs_in_parallel=self.jobs,
+            cluster=self.cluster,
+            fresh=self.fresh,
+        )
+
+
+class Misuse(click.ClickException):
+    """A user's mistake, shown in one line."""
+
+    exit_code = 2
+
+    def show(self, file: Any = None) -> None:
+        """One line on stderr."""
+        click.echo("error: " + " ".join(self.message.split()), file=file, err=True)
+
+
+def study_options(name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Gives a command the options of every study, as its first argument: a `Study`."""
+    options = (
+        click.option("--quick", is_flag=True, help="A small form of the study."),
+        click.option("--json", type=click.Path(path_type=Path), help="Write its figures here."),
+        click.option(
+            "--out",
+            type=click.Path(path_type=Path, file_okay=False),
+            default=Path("results") / name,
+            show_default=True,
+            help="Folder of tables and pictures.",
+        ),
+        click.option("--seed", type=int, default=0, show_default=True),
+        click.option(
+            "--jobs", type=int, default=-1, show_default=True, help="Processes; -1: one a core."
+        ),
+        click.option("--cluster", default="", help="Dask scheduler to run on: tcp://host:port."),
+        click.option("--fresh", is_flag=True, help=f"Use no results kept in {CACHE}."),
+    )
+    fields = tuple(field.name for field in dataclasses.fields(Study))[1:]
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            study = Study(name, **{field: given.pop(field) for field in fields})
+            try:
+                function(study, **given)
+            except (CalibrationError, qp_backends.BackendError) as error:
+                raise Misuse(str(error)) from error
+
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def start(file: str) -> None:
+    """Run the study in this file as ``python -m`` found it: ``start(__file__)``, at its end.
+
+    The module is imported under its own name, since nothing of ``__main__`` reaches a cluster.
+    """
+    module = f"experiments.{Path(file).stem}"
+    import_module(module).main(prog_name=f"python -m {module}")
