@@ -22,6 +22,7 @@ import inspect
 import pickle
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -148,19 +149,33 @@ def on_cluster(calls: Sequence[Call], cluster: str) -> Generator[tuple[int, Any]
     """Run calls on a Dask cluster, which deals with workers that come and go.
 
     Not by joblib's Dask backend (1.6): it waits for ever when Dask itself fails, as where a job
-    kills its worker or the scheduler lacks a module, and it runs on this machine alone while the
-    cluster has one worker.
+    kills its worker, and it runs on this machine alone while the cluster has one worker.
     """
     distributed = needed("distributed", "distributed")
     with connected(cluster) as client:
-        futures = client.map(part, *zip(*calls, strict=True), pure=False, retries=0)
+        need_modules(client, cluster, {__name__, calls[0][0].__module__})
+        futures = client.map(part, *zip(*calls, strict=True), pure=False)
+        arriving = distributed.as_completed(futures, loop=client.loop, with_results=True)
         try:
-            for _, found in distributed.as_completed(futures, loop=client.loop, with_results=True):
-                if isinstance(found, BaseException):
+            for _, found in arriving:
+                if isinstance(found, CancelledError):
                     raise found
                 yield found
-        except (ModuleNotFoundError, distributed.client.FuturesCancelledError) as error:
-            raise OptionError(f"{cluster}: {error}") from error
+        except (distributed.KilledWorker, CancelledError) as error:
+            raise click.ClickException(f"{cluster}: {' '.join(str(error).split())}") from error
+
+
+def need_modules(client: Any, cluster: str, modules: set[str]) -> None:
+    """Raises OptionError unless scheduler and workers have modules; Dask would lose its workers."""
+    try:
+        for module in modules:
+            client.run_on_scheduler(import_module, module)
+            client.run(import_module, module)
+    except ModuleNotFoundError as error:
+        raise OptionError(
+            f"{cluster} has no module {error.name!r}; start scheduler and workers in the project's "
+            f"folder, with the same packages: python -m dask worker {cluster} --nthreads 1"
+        ) from error
 
 
 @contextmanager

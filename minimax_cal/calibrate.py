@@ -289,9 +289,9 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     per = {"minimax": "target", "point": "point"}.get(options.objective, "")
     if per == "point" or (per == "target" and k > 1):
         report("minimax")
-        problem = worst_of(model, state, distances, options.distance, per)
+        minimax_problem = worst_of(model, state, distances, options.distance, per)
         qp = partial(solve_qp, name=options.qp, tolerance=QP_TOLERANCE)
-        best = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+        best = minimax.solve(minimax_problem, state, qp, Sqp(hessian=options.hessian))
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
         share = np.maximum(best.mu, FLOOR) / model.counts if per == "target" else share
