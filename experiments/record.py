@@ -54,7 +54,7 @@ def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     write_whole(folder / f"{name}.tex", "\n".join(table.latex() for table in tables))
     for number, table in enumerate(tables, start=1):
         write_whole(folder / f"{name}_{number}.csv", table.csv())
-        click.echo(table.text(130) + "\n")
+        click.echo(table.text(165) + "\n")
 
 
 def save_figure(folder: Path, name: str, figure: Figure) -> None:

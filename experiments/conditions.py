@@ -1,0 +1,271 @@
+"""The seven conditions of paper M, Table 3 and Fig. 2-6, on simulated and real robots.
+
+    python -m experiments.conditions [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
+
+0 nominal, 1-3 one target alone, 4 the sum, 5 minimax, 6 pose, and the worst point (ours): F_i and
+RMSE(phi) = sqrt(max F_i / m), position accuracy AP and orientation accuracy AO (ISO 9283, largest
+Euler deviation) and AO' = |log(R_m' R_c)|, each on the training and on the held-out poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import sweep
+from experiments.poses import euler_deviation, orientation_error, poses_of, triangle
+from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.sweep import Study, study_options
+from minimax_cal.cell import Cell
+from minimax_cal.data import Measurements, split
+from minimax_cal.kinematics import Array
+from minimax_cal.robot import Robot, load_robot
+from minimax_cal.simulate import Truth, simulate
+from minimax_cal.tables import Cell as TableCell
+from minimax_cal.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+CONDITIONS = ("nominal", "smr:1", "smr:2", "smr:3", "sum", "minimax", "pose", "point")
+PAPER = {  # Table 3 of the paper: F_1, F_2, F_3 [mm^2, 100 poses], RMSE(phi) [mm]
+    "nominal": (325.90, 261.23, 373.88, 1.934),
+    "smr:1": (13.20, 14.72, 15.88, 0.399),
+    "smr:2": (15.68, 11.27, 14.41, 0.396),
+    "smr:3": (18.23, 14.38, 12.40, 0.427),
+    "sum": (14.02, 11.49, 13.24, 0.374),
+    "minimax": (13.86, 12.49, 13.86, 0.372),
+    "pose": (15.94, 11.88, 14.00, 0.399),
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One robot under one condition: train poses, the rest held out (as many as there are)."""
+
+    robot: str
+    condition: str
+    train: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of one set of poses: F_i (k,) [mm^2], AP (3m,) [mm], AO and AO' (m,) [mrad]."""
+
+    sums: tuple[float, ...]
+    ap: Array
+    ao: Array
+    ao_angle: Array
+
+    @property
+    def phi(self) -> float:
+        """RMSE(phi) of the paper [mm]."""
+        return float(np.sqrt(max(self.sums) / len(self.ao)))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Training and held-out errors of a condition, and how the solver ended."""
+
+    train: Errors
+    held: Errors
+    status: str
+
+
+def simulated(seed: int) -> tuple[Robot, Measurements]:
+    """IRB 2600 with geometric errors and the compliance that no geometry holds."""
+    robot = load_robot("irb2600")
+    return robot, simulate(robot, 300, 3, seed, Truth()).data
+
+
+def shared(name: str) -> Callable[[int], tuple[Robot, Measurements]]:
+    """A real robot from shared data."""
+    return lambda seed: (
+        load_robot(SHARED / name / "robot.json"),
+        mc.read_measurements(SHARED / name / "measurements.csv"),
+    )
+
+
+ROBOTS: dict[str, tuple[str, Callable[[int], tuple[Robot, Measurements]], int]] = {
+    "irb2600": ("IRB 2600, simulated", simulated, 100),
+    "irb120": ("IRB 120, real", shared("irb120"), 100),
+    "fanuc": ("FANUC R-2000, real", shared("fanuc_r2000"), 29),
+}
+
+
+def here(name: str) -> bool:
+    """Whether the robot's measurements are on this machine."""
+    folder = {"irb120": "irb120", "fanuc": "fanuc_r2000"}.get(name)
+    return folder is None or (SHARED / folder).is_dir()
+
+
+def run(job: Job) -> Outcome:
+    """Calibrate under one condition and judge it on both sets of poses."""
+    robot, data = ROBOTS[job.robot][1](job.seed)
+    train, held, _ = split(data, 1.0 - job.train / data.poses, job.seed)
+    objective = "sum" if job.condition == "nominal" else job.condition
+    fit = mc.calibrate(robot, train, objective, holdout=0.0)
+    cell = fit.nominal if job.condition == "nominal" else fit.cell
+    status = "-" if job.condition == "nominal" else str(fit.status)
+    return Outcome(errors_of(cell, train), errors_of(cell, held), status)
+
+
+def errors_of(cell: Cell, data: Measurements) -> Errors:
+    """All errors of a cell on some poses; orientation from the three targets."""
+    predicted = cell.predict(data.q)
+    distance = 1e3 * np.linalg.norm(data.y - predicted, axis=-1)
+    shape = triangle(data.y)
+    measured, computed = poses_of(shape, data.y), poses_of(shape, predicted)
+    return Errors(
+        tuple((distance**2).sum(axis=0).tolist()),
+        distance.ravel(),
+        1e3 * euler_deviation(measured, computed).max(axis=1),
+        1e3 * orientation_error(measured, computed),
+    )
+
+
+def table_of(title: str, found: dict[str, Outcome]) -> Table:
+    """Table 3 for one robot, training and held out side by side."""
+    rows: list[tuple[TableCell, ...]] = []
+    for number, (condition, outcome) in enumerate(found.items()):
+        for where, errors in (("training", outcome.train), ("held out", outcome.held)):
+            rows.append(
+                (
+                    f"{number} {condition}",
+                    where,
+                    len(errors.ao),
+                    *errors.sums,
+                    errors.phi,
+                    float(np.sqrt(np.mean(errors.ap**2))),
+                    float(errors.ap.max()),
+                    float(errors.ao.max()),
+                    float(np.sqrt(np.mean(errors.ao_angle**2))),
+                    float(errors.ao_angle.max()),
+                    outcome.status,
+                )
+            )
+    return Table(
+        title,
+        ("condition", "poses", "count", "F_1 mm^2", "F_2 mm^2", "F_3 mm^2", "RMSE(phi) mm",
+         "AP rms mm", "AP max mm", "AO max mrad", "AO' rms mrad", "AO' max mrad", "status"),
+        tuple(rows),
+        ("", "", "d", *[".2f"] * 3, *[".4f"] * 3, *[".3f"] * 3, ""),
+    )  # fmt: skip
+
+
+def papers_table() -> Table:
+    """Table 3 as printed."""
+    rows = tuple(
+        (f"{number} {name}", *values) for number, (name, values) in enumerate(PAPER.items())
+    )
+    return Table(
+        "paper M, Table 3 (IRB 2600, 100 poses, training)",
+        ("condition", "F_1 mm^2", "F_2 mm^2", "F_3 mm^2", "RMSE(phi) mm"),
+        rows,
+        ("", ".2f", ".2f", ".2f", ".3f"),
+    )
+
+
+def boxes(title: str, found: dict[str, Outcome]) -> Figure:
+    """Fig. 2-4 and 6: AP, AO and AO' per condition, training and held out."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True)
+    kinds = (("ap", "AP (mm)"), ("ao", "AO (mrad)"), ("ao_angle", "AO' (mrad)"))
+    for row, where in zip(panels, ("train", "held"), strict=True):
+        for axes, (kind, name) in zip(row, kinds, strict=True):
+            values = [getattr(getattr(outcome, where), kind) for outcome in found.values()]
+            axes.boxplot(values, tick_labels=[str(i) for i in range(len(found))], whis=(5, 95))
+            poses = "training" if where == "train" else "held out"
+            axes.set(yscale="log", ylabel=f"{name}, {poses}")
+            axes.grid(visible=True, axis="y", alpha=0.3)
+    figure.suptitle(title + ": " + ", ".join(f"{i} {name}" for i, name in enumerate(found)))
+    return figure
+
+
+def sums_figure(title: str, found: dict[str, Outcome]) -> Figure:
+    """Fig. 5: F_i per condition (training), the nominal left out."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    names = [name for name in found if name != "nominal"]
+    for i in range(3):
+        values = [found[name].train.sums[i] for name in names]
+        axes.bar(np.arange(len(names)) + 0.27 * (i - 1), values, 0.25, label=f"F_{i + 1}")
+    axes.set_xticks(np.arange(len(names)), names)
+    axes.set(ylabel="sum of squares (mm^2)", title=title)
+    axes.legend()
+    return figure
+
+
+def claims(robots: Sequence[str], found: dict[str, dict[str, Outcome]]) -> Table:
+    """Whether minimax has the smallest RMSE(phi): it must in training, it need not held out."""
+    rows: list[tuple[TableCell, ...]] = []
+    for robot in robots:
+        outcomes = found[robot]
+        for where in ("train", "held"):
+            phi = {name: getattr(outcome, where).phi for name, outcome in outcomes.items()}
+            best = min(phi, key=lambda name: phi[name])
+            others = [value for name, value in phi.items() if name not in ("minimax", "nominal")]
+            rows.append(
+                (
+                    ROBOTS[robot][0],
+                    "training" if where == "train" else "held out",
+                    phi["minimax"],
+                    min(others),
+                    phi["minimax"] / min(others),
+                    best,
+                )
+            )
+    return Table(
+        "is minimax the smallest RMSE(phi)?",
+        ("robot", "poses", "minimax mm", "best other mm", "ratio", "smallest"),
+        tuple(rows),
+        ("", "", ".4f", ".4f", ".4f", ""),
+    )
+
+
+@click.command()
+@study_options("conditions")
+def main(study: Study) -> None:
+    """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""
+    robots = [name for name in ROBOTS if here(name)]
+    for name in ROBOTS:
+        if name not in robots:
+            click.echo(f"{ROBOTS[name][0]}: its measurements are not on this machine", err=True)
+    jobs = [Job(name, c, ROBOTS[name][2], study.seed) for name in robots for c in CONDITIONS]
+    outcomes = study.sweep(run, jobs, "conditions")
+    found = {
+        name: {
+            job.condition: outcome
+            for job, outcome in zip(jobs, outcomes, strict=True)
+            if job.robot == name
+        }
+        for name in robots
+    }
+    tables = [table_of(ROBOTS[name][0], found[name]) for name in robots]
+    summary = claims(robots, found)
+    save_tables(study.out, "conditions", [*tables, papers_table(), summary, environment()])
+    for name in robots:
+        save_figure(study.out, f"accuracy_{name}", boxes(ROBOTS[name][0], found[name]))
+        save_figure(study.out, f"sums_{name}", sums_figure(ROBOTS[name][0], found[name]))
+    if study.json:
+        rows = [
+            {"robot": row[0], "poses": row[1], "minimax_over_best_other": row[4], "best": row[5]}
+            for row in summary.rows
+        ]
+        save_json(study.json, {"rows": rows})
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)
