@@ -70,8 +70,8 @@ class Setting:
     length: float = 0.5e-3
     angle: float = 1.0e-3
     noise: float = 20e-6
-    transmission: float = 4.0e-3
-    span: float = 1.0
+    transmission: float = 3.0e-3
+    span: float = 1.25
 
 
 def measured(setting: Setting) -> tuple[Robot, Measurements]:
@@ -291,6 +291,28 @@ def span_table(study: Study, setting: Setting, every: int) -> Table:
     )
 
 
+def seed_table(study: Study, setting: Setting, every: int) -> Table:
+    """The separable methods on other simulated arms and poses: how safe the claim is."""
+    rows: list[tuple[Cell, ...]] = []
+    for seed in range(setting.seed, setting.seed + (2 if study.quick else 4)):
+        for angle in (0.0, 0.5):
+            other = replace(setting, seed=seed, base_angle=angle)
+            least = least_cost(other)
+            shares = []
+            for method in ("snlgn", "snllm"):
+                found = outcomes(study, other, method, "identifiable", max(every, 2), 500)
+                row = row_of(found, method, "identifiable", every, least, other.poses)
+                shares.append(100.0 * float(row.minimum.mean()))
+            rows.append((seed, angle, len(row.minimum), *shares))
+    return Table(
+        "separable methods on the identifiable parameters, other simulated arms: share of starts "
+        "that reach the minimum",
+        ("seed", "base turned rad", "starts", "SNLGN %", "SNLLM %"),
+        tuple(rows),
+        ("d", ".1f", "d", ".2f", ".2f"),
+    )
+
+
 def maps(rows: Sequence[Row], what: str) -> Figure:
     """Paper S, Fig. 3-5: a value over the grid of deviations, a panel a method."""
     from matplotlib.colors import LogNorm
@@ -336,7 +358,7 @@ def surface(rows: Sequence[Row]) -> Figure:
 @click.option("--base-angle", type=float, default=0.3, show_default=True, metavar="RAD")
 def main(study: Study, full: bool, base_angle: float) -> None:
     """Convergence of NLGN, NLLM, SNLGN, SNLLM from off starts: paper S, Table 2, Fig. 3-5."""
-    setting = Setting(seed=study.seed, base_angle=base_angle)
+    setting = Setting(seed=study.seed + 1, base_angle=base_angle)
     least = least_cost(setting)
     separable, joint = (9, 15) if study.quick else (1, 1 if full else 3)
     cap = 300 if study.quick else CAP
@@ -350,6 +372,7 @@ def main(study: Study, full: bool, base_angle: float) -> None:
             rows.append(row_of(found, method, parameters, every, least, setting.poses))
     tables = [
         table_2(rows, setting),
+        seed_table(study, setting, separable),
         span_table(study, setting, 15 if study.quick else 7),
         environment(),
     ]

@@ -381,7 +381,7 @@ def wider(
     if miss(found) <= limit:
         return found, ()
     report("search over base rotations")
-    wide = start.search(model, robot.mdh, points)
+    wide = start.search(model, robot.mdh, points, limit)
     notices: tuple[str, ...] = ()
     if wide.cost[0] < 0.99 * found.cost[0]:
         found = wide

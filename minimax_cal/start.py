@@ -18,6 +18,7 @@ from minimax_cal.parameters import State
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
+SCREEN, KEEP, ROUNDS = 15, 6, 8  # steps of the first look, starts that go on, further rounds
 ENOUGH = 60  # poses that tell one basin from another
 OCTAHEDRAL = Rotation.create_group("O").as_matrix()  # the 24 turns of a cube
 
@@ -123,23 +124,50 @@ def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
 
 
 def search(
-    model: Model, mdh: Array, points: float, screen: int = 15, keep: int = 6
+    model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = ROUNDS
 ) -> LeastSquares[State]:
     """The best fit over base rotations when the geometry's angles may be far off.
 
-    The 24 turns of a cube, each with the best lengths, take a few damped steps on some of the
-    poses; the best few go on, and the two best are finished on all.  Returns these, best first.
+    First the 24 turns of a cube for the base, with the angles as given.  While the best fit misses
+    by more than good [m], further rounds turn the cube at random and set two link angles at random
+    in each start: what is far off is mostly one or two zero positions.  Returns the best fits on
+    all poses, best first.
     """
-    k = model.y.shape[0]
-    few = thinned(model, ENOUGH)
+    rng = np.random.default_rng(0)  # the same data give the same answer
+    found = descend(model, starts_at(model, np.repeat(mdh[None], 24, axis=0), OCTAHEDRAL), points)
+    for _ in range(rounds if good > 0.0 else 0):
+        if np.sqrt(found.cost[0] / points) <= good:
+            break
+        turns = OCTAHEDRAL @ Rotation.random(rng=rng).as_matrix()
+        links = np.repeat(mdh[None], 24, axis=0)
+        for link in links:
+            spots = [(rng.integers(len(mdh)), rng.integers(2, 4)) for _ in range(2)]
+            for joint, column in spots:
+                link[joint, column] = rng.uniform(-np.pi, np.pi)
+        other = descend(model, starts_at(model, links, turns), points)
+        found = other if other.cost[0] < found.cost[0] else found
+    return found
+
+
+def starts_at(model: Model, mdh: Array, turns: Array) -> State:
+    """Starts with the base turned and amid the points, targets in the flange."""
     centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
-    origin = np.broadcast_to(centre, (24, 3))
-    starts = State(np.broadcast_to(mdh, (24, *mdh.shape)), OCTAHEDRAL, origin, np.zeros((24, k, 3)))
+    origin = np.broadcast_to(centre, (len(mdh), 3))
+    return State(mdh, turns, origin, np.zeros((len(mdh), model.y.shape[0], 3)))
+
+
+def descend(model: Model, starts: State, points: float) -> LeastSquares[State]:
+    """The best of many starts, screened on some of the poses and finished on all.
+
+    All take a few damped steps, the best few go on, and the two best of these are finished.
+    """
+    few, count = thinned(model, ENOUGH), len(starts.mdh)
     some = float(few.counts.sum())
-    first = least_squares.solve(SumOfSquares(few), starts, 24, some, limits=Limits(1e-9, screen))
-    chosen = np.argsort(first.cost)[:keep]
+    problem = SumOfSquares(few)
+    first = least_squares.solve(problem, starts, count, some, limits=Limits(1e-9, SCREEN))
+    chosen = np.argsort(first.cost)[:KEEP]
     second = least_squares.solve(
-        SumOfSquares(few), first.x.take(chosen), keep, some, limits=Limits(1e-9, 100)
+        problem, first.x.take(chosen), len(chosen), some, limits=Limits(1e-9, 100)
     )
     best = np.argsort(second.cost)[:2]  # the others are other minima, or the same one
     final = least_squares.solve(SumOfSquares(model), second.x.take(best), len(best), points)
