@@ -1,6 +1,6 @@
 """What each QP backend is worth: accuracy, reliability and time, by one judge.
 
-    python -m experiments.solver_accuracy [--quick] [--out FOLDER] [--json FILE] [--seed N]
+    python -m experiments.solver_accuracy [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
 On the QPs that calibrations really produce, on the Maros-Meszaros problems in shared data, and on
 hard ones.  Each backend is asked three times: through qpsolvers with its own defaults, and through
@@ -22,7 +22,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -31,9 +30,11 @@ import qpsolvers
 from rich.progress import track
 from scipy import sparse
 
+from experiments import sweep
 from experiments.qp_cases import SETS, Case
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
+from experiments.sweep import Study, study_options
 from minimax_cal.kinematics import Array
 from minimax_cal.robot import load_robot
 from minimax_cal.simulate import simulate
@@ -451,13 +452,13 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="Few problems of each kind: a minute or two.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("results/solver_accuracy"),
-              show_default=True, help="Folder for tables and figures.")  # fmt: skip
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write figures here.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the SQP comparison.")
-def main(quick: bool, out: Path, json_path: Path | None, seed: int) -> None:
-    """Tables and profiles of QP accuracy, reliability and time."""
+@study_options("solver_accuracy")
+def main(options: Study) -> None:
+    """Tables and profiles of QP accuracy, reliability and time.
+
+    Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
+    """
+    quick, out, json_path, seed = options.quick, options.out, options.json, options.seed
     runs, problems = study(quick)
     tables = [environment(available().keys() - {"proxqp", "highs", "subgradient"})]
     summary: dict[str, object] = {}
@@ -494,4 +495,4 @@ def main(quick: bool, out: Path, json_path: Path | None, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sweep.start(__file__)

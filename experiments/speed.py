@@ -1,6 +1,6 @@
 """How fast the fits are, as ratios to peers on the same problem in the same run.
 
-    python -m experiments.speed [--quick] [--json FILE] [--seed N] [--repeats N]
+    python -m experiments.speed [--quick] [--repeats N] [--out FOLDER] [--json FILE] [--seed N]
 
 Least squares against scipy.optimize.least_squares (finite differences, and our Jacobian); minimax
 against SLSQP on the same scaled epigraph problem; and the growth with the number of poses.  All
@@ -15,20 +15,20 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # ratios, not the luck of a share
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import click
 import numpy as np
 from scipy import optimize
 
+from experiments import sweep
+from experiments.record import environment, save_json, save_tables
+from experiments.sweep import Study, study_options
 from minimax_cal import identify, kinematics, start
 from minimax_cal.data import Measurements
-from minimax_cal.files import json_text, write_whole
 from minimax_cal.kinematics import Array
 from minimax_cal.model import Model, SumOfSquares, model_of
 from minimax_cal.parameters import State
@@ -293,23 +293,23 @@ def growth(seed: int, counts: tuple[int, ...], repeats: int) -> tuple[Table, dic
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="Fewer repeats, up to 1000 poses.")
+@study_options("speed")
 @click.option("--repeats", type=int, default=15, show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write figures here.")
-def main(quick: bool, repeats: int, seed: int, json_path: Path | None) -> None:
-    """Ratios of our fits to their peers."""
-    repeats = 3 if quick else repeats
-    counts = (100, 1000) if quick else (100, 1000, 10000)
-    squares, worst, figures = peers(seed, repeats)
-    table, grown = growth(seed, counts, repeats)
-    for each in (squares, worst, table):
-        click.echo(each.text() + "\n")
-    if json_path:
-        write_whole(json_path, json_text({"schema": 1, "figures": figures | grown}))
+def main(study: Study, repeats: int) -> None:
+    """Ratios of our fits to their peers.
+
+    Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
+    """
+    repeats = 3 if study.quick else repeats
+    counts = (100, 1000) if study.quick else (100, 1000, 10000)
+    squares, worst, figures = peers(study.seed, repeats)
+    table, grown = growth(study.seed, counts, repeats)
+    save_tables(study.out, "speed", [squares, worst, table, environment()])
+    if study.json:
+        save_json(study.json, {"figures": figures | grown})
     if figures["minimax_value_difference"] > 1e-6:
-        sys.exit("the two minimax solvers disagree")
+        raise click.ClickException("the two minimax solvers disagree")
 
 
 if __name__ == "__main__":
-    main()
+    sweep.start(__file__)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import qp_backends
 from minimax_cal import gates, identify, kinematics, start
 from minimax_cal.calibration import Calibration, Parameter, Provenance
 from minimax_cal.cell import Cell
@@ -41,6 +42,7 @@ from qp_backends import BackendError, Problem
 from qp_backends import solve as solve_qp
 
 QP_TOLERANCE = 1e-9
+FALLBACK = "daqp"  # a required package
 TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
 # With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
 # beside 1, but leaves their own coordinates determined.
@@ -112,6 +114,7 @@ def calibrate(
     data = data if isinstance(data, Measurements) else read_measurements(data)
     objective_of(chosen.objective, data)
     check_options(chosen)
+    usable(chosen.qp)
     gates.check_joints(robot, data)
     gates.check_spread(data)
     train, held, notices = split(data, chosen.holdout, chosen.seed)
@@ -215,10 +218,21 @@ def check_options(options: Options) -> None:
     for pattern, sigma in options.priors.items():
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
+
+
+def usable(qp: str) -> tuple[str, tuple[str, ...]]:
+    """The QP backend to use, and a notice where it is not the one that was named.
+
+    A backend that exists but is not installed is replaced; a name that does not exist is a
+    mistake.  Raises OptionError.
+    """
     try:
-        solve_qp(TRIVIAL, options.qp)
+        solve_qp(TRIVIAL, qp)
     except BackendError as error:
-        raise OptionError(str(error)) from error
+        if qp.partition(":")[0] not in qp_backends.names():
+            raise OptionError(str(error)) from error
+        return FALLBACK, (f"QP: {error}; {FALLBACK} is used",)
+    return qp, ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,12 +304,13 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     if per == "point" or (per == "target" and k > 1):
         report("minimax")
         minimax_problem = worst_of(model, state, distances, options.distance, per)
-        qp = partial(solve_qp, name=options.qp, tolerance=QP_TOLERANCE)
+        name, said = usable(options.qp)
+        qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
         best = minimax.solve(minimax_problem, state, qp, Sqp(hessian=options.hessian))
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
         share = np.maximum(best.mu, FLOOR) / model.counts if per == "target" else share
-        notices += tuple(f"QP: {note}" for note in best.notes)
+        notices += (*said, *(f"QP: {note}" for note in best.notes))
     return Fit(
         names=names,
         nominal=frame.state,
