@@ -36,6 +36,7 @@ from experiments.poses import (
     position_error,
 )
 from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.sweep import Study, start, study_options
 from minimax_cal.calibrate import calibrate
 from minimax_cal.data import Measurements, read_measurements
 from minimax_cal.figures import AFTER, BEFORE
@@ -519,21 +520,22 @@ def numbers(studies: Studies) -> dict[str, object]:
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="One split a robot (two for the FANUC).")
-@click.option("--seed", type=int, default=0, show_default=True)
+@study_options("methods")
 @click.option("--data", "folder", type=click.Path(path_type=Path), default=SHARED)
-@click.option("--out", type=click.Path(path_type=Path), default=Path("results/methods"),
-              show_default=True)  # fmt: skip
-@click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write figures here.")
-def main(quick: bool, seed: int, folder: Path, out: Path, json_path: Path | None) -> None:
+def main(options: Study, folder: Path) -> None:
     """Calibration methods side by side, on simulated and real robots."""
-    studies, weighted = run(quick, seed, folder), run_weights(quick, seed, folder)
-    save_tables(out, "methods", [*tables(studies, weighted), environment(("matplotlib",))])
+
+    def sweep(function: Callable[[Job], Outcome], jobs: Sequence[Job]) -> list[Outcome]:
+        return options.sweep(function, jobs, "methods")
+
+    studies = run(options.quick, options.seed, folder, sweep)
+    weighted = run_weights(options.quick, options.seed, folder, sweep)
+    save_tables(options.out, "methods", [*tables(studies, weighted), environment(("matplotlib",))])
     for name, figure in figures(studies).items():
-        save_figure(out, name, figure)
-    if json_path:
-        save_json(json_path, {"figures": numbers(studies)})
+        save_figure(options.out, name, figure)
+    if options.json:
+        save_json(options.json, {"figures": numbers(studies)})
 
 
 if __name__ == "__main__":
-    main()
+    start(__file__)
