@@ -1,0 +1,57 @@
+"""The studies' own arithmetic on a small scale; CI runs them all in their quick form."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from experiments import any_base, conditions, convergence, pseudo_inverse
+from experiments.convergence import Job, Setting
+from minimax_cal.solvers.least_squares import METHODS
+
+
+def test_the_grid_is_the_papers() -> None:
+    theta, alpha = convergence.grid(1)
+    assert len(theta) == 63 * 63
+    assert_allclose([theta.min(), theta.max(), alpha.min(), alpha.max()], [-3.1, 3.1, -3.1, 3.1])
+    few, _ = convergence.grid(3)
+    assert len(few) == 21 * 21
+    assert set(few) <= set(theta)
+    assert 0.0 in few  # the nominal start is on every grid
+
+
+@pytest.mark.parametrize("method", convergence.PAPER)
+def test_pseudo_inverse_and_identifiable_set_reach_the_same_minimum(method: str) -> None:
+    setting = Setting(seed=1)
+    least = convergence.least_cost(setting)
+    robot, every = convergence.problem_of(setting, "all")
+    begin = convergence.starts_of(robot, (0.2,), (-0.1,)).take(np.array(0))
+    ended = pseudo_inverse.solve(every, begin, METHODS[method], 1e-9, 2000)
+    assert ended.converged
+    assert_allclose(ended.cost, least, rtol=1e-6)
+    ours = convergence.run(Job(setting, method, "identifiable", (0.2,), (-0.1,), 2000))
+    assert ours.converged == (True,)
+    assert_allclose(ours.cost[0], least, rtol=1e-6)
+
+
+def test_separable_methods_come_back_from_radians_away() -> None:
+    setting = Setting(seed=1)
+    least = convergence.least_cost(setting)
+    corners = (-3.1, -3.1, 3.1, 3.1, 1.5), (-3.1, 3.1, -3.1, 3.1, -2.0)
+    for method in ("snlgn", "snllm"):
+        found = convergence.run(Job(setting, method, "identifiable", *corners, 500))
+        assert_allclose(found.cost, least, rtol=1e-6)
+
+
+def test_any_base_is_found() -> None:
+    for trial in any_base.trials(3, 3, float(np.pi)):
+        assert any_base.run(trial).ours
+
+
+def test_minimax_has_the_least_rmse_phi_in_training() -> None:
+    phi = {
+        c: conditions.run(conditions.Job("irb2600", c, 60, 4)).train.phi
+        for c in ("smr:1", "smr:2", "sum", "pose", "minimax")
+    }
+    # a fit of one target is the minimax where that target stays the worst: equal then
+    assert phi["minimax"] <= min(phi.values()) * (1 + 1e-7)
+    assert phi["sum"] > phi["minimax"]
