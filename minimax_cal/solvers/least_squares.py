@@ -222,6 +222,8 @@ def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
     matrix = gram[:, w][:, :, w] - np.swapaxes(mixed, -1, -2) @ solved[..., :angles]
     matrix = matrix + np.swapaxes(coupled, -1, -2) @ solved[..., angles:]
     size = np.maximum(column_size(matrix), 1e-5 * column_size(gram)[:, w])
+    if method.damped:  # angles share a unit: the paper's mu I, in units of the largest column
+        size = np.repeat(size.max(axis=1, keepdims=True), size.shape[1], axis=1)
     return Examined(x, cost, slope, gram, slope[:, w], matrix, size)
 
 
