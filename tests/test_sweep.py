@@ -97,18 +97,18 @@ def test_kept_results_are_used_unless_fresh(
     log = tmp_path / "log"
     jobs = [Job(seed, str(log)) for seed in range(4)]
     one = dict(name="kept", jobs_in_parallel=1, folder=tmp_path)
-    first = sweep(work, jobs[:3], **one)  # type: ignore[arg-type]
-    again = sweep(work, jobs, **one)  # type: ignore[arg-type]
+    first = sweep(work, jobs[:3], **one)
+    again = sweep(work, jobs, **one)
     assert same(again[:3], first)
     assert log.read_text().split() == ["0", "1", "2", "3"]
     assert "3 of 4 parts were kept" in capsys.readouterr().err
-    sweep(work, jobs, fresh=True, **one)  # type: ignore[arg-type]
+    sweep(work, jobs, fresh=True, **one)
     assert len(log.read_text().split()) == 8
 
 
 def test_damaged_parts_are_computed_again(expected: list[Found], tmp_path: Path) -> None:
     one = dict(name="damage", jobs_in_parallel=1, folder=tmp_path)
-    sweep(work, JOBS, **one)  # type: ignore[arg-type]
+    sweep(work, JOBS, **one)
     paths = sorted((tmp_path / "damage").iterdir())
     assert len(paths) == len(JOBS)
     paths[0].write_bytes(b"")
@@ -121,7 +121,7 @@ def test_damaged_parts_are_computed_again(expected: list[Found], tmp_path: Path)
     gone = pickle.dumps(Found(0, np.zeros(1), 0)).replace(b"Found", b"Gonee")
     paths[4].write_bytes(hashlib.sha256(gone).hexdigest().encode() + b"\n" + gone)
     assert [len(module.read_part(path)) for path in paths[:6]] == [0, 0, 0, 0, 0, 1]
-    assert same(sweep(work, JOBS, **one), expected)  # type: ignore[arg-type]
+    assert same(sweep(work, JOBS, **one), expected)
     assert all(module.read_part(path) for path in paths)
 
 
@@ -210,16 +210,17 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("cluster")
     file, log = folder / "scheduler.json", (folder / "log").open("w")
     dask = [sys.executable, "-m", "dask"]
-    place = dict(env=ENVIRONMENT, cwd=folder, stdout=log, stderr=log)
+    settings = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    place = dict(env=ENVIRONMENT | settings, cwd=folder, stdout=log, stderr=log)
     options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
     running = [
-        subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", str(file)], **place)  # type: ignore[call-overload]
+        subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", str(file)], **place)
     ]
     try:
         wait_for(file.exists)
         address = json.loads(file.read_text())["address"]
         size = ["--nworkers", "2", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0"]
-        running += [subprocess.Popen([*dask, "worker", address, *size], **place)]  # type: ignore[call-overload]
+        running += [subprocess.Popen([*dask, "worker", address, *size], **place)]
         yield address
     finally:
         for process in reversed(running):  # workers first: they sign off at the scheduler
@@ -258,7 +259,7 @@ def test_a_cluster_without_the_study_is_refused(
 ) -> None:
     (tmp_path / "only_here.py").write_text("def work(job):\n    return job\n")
     monkeypatch.syspath_prepend(tmp_path)
-    import only_here  # type: ignore[import-not-found]
+    import only_here
 
     with pytest.raises(OptionError, match="no module 'only_here'"):
         sweep(only_here.work, [1, 2], name="lost", cluster=cluster, folder=tmp_path)
@@ -267,6 +268,11 @@ def test_a_cluster_without_the_study_is_refused(
 def test_errors_of_a_job_come_back_from_a_cluster(cluster: str, tmp_path: Path) -> None:
     with pytest.raises(ModuleNotFoundError, match="no extra for"):
         sweep(missing, [1, 2], name="error", cluster=cluster, folder=tmp_path)
+
+
+def test_a_job_that_kills_its_worker_ends_the_sweep(cluster: str, tmp_path: Path) -> None:
+    with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
+        sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
 
 
 @click.command()
@@ -333,7 +339,7 @@ HOSTILE = "<script>alert('x')</script> & \"quoted\" | bar"
 def fake(name: str, monkeypatch: pytest.MonkeyPatch, body: Any) -> None:
     """A module with a command `main` that does body(study)."""
     made = ModuleType(name)
-    made.main = click.command()(study_options(name)(body))  # type: ignore[attr-defined]
+    made.main = click.command()(study_options(name)(body))
     monkeypatch.setitem(sys.modules, name, made)
 
 
@@ -420,7 +426,7 @@ def test_studies_are_listed_and_run_by_name(
 def test_a_study_starts_under_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
     made = ModuleType("experiments.fake_study")
     seen: list[str] = []
-    made.main = lambda prog_name: seen.append(prog_name)  # type: ignore[attr-defined]
+    made.main = lambda prog_name: seen.append(prog_name)
     monkeypatch.setitem(sys.modules, made.__name__, made)
     module.start("/somewhere/experiments/fake_study.py")
     assert seen == ["python -m experiments.fake_study"]
