@@ -6,11 +6,6 @@ python -m experiments all --quick [--out FOLDER] [--json FILE] [--seed N] [--job
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy; sweeps use processes
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import json
 import shlex
 import sys

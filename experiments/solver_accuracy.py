@@ -11,11 +11,6 @@ judge finds primal, dual and gap at most 1e-6 relative to the problem's own scal
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import statistics
 import time
 import warnings

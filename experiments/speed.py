@@ -9,11 +9,6 @@ start where our own closed-form start ends, and all reach the same optimum: that
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # ratios, not the luck of a shared machine
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import statistics
 import time
 from collections.abc import Callable
