@@ -71,7 +71,7 @@ class Setting:
     angle: float = 1.0e-3
     noise: float = 20e-6
     transmission: float = 3.0e-3
-    span: float = 1.25
+    span: float = 1.0
 
 
 def measured(setting: Setting) -> tuple[Robot, Measurements]:

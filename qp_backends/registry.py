@@ -19,7 +19,7 @@ Solver = Callable[..., Solution]
 
 BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
     "daqp": ("via_daqp", "daqp"),
-    "quadprog": ("via_qpsolvers", "quadprog"),
+    "quadprog": ("via_quadprog", "quadprog"),
     "piqp": ("via_qpsolvers", "piqp"),
     "clarabel": ("via_qpsolvers", "clarabel"),
     "proxqp": ("via_qpsolvers", "proxqp"),
