@@ -1,8 +1,8 @@
 """quadprog without qpsolvers in between, where that is simple.
 
 At the size of an SQP step qpsolvers' bookkeeping costs as much as the solve.  What quadprog does
-not take directly (sparse matrices, equalities, P without curvature, a tight clock) goes through
-qpsolvers as before.
+not take directly (sparse matrices, equalities, rows open above, P without curvature, a tight
+clock) goes through qpsolvers.
 """
 
 from __future__ import annotations
@@ -28,25 +28,22 @@ def solve(
 ) -> Solution:
     """The answer of quadprog [Goldfarb and Idnani 1983], not yet judged."""
     start = time.perf_counter()
-    low, high = problem.l, problem.u
-    hurried = time_limit < TRAITS["quadprog"].pace * sum(problem.A.shape) ** 3
-    if low.size and not (hurried or problem.has_sparse or (low == high).any()):
-        above, below = high < np.inf, low > -np.inf
-        A = problem.A
-        rows = np.concatenate([-A[above], A[below]])  # quadprog wants rows x >= bound
-        bound = np.concatenate([-high[above], low[below]])
+    low, high, A = problem.l, problem.u, problem.A
+    m, hurry = low.size, TRAITS["quadprog"].pace * sum(A.shape) ** 3
+    below = low > -np.inf
+    plain = m and time_limit >= hurry and not problem.has_sparse
+    if plain and high.max() < np.inf and not (low == high).any():
+        rows = np.concatenate([-A, A[below]])  # quadprog wants rows x >= bound
+        bound = np.concatenate([-high, low[below]])
         try:
-            x, _, _, steps, lagrange, _ = quadprog.solve_qp(problem.P, -problem.q, rows.T, bound, 0)
+            x, _, _, steps, y, _ = quadprog.solve_qp(problem.P, -problem.q, rows.T, bound, 0)
         except ValueError:  # no curvature somewhere, or contradicting rows: told apart there
             pass
         else:
-            y = np.zeros(low.shape)
-            count = np.count_nonzero(above)
-            y[above] = lagrange[:count]
-            y[below] -= lagrange[count:]
-            return Solution(
-                x, y, Status.SOLVED, time.perf_counter() - start, iterations=int(steps[0])
-            )
+            lower, y = y[m:], y[:m]
+            y[below] -= lower
+            seconds = time.perf_counter() - start
+            return Solution(x, y, Status.SOLVED, seconds, iterations=int(steps[0]))
     return via_qpsolvers.solve(
         problem,
         method=method,
