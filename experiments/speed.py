@@ -79,7 +79,9 @@ def fitted(robot: Robot, data: Measurements) -> tuple[Model, State]:
 def ours_squares(case: Case) -> State:
     """Our separable least squares."""
     points = float(case.model.counts.sum())
-    found = least_squares.solve(SumOfSquares(case.model), case.begin.batch(), 1, points)
+    found = least_squares.solve(
+        SumOfSquares(case.model), case.begin.batch(), 1, points, limits=least_squares.NEAR
+    )
     return found.x.take(np.array(0))
 
 

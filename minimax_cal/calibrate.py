@@ -295,7 +295,8 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         # the turn that fits the errors best vanishes for half a turn too: start near the answer
         problem = SumOfSquares(with_poses(model, weights))
         points = float(model.counts.sum())
-        squares = least_squares.solve(problem, squares.x, 1, points, METHODS[options.method])
+        method = METHODS[options.method]
+        squares = least_squares.solve(problem, squares.x, 1, points, method, least_squares.NEAR)
     state, status = squares.x.take(np.array(0)), squares.status[0]
     iterations = int(squares.iterations[0])
     distances = measured_distances(data, options.distance_tolerance)
@@ -370,7 +371,8 @@ def least(
     for _ in range(20 if np.isfinite(sigma).any() else 1):
         model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
         problem = SumOfSquares(model)
-        found = least_squares.solve(problem, frame.state.batch(), 1, points, method)
+        begin = frame.state.batch()
+        found = least_squares.solve(problem, begin, 1, points, method, least_squares.NEAR)
         state = found.x.take(np.array(0))
         _, _, gram = problem.normal(state)
         weight = np.diag(model.prior.weight[model.active])

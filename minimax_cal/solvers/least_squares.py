@@ -77,11 +77,16 @@ class Limits:
     """When to stop.
 
     step: root mean square motion of a point that a step would cause [the residual's unit].
-    iterations: at most so many.
+    iterations: at most so many.  damping: the first one, relative to the largest column; a start
+    that is known to be near wants hardly any (NEAR).
     """
 
     step: float = 1e-12
     iterations: int = 200
+    damping: float = 1e-3
+
+
+NEAR = Limits(damping=1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +125,7 @@ def solve(
     costs = [cost]
     status = [Status.ITERATION_LIMIT] * count
     iterations = np.zeros(count, dtype=int)
-    damping, growth = np.full(count, 1e-3), np.full(count, 2.0)
+    damping, growth = np.full(count, limits.damping), np.full(count, 2.0)
     alive = np.arange(count)  # the members still iterating
     for iteration in range(1, limits.iterations + 1):
         if not len(alive):
