@@ -269,19 +269,31 @@ def table_2(rows: Sequence[Row], setting: Setting) -> Table:
     )
 
 
+def separable_shares(study: Study, setting: Setting, every: int) -> tuple[int, float, float]:
+    """How many starts, and which share of them SNLGN and SNLLM bring to the minimum [%]."""
+    least = least_cost(setting)
+    rows = [
+        row_of(
+            outcomes(study, setting, method, "identifiable", every, 500),
+            method,
+            "identifiable",
+            every,
+            least,
+            setting.poses,
+        )
+        for method in ("snlgn", "snllm")
+    ]
+    gauss_newton, levenberg = (100.0 * float(row.minimum.mean()) for row in rows)
+    return len(rows[0].minimum), gauss_newton, levenberg
+
+
 def span_table(study: Study, setting: Setting, every: int) -> Table:
     """Where the claim of global convergence ends: wider poses have other minima."""
     rows: list[tuple[Cell, ...]] = []
     for span in (0.5, 1.0, 1.5, 2.0, np.pi):
         for angle in (0.0, 0.5):
             wider = replace(setting, span=span, base_angle=angle)
-            least = least_cost(wider)
-            shares = []
-            for method in ("snlgn", "snllm"):
-                found = outcomes(study, wider, method, "identifiable", every, 500)
-                row = row_of(found, method, "identifiable", every, least, wider.poses)
-                shares.append(100.0 * float(row.minimum.mean()))
-            rows.append((span, angle, len(row.minimum), *shares))
+            rows.append((span, angle, *separable_shares(study, wider, every)))
     return Table(
         "separable methods on the identifiable parameters, from the paper's start: share of starts "
         "that reach the minimum",
@@ -297,13 +309,7 @@ def seed_table(study: Study, setting: Setting, every: int) -> Table:
     for seed in range(setting.seed, setting.seed + (2 if study.quick else 4)):
         for angle in (0.0, 0.5):
             other = replace(setting, seed=seed, base_angle=angle)
-            least = least_cost(other)
-            shares = []
-            for method in ("snlgn", "snllm"):
-                found = outcomes(study, other, method, "identifiable", max(every, 2), 500)
-                row = row_of(found, method, "identifiable", every, least, other.poses)
-                shares.append(100.0 * float(row.minimum.mean()))
-            rows.append((seed, angle, len(row.minimum), *shares))
+            rows.append((seed, angle, *separable_shares(study, other, max(every, 2))))
     return Table(
         "separable methods on the identifiable parameters, other simulated arms: share of starts "
         "that reach the minimum",
