@@ -81,6 +81,7 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
     if not math.isfinite(gap):
         return NOWHERE
     outside = Ax - np.minimum(np.maximum(Ax, l), u)
+    far = outside.any()
     slope, dual = _size(q), _size(Px + q + Aty)
     delta = max(slope, _size(Px), _size(Aty))
     curvature = problem.curvature
@@ -88,12 +89,14 @@ def _judged(problem: Problem, x: Array, y: Array) -> Accuracy:
         delta = max(delta, (curvature or 1.0) * _reach(problem))
     step = min(1.0, delta / curvature) if curvature > 0 else 1.0
     return Accuracy(
-        primal=_size(outside),
+        primal=_size(outside) if far else 0.0,
         dual=dual,
         gap=gap,
         primal_relative=_ratio(
             _size(outside / problem.row_norm), max(_size(Ax / problem.row_norm), step)
-        ),
+        )
+        if far
+        else 0.0,
         dual_relative=_ratio(dual, delta),
         gap_relative=_ratio(gap, max(abs(xPx), abs(qx), abs(support), delta * step)),
         objective=0.5 * xPx + qx,

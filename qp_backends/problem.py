@@ -134,6 +134,21 @@ class Problem:
         return float(self.P.diagonal().max(initial=0.0))
 
     @cached_property
+    def above(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """The rows as Gx ≥ g, for solvers that know no other: G (r, n), g (r,), low (m,).
+
+        First -Ax ≥ -u for all rows, then Ax ≥ l for those with low = True; A must be dense.
+        """
+        low = self.l > -np.inf
+        rows = np.concatenate([-self.A, self.A[low]])
+        return rows, np.concatenate([-self.u, self.l[low]]), low
+
+    @cached_property
+    def boxed(self) -> bool:
+        """Whether every row is closed above and none is an equality."""
+        return bool(self.u.max(initial=-np.inf) < np.inf and not (self.l == self.u).any())
+
+    @cached_property
     def has_sparse(self) -> bool:
         """Whether P or A came as a sparse matrix."""
         return is_sparse(self.P) or is_sparse(self.A)

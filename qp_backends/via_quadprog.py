@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import time
 
-import numpy as np
 import quadprog
 
 from . import via_qpsolvers
@@ -28,13 +27,10 @@ def solve(
 ) -> Solution:
     """The answer of quadprog [Goldfarb and Idnani 1983], not yet judged."""
     start = time.perf_counter()
-    low, high, A = problem.l, problem.u, problem.A
-    m, hurry = low.size, TRAITS["quadprog"].pace * sum(A.shape) ** 3
-    below = low > -np.inf
-    plain = m and time_limit >= hurry and not problem.has_sparse
-    if plain and high.max() < np.inf and not (low == high).any():
-        rows = np.concatenate([-A, A[below]])  # quadprog wants rows x >= bound
-        bound = np.concatenate([-high, low[below]])
+    m, n = problem.l.size, problem.q.size
+    hurry = TRAITS["quadprog"].pace * (m + n) ** 3
+    if m and time_limit >= hurry and not problem.has_sparse and problem.boxed:
+        rows, bound, below = problem.above
         try:
             x, _, _, steps, y, _ = quadprog.solve_qp(problem.P, -problem.q, rows.T, bound, 0)
         except ValueError:  # no curvature somewhere, or contradicting rows: told apart there

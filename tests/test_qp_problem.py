@@ -50,3 +50,15 @@ def test_row_norm_is_the_same_dense_and_sparse():
     assert_allclose(thin.row_norm, dense.row_norm, rtol=1e-15)
     assert thin.has_sparse
     assert not dense.has_sparse
+
+
+def test_one_sided_rows_say_the_same() -> None:
+    A = np.array([[1.0, 2.0], [3.0, -1.0], [0.5, 0.5]])
+    problem = Problem(np.eye(2), np.zeros(2), A, [-1.0, -np.inf, 0.0], [1.0, 2.0, 4.0])
+    rows, bound, low = problem.above
+    assert low.tolist() == [True, False, True]
+    for x in np.random.default_rng(0).uniform(-2.0, 2.0, (200, 2)):
+        inside = bool((problem.l <= A @ x).all() and (A @ x <= problem.u).all())
+        assert inside == bool((rows @ x >= bound).all())
+    assert problem.boxed
+    assert not Problem(np.eye(2), np.zeros(2), A, [0.0, 1.0, 2.0], [0.0, 2.0, 3.0]).boxed
