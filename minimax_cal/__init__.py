@@ -4,6 +4,8 @@ from minimax_cal.calibrate import Options, calibrate
 from minimax_cal.calibration import Calibration
 from minimax_cal.cell import Cell, evaluate, load_cell
 from minimax_cal.data import Measurements, measurements, read_measurements, write_measurements
+from minimax_cal.diagnose import diagnose
+from minimax_cal.diagnosis import Diagnosis
 from minimax_cal.errors import CalibrationError, DataError, OptionError, RobotError
 from minimax_cal.minimize import minimize_max
 from minimax_cal.robot import Robot, builtin_robots, load_robot
@@ -13,6 +15,7 @@ __all__ = [
     "CalibrationError",
     "Cell",
     "DataError",
+    "Diagnosis",
     "Measurements",
     "OptionError",
     "Options",
@@ -20,6 +23,7 @@ __all__ = [
     "RobotError",
     "builtin_robots",
     "calibrate",
+    "diagnose",
     "evaluate",
     "load_cell",
     "load_robot",

@@ -16,7 +16,11 @@ from minimax_cal import gates, identify, kinematics, start
 from minimax_cal.calibration import Calibration, Parameter, Provenance
 from minimax_cal.cell import Cell
 from minimax_cal.data import Measurements, groups, read_measurements, split
+from minimax_cal.effects.table import Fitted, Term, names_of
+from minimax_cal.effects.table import terms as terms_of
 from minimax_cal.errors import DataError, OptionError
+from minimax_cal.extend import extended, fitted, scene_of
+from minimax_cal.history import with_history
 from minimax_cal.identify import Identification
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import accuracy
@@ -47,6 +51,7 @@ TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zero
 # With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
 # beside 1, but leaves their own coordinates determined.
 ASIDE = 1e-9
+PASSES = 2  # of a fit with effects: the second takes finite turns into account
 FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
@@ -67,6 +72,7 @@ class Options:
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
     distance constraints, two-sided, squared or off.  distance_tolerance: [m], NaN for the
     instrument's own accuracy.  resolution: relative singular value that counts as not measured.
+    effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
     """
 
     objective: str = "minimax"
@@ -82,6 +88,7 @@ class Options:
     distance: str = "two-sided"
     distance_tolerance: float = np.nan
     resolution: float = identify.RESOLUTION
+    effects: Sequence[str | Term] = ()
 
 
 Report = Callable[[str], None]
@@ -105,7 +112,7 @@ def calibrate(
     a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended is in the
     result's `status`.
     """
-    for name in ("fix", "free"):
+    for name in ("fix", "free", "effects"):
         if isinstance(options.get(name), str):
             options[name] = tuple(filter(None, str(options[name]).replace(" ", "").split(",")))
     chosen = Options(objective=objective, qp=qp, **options)  # type: ignore[arg-type]
@@ -117,6 +124,8 @@ def calibrate(
     usable(chosen.qp)
     gates.check_joints(robot, data)
     gates.check_spread(data)
+    if chosen.effects:
+        data = with_history(data)  # the way to a pose is lost once its predecessor is held out
     train, held, notices = split(data, chosen.holdout, chosen.seed)
     notices = (*data.notices, *gates.limit_notices(robot, data), *notices)
     few = train.seen.sum(axis=0) < LEAST_POSES
@@ -129,7 +138,7 @@ def calibrate(
         check_sense(robot, data)
     report("start")
     fit = fit_cell(robot, train, chosen, report)
-    calibrated = Cell.of(robot, fit.state, data.targets)
+    calibrated = Cell.of(robot, fit.state, data.targets, fit.effects)
     nominal = Cell.of(robot, fit.nominal, data.targets)
     errors = {
         "nominal": nominal.error(held),
@@ -160,8 +169,14 @@ def calibrate(
         trace=fit.trace,
         train_lines=train.line,
         notices=notices,
-        provenance=Provenance.of(robot, data, vars(chosen)),
+        provenance=Provenance.of(robot, data, settings_of(chosen)),
     )
+
+
+def settings_of(options: Options) -> dict[str, object]:
+    """The options for the record, effects in their written form."""
+    effects = [e.text if isinstance(e, Term) else e for e in options.effects]
+    return {**vars(options), "effects": effects}
 
 
 def remarks(
@@ -242,7 +257,7 @@ class Fit:
     nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
     covariance: (p, p) of all parameters, base in its own axes, NaN where not identified.
     worst: the minimax answer, where there was one to find.  trace: cost at each iterate of the
-    least squares [m^2].
+    least squares [m^2].  effects: those asked for, with their values; units: of each value.
     """
 
     names: Names
@@ -256,6 +271,8 @@ class Fit:
     distances: Distances
     trace: tuple[float, ...]
     notices: tuple[str, ...]
+    effects: Fitted
+    units: tuple[str, ...]
 
 
 def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report) -> Fit:
@@ -291,6 +308,35 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     report("least squares")
     model, squares = least(model.only(found.active), frame, sigma, options)
     squares, notices = wider(robot, model, squares, report)
+    terms: tuple[Term, ...] = ()
+    if options.effects:
+        report("effects")
+        scene = scene_of(robot, data, model, squares.x.take(np.array(0)))
+        terms = terms_of(scene, options.effects)
+        known_ones = np.isfinite(sigma)
+        for _ in range(PASSES):
+            model, begin = extended(
+                model.only(found.active), robot, data, squares.x.take(np.array(0)), terms
+            )
+            more = len(model.fields)
+            found = identify.identify(
+                model,
+                begin,
+                np.concatenate([np.arange(names.count, names.count + more), order]),
+                allowed=np.pad(allowed, (0, more), constant_values=True),
+                reference=reference,
+                known=np.pad(known_ones, (0, more)),
+                resolution=options.resolution,
+            )
+            told = found.active[names.count :]
+            begin = replace(begin, effects=np.where(told, begin.effects, 0.0))
+            model, squares = least(
+                model.only(found.active),
+                replace(frame, state=begin),
+                np.pad(sigma, (0, more), constant_values=np.inf),
+                options,
+            )
+        base = replace(base, names=model.names, fields=model.fields, moved=model.moved)
     if len(weights):
         # the turn that fits the errors best vanishes for half a turn too: start near the answer
         problem = SumOfSquares(with_poses(model, weights))
@@ -313,7 +359,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         share = np.maximum(best.mu, FLOOR) / model.counts if per == "target" else share
         notices += (*said, *(f"QP: {note}" for note in best.notes))
     return Fit(
-        names=names,
+        names=model.names,
         nominal=frame.state,
         state=state,
         identification=found,
@@ -326,6 +372,8 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         distances=distances,
         trace=tuple(float(value) for value in squares.trace[:, 0]),
         notices=notices,
+        effects=fitted(terms, scene_of(robot, data, model, state), state.effects),
+        units=names_of(terms, scene_of(robot, data, model, state))[1],
     )
 
 
@@ -537,9 +585,11 @@ def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
 
     def values(x: State) -> Array:
         turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
-        return np.concatenate([links_of(x.mdh), axes.T @ x.origin, turn, x.targets.reshape(-1)])
+        parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.targets.reshape(-1))
+        return np.concatenate([*parts, x.effects if len(x.effects) else np.zeros(len(fit.units))])
 
     before, linear = values(fit.nominal), names.linear
+    units = [*("m" if length else "rad" for length in linear[: names.geometric]), *fit.units]
     value = np.where(known, values(fit.state), before)
     order = [kind * n + joint for joint in range(n) for kind in range(5)]
     order += range(5 * n, names.count)
@@ -549,7 +599,7 @@ def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
             value=float(value[i]),
             nominal=float(before[i]),
             sigma=float(sigma[i]),
-            unit="m" if linear[i] else "rad",
+            unit=units[i],
             identifiable=bool(known[i]),
             reason=fit.identification.reasons.get(names.all[i], ""),
         )

@@ -50,7 +50,7 @@ class Parameter:
             "value": self.value * scale,
             "nominal": self.nominal * scale,
             "sigma": None if math.isnan(self.sigma) else self.sigma * scale,
-            "unit": "mm" if self.unit == "m" else "rad",
+            "unit": "mm" if self.unit == "m" else self.unit,
             "identifiable": self.identifiable,
         }
         return out | ({"reason": self.reason} if self.reason else {})
@@ -147,6 +147,8 @@ class Calibration:
         """Every parameter with its nominal value, change and sigma, in mm and mrad."""
         rows = []
         for p in self.parameters:
+            if p.unit not in ("m", "rad") or ":" in p.name:
+                continue  # effects have a table of their own
             # millimetres and milliradians: 1e3 serves both
             scale, unit = 1e3, "mm" if p.unit == "m" else "mrad"
             fixed = p.reason or "not identifiable"
@@ -166,6 +168,16 @@ class Calibration:
             tuple(rows),
             ("", "", ".4f", "+.4f", ".4f", ""),
         )
+
+    def effect_rows(self) -> Table:
+        """The parameters of effects beyond geometry, SI; empty without any."""
+        rows = tuple(
+            (p.name, p.unit, p.value, p.sigma, "" if p.identifiable else p.reason)
+            for p in self.parameters
+            if ":" in p.name
+        )
+        header = ("effect", "unit", "value", "sigma", "not identified because")
+        return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
 
     def minimax_table(self) -> Table:
         """What the minimax found: errors, multipliers, activity; empty without one."""
@@ -229,7 +241,8 @@ class Calibration:
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         worst = (self.minimax_table(),) if self.worst else ()
-        return (self.accuracy_table(), *worst, self.parameter_rows())
+        effects = (self.effect_rows(),) if self.cell.effects.terms else ()
+        return (self.accuracy_table(), *worst, *effects, self.parameter_rows())
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

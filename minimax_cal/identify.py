@@ -7,7 +7,7 @@ one member is left at its nominal value.  Which one is a matter of taste: predic
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def drop_order(robot: Robot, names: Names) -> Array:
     a, d, theta, _, b = links
     first = [*b[~parallel], *d[parallel], d[0], theta[0], *links[[1, 2, 3, 0], -1]]
     rest = [*theta[::-1], *d[::-1], *a[::-1], *links[3][::-1], *b[parallel]]
-    order = [*first, *rest, *range(5 * n, names.count)]
+    order = [*first, *rest, *range(5 * n, names.geometric)]
     return np.array(list(dict.fromkeys(int(i) for i in order)))
 
 
@@ -90,7 +90,11 @@ def identify(
     dead = active & (scale <= 1e-12)
     active &= ~dead
     reasons |= {model.names.all[i]: "moves no measured point" for i in np.flatnonzero(dead)}
-    for i in redundant(gram_of(reference, state), active, order, RANK):
+    geometric = np.arange(len(active)) < model.names.geometric
+    plain = gram_of(reference, replace(state, effects=np.zeros(0)))
+    for i in redundant(
+        np.pad(plain, (0, len(active) - len(plain))), active & geometric, order, RANK
+    ):
         active[i] = False
         reasons[model.names.all[i]] = "same motion as {}"
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))

@@ -25,6 +25,7 @@ BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
 
 
 NO_MIX: Array = np.zeros((0, 0, 0))
+NO_FIELDS: Array = np.zeros((0, 0, 0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class Model:
     prior: on the parameters, in the order of `names`.
     mix: (m, 3k, 3k) matrices that each pose's errors (all targets, measurement axes) are multiplied
     by, so that the sum of squares weighs position and orientation; empty for plain points.
+    fields: (e, k, 3, m) motion of the points, in base axes, per unit of each effect's parameter.
+    moved: (k, 3, m) by how much more they are known to move [m]; empty for not at all.
     """
 
     q: Array
@@ -88,6 +91,8 @@ class Model:
     active: Array
     prior: Prior
     mix: Array = field(default_factory=lambda: NO_MIX)
+    fields: Array = field(default_factory=lambda: NO_FIELDS)
+    moved: Array = field(default_factory=lambda: NO_MIX)
 
     @property
     def counts(self) -> Array:
@@ -119,8 +124,8 @@ class Model:
     def error(self, state: State) -> Array:
         """Measured minus predicted, in base axes: (..., k, m, 3), NaN where not measured [m]."""
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
-        error = in_base(state, self.y) - kinematics.points(links, state.targets)
-        error = np.swapaxes(error, -1, -2)
+        point = self.displaced(state, kinematics.points(links, state.targets), slice(None))
+        error = np.swapaxes(in_base(state, self.y) - point, -1, -2)
         error[..., ~self.seen, :] = np.nan
         return np.asarray(error)
 
@@ -129,7 +134,9 @@ class Model:
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
         point = kinematics.points(links, state.targets)
         every = np.ones(self.names.count, dtype=bool)
-        turned = Columns.of(self.names, every).jacobian(Block(slice(0), links), point)
+        block = Block(slice(len(self.q)), links)
+        swung = self.displaced(state, point, slice(None))
+        turned = Columns.of(self.names, every).jacobian(block, point, swung, self.fields)
         return np.asarray(np.swapaxes(np.moveaxis(turned, -3, -1), -3, -2))
 
     def blocks(self, state: State) -> list[Block]:
@@ -145,10 +152,18 @@ class Model:
     def error_of(self, state: State, block: Block) -> tuple[Array, Array]:
         """Weighted errors and predicted points of one block: (..., k, 3, c) each [m]."""
         point = kinematics.points(block.links, state.targets)
-        error = in_base(state, self.y[..., block.rows]) - point
+        error = in_base(state, self.y[..., block.rows]) - self.displaced(state, point, block.rows)
         if not self.even:
             error *= np.sqrt(self.weight[:, None, block.rows])
         return self.mixed(state, error, block.rows), point
+
+    def displaced(self, state: State, point: Array, poses: slice) -> Array:
+        """Points (..., k, 3, c) moved by the effects at the state's values."""
+        if len(self.moved):
+            point = point + self.moved[..., poses]
+        if len(self.fields):
+            point = point + np.tensordot(state.effects, self.fields[..., poses], 1)
+        return point
 
     def mixed(self, state: State, rows: Array, poses: slice) -> Array:
         """Rows (..., k, 3, c) in base axes times the mix, if there is one."""
@@ -203,7 +218,8 @@ class Model:
     def rows_of(self, state: State, block: Block, select: Columns) -> tuple[Array, Array]:
         """`weighted_rows` with the choice of columns at hand."""
         error, point = self.error_of(state, block)
-        turned = select.jacobian(block, point)
+        swung = self.displaced(state, point, block.rows)
+        turned = select.jacobian(block, point, swung, self.fields)
         if not self.even:
             turned *= np.sqrt(self.weight[:, None, None, block.rows])
         if len(self.mix):  # parameter by parameter, the targets of a pose together
@@ -229,7 +245,8 @@ class Model:
             axis, _ = block.screws
             base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
             axis = np.concatenate([axis, base], axis=-3)  # theta, alpha, beta, base rotation
-            part = np.zeros((*batch, 2 * n + 3 + 3 * k, 3 * n + 3))
+            fields = self.fields[..., block.rows].reshape(len(self.fields), k, 3 * c)
+            part = np.zeros((*batch, 2 * n + 3 + 3 * k + len(fields), 3 * n + 3))
             pull = kinematics.cross(error.sum(-3)[..., None, :, :], axis)
             flat = np.swapaxes(pull.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
             lengths = np.concatenate([links.x, links.z], axis=-3)
@@ -239,8 +256,10 @@ class Model:
                 own = kinematics.cross(error[..., i, None, :, :], axis)
                 flat = np.swapaxes(own.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
                 part[..., 2 * n + 3 + 3 * i : 2 * n + 6 + 3 * i, :] = turned @ flat
+                if len(fields):
+                    part[..., 2 * n + 3 + 3 * k :, :] += fields[:, i] @ flat
             total = total + part
-        coupled = total * precedes(n, k)
+        coupled = total * precedes(n, k, len(self.fields))
         return np.asarray(coupled[..., active[linear], :][..., active[~linear]])
 
     def values(self, state: State) -> Array:
@@ -249,7 +268,9 @@ class Model:
         k = state.targets.shape[-2]
         links = np.swapaxes(state.mdh, -1, -2).reshape(*batch, 5 * n)
         base = np.concatenate([state.origin, np.zeros((*batch, 3))], axis=-1)
-        return np.concatenate([links, base, state.targets.reshape(*batch, 3 * k)], axis=-1)
+        spots = state.targets.reshape(*batch, 3 * k)
+        more = np.broadcast_to(state.effects, (*batch, len(self.fields)))
+        return np.concatenate([links, base, spots, more], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,10 +333,14 @@ def in_base(state: State, y: Array) -> Array:
     return np.asarray(np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ centred)
 
 
-def precedes(n: int, k: int) -> Array:
-    """(r, omega) True where turning angle omega turns the direction of length r."""
+def precedes(n: int, k: int, effects: int) -> Array:
+    """(r, omega) True where turning angle omega turns the direction of length r.
+
+    The fields of effects are held fixed in base axes: only the base turns them.
+    """
     link = np.arange(n)
-    length = np.concatenate([3 * link + 1, 3 * link, np.full(3, -9), np.full(3 * k, 3 * n)])
+    spots, fields = np.full(3 * k, 3 * n), np.full(effects, -1)
+    length = np.concatenate([3 * link + 1, 3 * link, np.full(3, -9), spots, fields])
     angle = np.concatenate([3 * link, 3 * link + 1, 3 * link + 2, np.full(3, -1)])
     return np.asarray(angle[None, :] <= length[:, None])
 
@@ -329,6 +354,7 @@ class Columns:
     angles: Array
     base: Array
     targets: Array
+    effects: Array
     targets_at: int
     angles_at: int
     joints: int
@@ -341,21 +367,27 @@ class Columns:
         turns = np.flatnonzero(active[5 * n + 3 : 5 * n + 6])
         lengths = np.flatnonzero(active[: 2 * n])
         angles = np.flatnonzero(active[2 * n : 5 * n])
-        targets = np.flatnonzero(active[5 * n + 6 :])
-        count = sum(map(len, (lengths, angles, base, turns, targets)))
+        targets = np.flatnonzero(active[5 * n + 6 : names.geometric])
+        effects = np.flatnonzero(active[names.geometric :])
+        count = sum(map(len, (lengths, angles, base, turns, targets, effects)))
         return Columns(
             count,
             lengths,
             np.concatenate([angles, 3 * n + turns]),
             base,
             targets,
-            count - len(targets),
+            effects,
+            count - len(targets) - len(effects),
             len(lengths),
             len(angles),
         )
 
-    def jacobian(self, block: Block, point: Array) -> Array:
-        """Transposed derivative of points (..., k, 3, c): (..., k, p, 3, c), base axes."""
+    def jacobian(self, block: Block, point: Array, swung: Array, fields: Array) -> Array:
+        """Transposed derivative of points (..., k, 3, c): (..., k, p, 3, c), base axes.
+
+        swung: the points where effects have moved them to: a turn of the base takes both along.
+        fields: (e, k, 3, m) of the effects, at all poses.
+        """
         *batch, k, _, c = point.shape
         links = block.links
         n = links.x.shape[-3]
@@ -365,23 +397,24 @@ class Columns:
             out[..., column, :, :] = source[..., None, which % n, :, :]
         if len(self.angles):
             axis, moment = block.screws
-            still = np.zeros((*batch, 3, 3, c), dtype=point.dtype)
-            axis = np.concatenate([axis, still + np.eye(3)[..., None]], axis=-3)
-            moment = np.concatenate([moment, still], axis=-3)
-            axis, moment = axis[..., self.angles, :, :], moment[..., self.angles, :, :]
-            turned = moment[..., None, :, :, :] - kinematics.cross(
+            turns = self.angles[: self.joints]
+            axis, moment = axis[..., turns, :, :], moment[..., turns, :, :]
+            at = self.angles_at
+            out[..., at : at + self.joints, :, :] = moment[..., None, :, :, :] - kinematics.cross(
                 point[..., None, :, :], axis[..., None, :, :, :]
             )
-            at = self.angles_at
-            out[..., at : at + self.joints, :, :] = turned[..., : self.joints, :, :]
             at += self.joints + len(self.base)
-            out[..., at : self.targets_at, :, :] = turned[..., self.joints :, :, :]
+            own = np.eye(3)[self.angles[self.joints :] - 3 * n, :, None]
+            out[..., at : self.targets_at, :, :] = kinematics.cross(own, swung[..., None, :, :])
         at = self.angles_at + self.joints
         out[..., at : at + len(self.base), :, :] = np.eye(3)[self.base][..., None]
         out[..., self.targets_at :, :, :] = 0.0
         for column, which in enumerate(self.targets, start=self.targets_at):
             target, axis_number = divmod(int(which), 3)
             out[..., target, column, :, :] = links.axes[..., axis_number, :, :]
+        if len(self.effects):
+            chosen = fields[self.effects][..., block.rows]
+            out[..., self.targets_at + len(self.targets) :, :, :] = np.moveaxis(chosen, 0, 1)
         return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -27,29 +27,35 @@ class State:
 
     mdh: (..., n, 5) [m, rad].  rotation: (..., 3, 3), origin: (..., 3) [m], pose of the base.
     targets: (..., k, 3) in the last frame [m].
+    effects: (..., e) parameters of effects beyond geometry, in their own units; (0,) without any.
     """
 
     mdh: Array
     rotation: Array
     origin: Array
     targets: Array
+    effects: Array = field(default_factory=lambda: np.zeros(0))
 
     def step(self, dx: Array) -> State:
         """The state moved by dx (..., p), all parameters in the order of `Names`."""
         n, k = self.mdh.shape[-2], self.targets.shape[-2]
         batch = dx.shape[:-1]
         links = np.swapaxes(dx[..., : 5 * n].reshape(*batch, 5, n), -1, -2)
-        move, turn, shift = np.split(dx[..., 5 * n :], (3, 6), axis=-1)
+        move, turn, shift, more = np.split(dx[..., 5 * n :], (3, 6, 6 + 3 * k), axis=-1)
         return State(
             mdh=self.mdh + links,
             rotation=self.rotation @ kinematics.rotation(turn),
             origin=self.origin + (self.rotation @ move[..., None])[..., 0],
             targets=self.targets + shift.reshape(*batch, k, 3),
+            effects=self.effects + more,
         )
 
     def take(self, rows: Array) -> State:
         """Some members of a batch."""
-        return State(self.mdh[rows], self.rotation[rows], self.origin[rows], self.targets[rows])
+        some = self.effects[rows] if self.effects.ndim > 1 else self.effects
+        return State(
+            self.mdh[rows], self.rotation[rows], self.origin[rows], self.targets[rows], some
+        )
 
     def put(self, rows: Array, other: State) -> State:
         """The batch with some members replaced."""
@@ -59,14 +65,23 @@ class State:
             rotation=self.rotation.copy(),
             origin=self.origin.copy(),
             targets=self.targets.copy(),
+            effects=self.effects.copy(),
         )
         out.mdh[rows], out.rotation[rows] = other.mdh, other.rotation
         out.origin[rows], out.targets[rows] = other.origin, other.targets
+        if self.effects.ndim > 1:
+            out.effects[rows] = other.effects
         return out
 
     def batch(self) -> State:
         """A single state as a batch of one."""
-        return State(self.mdh[None], self.rotation[None], self.origin[None], self.targets[None])
+        return State(
+            self.mdh[None],
+            self.rotation[None],
+            self.origin[None],
+            self.targets[None],
+            self.effects[None],
+        )
 
     def repeat(self, count: int) -> State:
         """A single state, count times."""
@@ -75,26 +90,32 @@ class State:
 
 @dataclass(frozen=True)
 class Names:
-    """The parameters of an arm with n joints seen through some targets."""
+    """The parameters of an arm with n joints seen through some targets, and of its effects."""
 
     joints: int
     targets: tuple[str, ...]
+    effects: tuple[str, ...] = ()
 
     @property
     def all(self) -> tuple[str, ...]:
-        """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..."""
+        """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..., effects."""
         links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
         spots = [f"{target}_{axis}" for target in self.targets for axis in "xyz"]
-        return (*links, *BASE_NAMES, *spots)
+        return (*links, *BASE_NAMES, *spots, *self.effects)
 
     @property
     def count(self) -> int:
         """Number of parameters."""
+        return self.geometric + len(self.effects)
+
+    @property
+    def geometric(self) -> int:
+        """Number of parameters that are not of effects; those come first."""
         return 5 * self.joints + 6 + 3 * len(self.targets)
 
     @property
     def linear(self) -> Array:
-        """(p,) True for lengths: positions are affine in them [paper S, eq. 11]."""
+        """(p,) True for lengths and effects: positions are affine in them [paper S, eq. 11]."""
         n = self.joints
         mask = np.ones(self.count, dtype=bool)
         mask[2 * n : 5 * n] = False

@@ -1,0 +1,924 @@
+"""Measurement files with a known gap between model and robot, for the blind study of `diagnose`.
+
+A `Case` says what is wrong with an arm; `make` builds the arm, lets it be measured and keeps the
+truth; `write` leaves robot.json and data.csv for the diagnosis, and the truth in a file apart.
+
+The laws here are this file's own and share no code with the library that is judged by them: every
+deviation is finite (offsets go through the forward kinematics, links turn and bend), and they are
+evaluated with the arm's true geometry and true masses, which the robot file does not tell.
+How large an effect is, is asked for by its detectability lambda: the squared length of its
+displacement of the training points, whitened by instrument noise and by the joints' repeatability,
+after projection on what no error of the geometry could explain.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.data import Measurements, measurements, write_measurements
+from minimax_cal.files import json_text, write_whole
+from minimax_cal.kinematics import Array
+from minimax_cal.robot import Robot, load_robot
+
+G = 9.80665  # [m/s^2]
+HELD_OUT, REVISITS = 80, 15
+NOISE, NOISE_PER_METRE = 10e-6, 2.5e-6  # of each coordinate, and its growth with range [m, -]
+LENGTH, ANGLE = 0.5e-3, 1e-3  # standard deviation of the geometry's errors [m, rad]
+WRONG = 0.15  # relative error of the masses and centres that the robot file tells
+PAUSE = 30.0  # from one pose to the next [s]
+RANK = 1e-4  # singular values of the geometry that count as nothing, relative to the largest
+TURN = np.pi  # joints stay within one turn
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What the generator knows of a robot beside its geometry.
+
+    mass, com: of each link in its own frame, the tool with the last [kg, m].  ratio: of the gears
+    whose ratio the robot file tells, NaN for the others.  ripple: waves a turn of the others.
+    beams: links that may bend.  loaded: joints that carry gravity.  hot: (joint, column of the MDH
+    table) of the lengths that grow.
+    """
+
+    mass: tuple[float, ...]
+    com: tuple[tuple[float, float, float], ...]
+    ratio: tuple[float, ...]
+    ripple: tuple[float, float]
+    beams: tuple[int, ...]
+    loaded: tuple[int, ...]
+    hot: tuple[tuple[int, int], ...]
+
+
+UNKNOWN = float("nan")
+ARMS = {
+    "irb2600": Arm(
+        mass=(95.0, 52.0, 48.0, 22.0, 7.0, 14.0),
+        com=(
+            (-0.11, 0.14, 0.02),
+            (-0.44, 0.02, 0.06),
+            (-0.06, 0.03, 0.12),
+            (0.01, -0.42, 0.01),
+            (0.0, 0.01, 0.05),
+            (0.02, -0.01, 0.05),
+        ),
+        ratio=(121.0, 141.3, 105.5, UNKNOWN, UNKNOWN, UNKNOWN),
+        ripple=(17.0, 24.0),
+        beams=(2, 4),
+        loaded=(2, 3, 5),
+        hot=((1, 1), (2, 0), (4, 1)),
+    ),
+    "ur10e": Arm(
+        mass=(7.4, 13.1, 4.0, 2.1, 2.0, 4.6),
+        com=(
+            (0.0, 0.02, 0.03),
+            (0.38, 0.0, 0.16),
+            (0.24, 0.0, 0.07),
+            (0.0, 0.01, 0.02),
+            (0.0, 0.01, 0.02),
+            (0.02, -0.01, 0.03),
+        ),
+        ratio=(101.0, 101.0, 101.0, UNKNOWN, UNKNOWN, UNKNOWN),
+        ripple=(13.0, 17.0),
+        beams=(2, 3),
+        loaded=(2, 3, 4, 5),
+        hot=((1, 1), (2, 0), (3, 0)),
+    ),
+}
+
+
+# ---- what is asked for, and what comes out -----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A law of `LAWS` at a place.
+
+    power: its detectability lambda (of a fault the factor of its size, 1 as a rule).
+    variant: which of a law's forms, as once or twice a turn.
+    """
+
+    law: str
+    place: str
+    power: float
+    variant: int = 0
+
+    @property
+    def effect(self) -> str:
+        """The effect's name in the contract: a law may be a distorted form, as in name/form."""
+        return self.law.partition("/")[0]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm and its measurement, as plain data.
+
+    background: lambda of each of the small effects on all joints, 0 for none.  poses: of the
+    training, revisits apart.  jitter: of every joint at every visit [rad].  noise: factor on the
+    instrument's noise.  delete: effects that the diagnosis must do without.
+    """
+
+    robot: str
+    condition: str
+    causes: tuple[Cause, ...] = ()
+    background: float = 0.0
+    poses: int = 100
+    jitter: float = 6e-6
+    noise: float = 1.0
+    delete: tuple[str, ...] = ()
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Sealed:
+    """A measured arm: what is told, and the truth.
+
+    robot: as told, nominal geometry and wrong masses.  data: as measured.  true: the arm itself.
+    truth: (effect, place) of every cause of the case.  background: those of the background.
+    displacement: (k, m, 3) of the points by all effects, in the measurement frame [m].
+    parts: (c, k, m, 3) the same by each cause of the case alone [m].  powers: (c,) lambda of each.
+    power: lambda of all.  amplitudes: (c,) of the laws, in the law's own unit.
+    floor: RMS that the noise and the jitter alone leave on the held-out poses [m].
+    """
+
+    case: Case
+    robot: Robot
+    data: Measurements
+    true: Robot
+    truth: tuple[tuple[str, str], ...]
+    background: tuple[tuple[str, str], ...]
+    displacement: Array
+    parts: Array
+    powers: tuple[float, ...]
+    power: float
+    amplitudes: tuple[float, ...]
+    floor: float
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """An arm in its place, and its visits in their order.
+
+    robot: the arm as it is.  told: as the robot file tells it.  base: (4, 4) pose in the
+    measurement frame [m].  spots: (k, 3) targets in the flange's frame [m].  q: (m, n) commanded
+    [rad].  jitter: (m, n) [rad].  move: (m, n) last move of the joints, 0 before the first [rad].
+    time: (m,) since the start [s].  warm: time constant of the warming [s].
+    train: (m,) True where a row is for training.
+    """
+
+    robot: Robot
+    told: Robot
+    arm: Arm
+    base: Array
+    spots: Array
+    q: Array
+    jitter: Array
+    move: Array
+    time: Array
+    warm: float
+    train: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """How an arm deviates from the rigid one, at every row.
+
+    joints: (m, n) turn, in the controller's sense [rad].  lengths: (m, n, 2) of a and d [m].
+    links: (m, n, 6) rotation vector and translation of the end of a link in its frame [rad, m].
+    base, tool: (m, 6) the same of the base in the base's and of the tool in the flange's frame.
+    spots: (m, k, 3) of the targets in the flange's frame [m].
+    sight: (m, k) along the line of sight [m].  points: (m, k, 3) of what is written down [m].
+    """
+
+    joints: Array
+    lengths: Array
+    links: Array
+    base: Array
+    tool: Array
+    spots: Array
+    sight: Array
+    points: Array
+
+    def __add__(self, other: Deviation) -> Deviation:
+        return Deviation(*(a + b for a, b in zip(self.parts(), other.parts(), strict=True)))
+
+    def __mul__(self, factor: float) -> Deviation:
+        return Deviation(*(factor * part for part in self.parts()))
+
+    def parts(self) -> tuple[Array, ...]:
+        """The fields, in their order."""
+        return tuple(vars(self).values())
+
+
+def rigid(world: World) -> Deviation:
+    """No deviation."""
+    (m, n), k = world.q.shape, len(world.spots)
+    shapes = ((m, n), (m, n, 2), (m, n, 6), (m, 6), (m, 6), (m, k, 3), (m, k), (m, k, 3))
+    return Deviation(*(np.zeros(shape) for shape in shapes))
+
+
+# ---- the arm: forward kinematics, loads, geometry ----------------------------------------------
+
+
+def turn(axis: int, angle: Array) -> Array:
+    """Rotation about the axis x (0) or y (1) or z (2): (..., 4, 4)."""
+    out = np.zeros((*np.shape(angle), 4, 4), dtype=np.asarray(angle).dtype)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out[..., axis, axis] = out[..., 3, 3] = 1.0
+    out[..., i, i] = out[..., j, j] = np.cos(angle)
+    out[..., j, i] = np.sin(angle)
+    out[..., i, j] = -out[..., j, i]
+    return out
+
+
+def shift(vector: Array) -> Array:
+    """Translation: (..., 4, 4).  vector: (..., 3) [m]."""
+    out = np.zeros((*vector.shape[:-1], 4, 4), dtype=vector.dtype)
+    out[..., range(4), range(4)] = 1.0
+    out[..., :3, 3] = vector
+    return out
+
+
+def twist(six: Array) -> Array:
+    """Rotation by a vector, and translation: (m, 4, 4).  six: (m, 6) [rad, m]."""
+    out = shift(six[:, 3:])
+    out[:, :3, :3] = Rotation.from_rotvec(six[:, :3]).as_matrix()
+    return out
+
+
+def frames(robot: Robot, q: Array, deviation: Deviation | None = None) -> Array:
+    """Poses of all frames in the base, the base's own first: (m, n + 1, 4, 4) [m].
+
+    q: (m, n) [rad].  A deviation of joints, lengths and links is taken into account.
+    """
+    m = len(q)
+    pose = np.broadcast_to(np.eye(4, dtype=q.dtype), (m, 4, 4))
+    out = [pose]
+    for i, (a, d, theta, alpha, beta) in enumerate(robot.mdh):
+        dq = deviation.joints[:, i] if deviation else 0.0
+        da, dd = deviation.lengths[:, i].T if deviation else (0.0, 0.0)
+        zero = np.zeros(m)
+        step = np.stack([zero + a + da, zero, zero + d + dd], axis=-1)
+        link = turn(2, theta + robot.sign[i] * (q[:, i] + dq)) @ shift(step)
+        pose = pose @ link @ turn(0, alpha) @ turn(1, beta)
+        if deviation and deviation.links[:, i].any():
+            pose = pose @ twist(deviation.links[:, i])
+        out.append(pose)
+    return np.stack(out, axis=1)
+
+
+def measure(world: World, deviation: Deviation) -> Array:
+    """Where the instrument sees the targets, without its noise: (m, k, 3) [m]."""
+    flange = frames(world.robot, world.q + world.jitter, deviation)[:, -1]
+    pose = world.base @ twist(deviation.base) @ flange @ twist(deviation.tool)
+    spots = world.spots + deviation.spots
+    y = np.einsum("mij,mkj->mki", pose[:, :3, :3], spots) + pose[:, None, :3, 3]
+    away = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    return np.asarray(y + deviation.sight[..., None] * away + deviation.points)
+
+
+def centres(robot: Robot, pose: Array) -> Array:
+    """Centres of gravity of the links in the base: (m, n, 3) [m].  pose: as `frames`."""
+    turned = np.einsum("mnij,nj->mni", pose[:, 1:, :3, :3], robot.com)
+    return np.asarray(turned + pose[:, 1:, :3, 3])
+
+
+def load(robot: Robot, pose: Array, first: int, about: Array) -> tuple[Array, Array]:
+    """Weight of links first, first + 1, ... and its moment about points: (m, 3) each [N, N m].
+
+    first: counted from 0.  about: (m, 3) in the base [m].
+    """
+    weight = -G * robot.mass[first:, None] * robot.up
+    lever = centres(robot, pose)[:, first:] - about[:, None]
+    force = np.broadcast_to(weight.sum(axis=0), about.shape)
+    return force, np.cross(lever, weight).sum(axis=1)
+
+
+def torque(robot: Robot, q: Array) -> Array:
+    """Gravity's torque on every joint, in the controller's sense: (m, n) [N m]."""
+    pose = frames(robot, q)
+    about = [load(robot, pose, i, pose[:, i, :3, 3])[1] for i in range(robot.joints)]
+    axes = pose[:, :-1, :3, 2]
+    return np.asarray(np.sum(np.stack(about, axis=1) * axes, axis=-1) * robot.sign)
+
+
+def jacobians(world: World) -> tuple[Array, Array]:
+    """Motion of the points by the geometry's parameters, and by the joints, in the base.
+
+    Returns (m, k, 3, p) with p of theta, d, a, alpha, beta, base and targets, and (m, k, 3, n).
+    """
+    robot, k = world.robot, len(world.spots)
+    pose = frames(robot, world.q)
+    turned, origin = pose[:, :, :3, :3], pose[:, :, :3, 3]
+    points = np.einsum("mij,kj->mki", turned[:, -1], world.spots) + origin[:, -1, None]
+    z, y = turned[:, :-1, :, 2], turned[:, 1:, :, 1]
+    across = turn(2, robot.mdh[:, 2] + robot.sign * world.q)[..., :3, 0]
+    x = np.einsum("mnij,mnj->mni", turned[:, :-1], across)
+
+    def about(axis: Array, through: Array) -> Array:
+        lever = points[:, :, None] - through[:, None]
+        return np.moveaxis(np.cross(axis[:, None], lever), 2, 3)
+
+    def along(axis: Array) -> Array:
+        still = np.broadcast_to(axis[:, None], (len(axis), k, *axis.shape[1:]))
+        return np.moveaxis(still, 2, 3)
+
+    before, after = origin[:, :-1], origin[:, 1:]
+    unit = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    theta = about(z, before)
+    parts = [theta, along(z), along(x), about(x, after), about(y, after)]
+    parts += [about(unit, np.zeros_like(unit)), along(unit)]
+    for target in range(k):
+        own = np.zeros((len(points), k, 3, 3))
+        own[:, target] = turned[:, -1]
+        parts.append(own)
+    return np.concatenate(parts, axis=-1), theta * robot.sign
+
+
+# ---- detectability -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Measures displacements of the training points by what noise and geometry leave of them.
+
+    turn: (3, 3) from the measurement frame to the base.  train: (m,) rows that count.
+    white: (m', 3k, 3k) inverse root of the covariance of a row.  geometry: (3k m', r)
+    orthonormal, what errors of the geometry can explain after whitening.  floor: as `Sealed`.
+    """
+
+    turn: Array
+    train: Array
+    white: Array
+    geometry: Array
+    floor: float
+
+    def left(self, displacement: Array) -> Array:
+        """What is left of displacements (m, k, 3) after whitening and projection: (3k m',)."""
+        rows = (displacement[self.train] @ self.turn.T).reshape(len(self.white), -1)
+        flat = np.einsum("mij,mj->mi", self.white, rows).reshape(-1)
+        return np.asarray(flat - self.geometry @ (self.geometry.T @ flat))
+
+    def power(self, displacement: Array) -> float:
+        """The detectability lambda of a displacement (m, k, 3) [m]."""
+        return float(np.sum(self.left(displacement) ** 2))
+
+
+def judge(world: World, noise: Array, jitter: float) -> Judge:
+    """The measure of detectability.
+
+    noise: (m, k) standard deviation of each coordinate [m].  jitter: of a joint [rad].
+    """
+    geometry, joints = jacobians(world)
+    m, k, _, p = geometry.shape
+    bends = joints.reshape(m, 3 * k, -1)
+    variance = np.repeat(noise**2, 3, axis=1)
+    covariance = jitter**2 * bends @ bends.swapaxes(1, 2) + variance[:, :, None] * np.eye(3 * k)
+    held = covariance[~world.train]
+    floor = np.sqrt(np.trace(held, axis1=1, axis2=2).mean() / k)
+    white = np.linalg.inv(np.linalg.cholesky(covariance[world.train]))
+    columns = (white @ geometry[world.train].reshape(-1, 3 * k, p)).reshape(-1, p)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return Judge(world.base[:3, :3].T, world.train, white, u[:, s > RANK * s[0]], float(floor))
+
+
+# ---- laws: what a cause does to the arm, at amplitude 1 ----------------------------------------
+
+Law = Callable[[World, Cause, np.random.Generator], Deviation]
+
+
+def number(place: str) -> int:
+    """Index, from 0, of the joint, link or target that a place names."""
+    found = re.fullmatch(r"(?:J|L|smr)(\d+)", place)
+    if not found:
+        raise ValueError(f"place {place!r} has no number")
+    return int(found[1]) - 1
+
+
+def at_joint(world: World, joint: int, dq: Array) -> Deviation:
+    """Joint (from 0) turns by dq (m,) [rad]."""
+    joints = np.zeros(world.q.shape)
+    joints[:, joint] = dq
+    return replace(rigid(world), joints=joints)
+
+
+def at_joints(world: World, place: str, dq: Array, rng: np.random.Generator) -> Deviation:
+    """All joints turn by dq (m, n), each by a factor of its own, or the one of the place."""
+    factors = rng.uniform(0.6, 1.6, world.q.shape[1])
+    if place != "all":
+        return at_joint(world, number(place), dq[:, number(place)])
+    return replace(rigid(world), joints=dq * factors)
+
+
+def joint_compliance(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """dq = c torque [c in rad/(N m)]."""
+    return at_joints(world, cause.place, torque(world.robot, world.q), rng)
+
+
+def hardening(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Compliance that is a third at the largest torque: dq = c torque / (1 + 2 |torque| / max)."""
+    load = torque(world.robot, world.q)
+    most = np.maximum(np.abs(load).max(axis=0), 1e-9)
+    return at_joints(world, cause.place, load / (1.0 + 2.0 * np.abs(load) / most), rng)
+
+
+def link_bending(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """Cantilever of stiffness EI under all links beyond it [1/EI in 1/(N m^2)]."""
+    i = number(cause.place)
+    pose = frames(world.robot, world.q)
+    end = pose[:, i + 1, :3, 3]
+    beam = end - pose[:, i, :3, 3]
+    length = np.linalg.norm(beam, axis=1, keepdims=True)
+    along = beam / length
+    force, moment = load(world.robot, pose, i + 1, end)
+    slope = length**2 / 2.0 * np.cross(along, force) + length * moment
+    lateral = force - along * np.sum(along * force, axis=1, keepdims=True)
+    sag = length**3 / 3.0 * lateral + length**2 / 2.0 * np.cross(moment, along)
+    links = np.zeros((*world.q.shape, 6))
+    inward = pose[:, i + 1, :3, :3].swapaxes(1, 2)
+    links[:, i, :3] = np.einsum("mij,mj->mi", inward, slope)
+    links[:, i, 3:] = np.einsum("mij,mj->mi", inward, sag)
+    return replace(rigid(world), links=links)
+
+
+def gravity_compensator(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A spring from the base to the link turns its joint: dq = k a L sin(q - phi) (1 - s0/s)."""
+    i = number(cause.place)
+    a, arm = rng.uniform(0.2, 0.3), rng.uniform(0.5, 0.6)
+    rest = rng.uniform(0.4, 0.95) * (arm - a)  # always in tension, shortest near upright
+    angle = world.q[:, i] - rng.normal(0.0, 0.2)
+    spring = np.sqrt(a**2 + arm**2 - 2.0 * a * arm * np.cos(angle))
+    return at_joint(world, i, a * arm * np.sin(angle) * (1.0 - rest / spring))
+
+
+def wave(world: World, cause: Cause, times: float, rng: np.random.Generator) -> Deviation:
+    """dq = sin(times q + phase)."""
+    i = number(cause.place)
+    return at_joint(world, i, np.sin(times * world.q[:, i] + rng.uniform(0.0, 2.0 * np.pi)))
+
+
+def gear_error(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Eccentricity: once or twice a turn of the joint [amplitude in rad]."""
+    return wave(world, cause, turns(world.arm, cause), rng)
+
+
+def gear_between(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A wave of 1.3 a turn: neither once nor twice [amplitude in rad]."""
+    return wave(world, cause, 1.3, rng)
+
+
+def gear_ripple(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A wave at the gear ratio or twice it, or where the file tells none at some other number."""
+    return wave(world, cause, turns(world.arm, cause), rng)
+
+
+def turns(arm: Arm, cause: Cause) -> float:
+    """Waves a turn of a gear's error, by the cause's variant."""
+    twice = cause.variant % 2
+    if cause.effect == "gear_error":
+        return (1.0, 2.0)[twice]
+    ratio = arm.ratio[number(cause.place)]
+    return ratio * (1.0, 2.0)[twice] if np.isfinite(ratio) else arm.ripple[twice]
+
+
+def encoder_gain(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """dq = g q."""
+    return at_joint(world, number(cause.place), world.q[:, number(cause.place)])
+
+
+DRIVEN_BY = {"J3": 2, "J5": 4, "J6": 5}  # the joint whose motor moves another joint
+
+
+def joint_coupling(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """dq_j = c q_i."""
+    return at_joint(world, number(cause.place), world.q[:, DRIVEN_BY[cause.place] - 1])
+
+
+def backlash(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """dq = b sign(last move) [half the play, rad]."""
+    return at_joint(world, number(cause.place), np.sign(world.move[:, number(cause.place)]))
+
+
+def travel_backlash(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """Play that grows with the distance of the last move."""
+    move = world.move[:, number(cause.place)]
+    return at_joint(world, number(cause.place), np.sign(move) * (0.3 + np.abs(move) / np.pi))
+
+
+def settling(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A rest of the last move is still to come: dq = -e (q_n - q_(n-1))."""
+    return at_joints(world, cause.place, -world.move, rng)
+
+
+def thermal_growth(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """Lengths grow by strain (1 - exp(-t / tau))."""
+    tau = world.warm * rng.uniform(0.8, 1.25)
+    lengths = np.zeros((*world.q.shape, 2))
+    for joint, column in world.arm.hot:
+        nominal = world.robot.mdh[joint - 1, column]
+        lengths[:, joint - 1, column] = nominal * -np.expm1(-world.time / tau)
+    return replace(rigid(world), lengths=lengths)
+
+
+def base_flex(world: World, _: Cause, __: np.random.Generator) -> Deviation:
+    """The foot turns by C times the overturning moment [rad/(N m)]."""
+    pose = frames(world.robot, world.q)
+    up = world.robot.up
+    moment = load(world.robot, pose, 0, np.zeros((len(pose), 3)))[1]
+    base = np.zeros((len(pose), 6))
+    base[:, :3] = moment - np.outer(moment @ up, up)
+    return replace(rigid(world), base=base)
+
+
+def frame_drift(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Base against instrument, in proportion to time or slowing down [m at the end]."""
+    share = world.time / world.time.max()
+    slowing = -np.expm1(-3.0 * share)
+    course = slowing if cause.variant % 2 else share
+    direction = np.concatenate([rng.normal(size=3) * 0.5, rng.normal(size=3)])
+    return replace(rigid(world), base=np.outer(course, direction))
+
+
+def tool_flex(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """The bracket tips towards gravity about its foot, and sags along its axis [rad]."""
+    flange = frames(world.robot, world.q)[:, -1, :3, :3]
+    down = -np.einsum("mij,i->mj", flange, world.robot.up)
+    tool = np.zeros((len(down), 6))
+    tool[:, :3] = np.cross([0.0, 0.0, 1.0], down)
+    tool[:, 5] = rng.uniform(0.02, 0.06) * down[:, 2]
+    return replace(rigid(world), tool=tool)
+
+
+def target_offset(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """A target, or all, are seen too far along the line of sight [m]."""
+    sight = np.zeros((len(world.q), len(world.spots)))
+    sight[:, slice(None) if cause.place == "all" else number(cause.place)] = 1.0
+    return replace(rigid(world), sight=sight)
+
+
+def target_shift(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A nest moves on the flange after some visit [m]."""
+    m, k = len(world.q), len(world.spots)
+    spots = np.zeros((m, k, 3))
+    way = rng.normal(size=3)
+    spots[round(m * rng.uniform(0.3, 0.7)) :, number(cause.place)] = way / np.linalg.norm(way)
+    return replace(rigid(world), spots=spots)
+
+
+def outliers(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """Three points in a hundred are off by 0.3 to 1 [amplitude 1 mm makes that millimetres]."""
+    m, k = len(world.q), len(world.spots)
+    points = np.zeros((m * k, 3))
+    chosen = rng.choice(m * k, max(2, round(0.03 * m * k)), replace=False)
+    way = rng.normal(size=(len(chosen), 3))
+    size = rng.uniform(0.3, 1.0, (len(chosen), 1))
+    points[chosen] = size * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return replace(rigid(world), points=points.reshape(m, k, 3))
+
+
+def swapped_rows(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """Two pairs of training rows hold each other's points [amplitude 1 swaps them whole]."""
+    y = measure(world, rigid(world))
+    rows = rng.choice(np.flatnonzero(world.train), 4, replace=False)
+    points = np.zeros_like(y)
+    points[rows] = y[rows[[1, 0, 3, 2]]] - y[rows]
+    return replace(rigid(world), points=points)
+
+
+def two(world: World, cause: Cause, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Joint values (m,) of the place's joint and of another [rad]."""
+    others = [i for i in range(world.q.shape[1]) if i != number(cause.place)]
+    return world.q[:, number(cause.place)], world.q[:, rng.choice(others)]
+
+
+def outside_sum(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """dq_j = sin(q_j + q_i + phase)."""
+    own, other = two(world, cause, rng)
+    return at_joint(world, number(cause.place), np.sin(own + other + rng.uniform(0.0, 2.0 * np.pi)))
+
+
+def outside_product(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """dq_j = q_i q_j."""
+    own, other = two(world, cause, rng)
+    return at_joint(world, number(cause.place), own * other)
+
+
+def outside_waves(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """dq_j = sin(5 q_j + phase) sin(5 q_i + phase)."""
+    own, other = two(world, cause, rng)
+    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    dq = np.sin(5.0 * own + phase[0]) * np.sin(5.0 * other + phase[1])
+    return at_joint(world, number(cause.place), dq)
+
+
+def outside_step(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """dq_j jumps where q_j passes an angle in the middle of its range."""
+    own = world.q[:, number(cause.place)]
+    return at_joint(
+        world, number(cause.place), 1.0 * (own > np.quantile(own, rng.uniform(0.3, 0.7)))
+    )
+
+
+def outside_cubic(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """dq_j = (torque / its largest)^3."""
+    load = torque(world.robot, world.q)[:, number(cause.place)]
+    return at_joint(world, number(cause.place), (load / np.abs(load).max()) ** 3)
+
+
+def outside_field(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """The flange is moved by a smooth random field over the first three joints."""
+    waves = rng.normal(0.0, 1.5, (3, 12))
+    phase, weight = rng.uniform(0.0, 2.0 * np.pi, 12), rng.normal(size=(12, 3))
+    base = np.zeros((len(world.q), 6))
+    base[:, 3:] = np.cos(world.q[:, :3] @ waves + phase) @ weight
+    return replace(rigid(world), base=base)
+
+
+LAWS: dict[str, Law] = {
+    "joint_compliance": joint_compliance,
+    "joint_compliance/hardening": hardening,
+    "link_bending": link_bending,
+    "gravity_compensator": gravity_compensator,
+    "gear_error": gear_error,
+    "gear_error/between": gear_between,
+    "gear_ripple": gear_ripple,
+    "encoder_gain": encoder_gain,
+    "joint_coupling": joint_coupling,
+    "backlash": backlash,
+    "backlash/travel": travel_backlash,
+    "settling": settling,
+    "thermal_growth": thermal_growth,
+    "base_flex": base_flex,
+    "frame_drift": frame_drift,
+    "tool_flex": tool_flex,
+    "target_offset": target_offset,
+    "target_shift": target_shift,
+    "outliers": outliers,
+    "swapped_rows": swapped_rows,
+    "outside_sum": outside_sum,
+    "outside_product": outside_product,
+    "outside_waves": outside_waves,
+    "outside_step": outside_step,
+    "outside_cubic": outside_cubic,
+    "outside_field": outside_field,
+}
+FAULTS = {"outliers": 1e-3, "swapped_rows": 1.0}  # amplitude at power 1: they have no lambda
+EFFECTS = tuple(law for law in LAWS if "/" not in law and "outside" not in law)
+OUTSIDE = tuple(law for law in LAWS if "outside" in law)
+DISTORTED = tuple(law for law in LAWS if "/" in law)
+JOINTS = tuple(f"J{i}" for i in range(1, 7))
+
+
+def places(law: str, robot: str) -> tuple[str, ...]:
+    """Where a law can be on a robot."""
+    arm, effect = ARMS[robot], law.partition("/")[0]
+    loaded = tuple(f"J{i}" for i in arm.loaded)
+    targets = ("smr1", "smr2", "smr3")
+    some = {
+        "joint_compliance": (*loaded, "all"),
+        "link_bending": tuple(f"L{i}" for i in arm.beams),
+        "gravity_compensator": ("J2",) if robot == "irb2600" else (),
+        "joint_coupling": tuple(DRIVEN_BY),
+        "settling": ("all", "J1", "J3", "J5"),
+        "thermal_growth": ("all",),
+        "base_flex": ("frame",),
+        "frame_drift": ("frame",),
+        "tool_flex": ("all",),
+        "target_offset": (*targets, "all"),
+        "target_shift": targets,
+        "outliers": ("all",),
+        "swapped_rows": ("all",),
+        "outside_cubic": loaded,
+        "outside_field": ("all",),
+    }
+    return some.get(effect, JOINTS)
+
+
+def spec(robot: str, cause: Cause) -> str:
+    """The cause as `calibrate` takes effects, as gear_error:J2:turns=1."""
+    choice = ""
+    if cause.effect.startswith("gear_"):
+        choice = f":turns={turns(ARMS[robot], cause):g}"
+    elif cause.effect == "joint_coupling":
+        choice = f":source={DRIVEN_BY[cause.place]}"
+    return f"{cause.effect}:{cause.place}{choice}"
+
+
+# ---- building a case ---------------------------------------------------------------------------
+
+
+def told_robot(name: str) -> Robot:
+    """The robot of the file that is given to the diagnosis."""
+    arm = ARMS[name]
+    nominal = load_robot(name)
+    ratio, mass, com = (np.array(value) for value in (arm.ratio, arm.mass, arm.com))
+    return replace(nominal, ratio=ratio, mass=mass, com=com)
+
+
+def true_robot(told: Robot, rng: np.random.Generator) -> Robot:
+    """The arm itself: errors of its geometry, and other masses and centres than told."""
+    n = told.joints
+    mdh = told.mdh + rng.normal(size=(n, 5)) * ([LENGTH] * 2 + [ANGLE] * 3)
+    factor = 1.0 + WRONG * np.clip(rng.normal(size=n), -2.5, 2.5)
+    way = rng.normal(size=(n, 3))
+    off = np.linalg.norm(told.com, axis=1, keepdims=True) * WRONG
+    com = told.com + off * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return replace(told, mdh=mdh, mass=told.mass * factor, com=com)
+
+
+def some_poses(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Joint values (count, n) over the range within one turn, the flange above the floor [rad]."""
+    lower, upper = np.maximum(robot.lower, -TURN), np.minimum(robot.upper, TURN)
+    found = np.zeros((0, robot.joints))
+    while len(found) < count:
+        q = rng.uniform(lower, upper, (2 * count, robot.joints))
+        height = frames(robot, q)[:, -1, :3, 3] @ robot.up
+        found = np.concatenate([found, q[height > 0.15]])
+    return found[:count]
+
+
+def some_base(rng: np.random.Generator) -> Array:
+    """Pose of the robot's foot in the instrument's frame: (4, 4) [m]."""
+    away, side = rng.uniform(2.5, 4.0), rng.uniform(-np.pi, np.pi)
+    base = np.eye(4)
+    base[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    down = base[:3, 2] * rng.uniform(-1.5, -0.5)
+    flat = base[:3, :2] @ [np.cos(side), np.sin(side)]
+    base[:3, 3] = down + flat * np.sqrt(away**2 - down @ down)
+    return base
+
+
+def some_spots(rng: np.random.Generator) -> Array:
+    """Three targets about 0.1 to 0.15 m off the flange's axis, in no symmetry: (3, 3) [m]."""
+    angle = np.array([0.0, 1.7, 3.9]) + rng.uniform(-0.3, 0.3, 3) + rng.uniform(0.0, 2.0 * np.pi)
+    radius, height = rng.uniform(0.1, 0.15, 3), rng.uniform(0.02, 0.1, 3)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """Every row of a session in its order: joints (m, n) [rad], train (m,), time (m,) [s]."""
+
+    q: Array
+    train: Array
+    time: Array
+
+
+def visits(robot: Robot, poses: int, rng: np.random.Generator) -> Visits:
+    """Training poses, revisits of some of them and held-out poses, in one random order."""
+    q = some_poses(robot, poses + HELD_OUT, rng)
+    again = rng.choice(poses, REVISITS, replace=False)
+    pose = rng.permutation(np.concatenate([np.arange(poses + HELD_OUT), again]))
+    time = np.cumsum(PAUSE * rng.uniform(0.7, 1.3, len(pose)))
+    return Visits(q[pose], pose < poses, time - time[0])
+
+
+def world_of(case: Case, rng: np.random.Generator) -> World:
+    """The arm in its place with all its visits."""
+    told = told_robot(case.robot)
+    session = visits(told, case.poses, rng)
+    move = np.zeros_like(session.q)
+    move[1:] = np.diff(session.q, axis=0)
+    return World(
+        robot=true_robot(told, rng),
+        told=told,
+        arm=ARMS[case.robot],
+        base=some_base(rng),
+        spots=some_spots(rng),
+        q=session.q,
+        jitter=case.jitter * rng.normal(size=session.q.shape),
+        move=move,
+        time=session.time,
+        warm=rng.uniform(1000.0, 3000.0),
+        train=session.train,
+    )
+
+
+def sized(world: World, measure_of: Judge, cause: Cause, unit: Deviation) -> float:
+    """Amplitude at which a law's deviation has the detectability that is asked for.
+
+    Laws are nearly linear in it: a few corrections reach it to rounding.
+    """
+    if cause.law in FAULTS or cause.power == 0.0:
+        return FAULTS.get(cause.law, 1.0) * cause.power
+    still = measure(world, rigid(world))
+    amplitude = 1e-6 / max(float(np.abs(part).max()) for part in unit.parts())
+    for _ in range(5):
+        power = measure_of.power(measure(world, unit * amplitude) - still)
+        if not power > 0.0:
+            raise ValueError(f"{cause.law} at {cause.place} moves nothing that geometry does not")
+        amplitude *= np.sqrt(cause.power / power)
+    return float(amplitude)
+
+
+def small_effects(case: Case, rng: np.random.Generator) -> tuple[Cause, ...]:
+    """The background: a small effect of random kind on every joint."""
+    kinds = ("gear_error", "encoder_gain", "backlash", "joint_compliance")
+    named = {(cause.effect, cause.place) for cause in case.causes}
+
+    def one(place: str) -> Cause:
+        free = [k for k in kinds if place in places(k, case.robot) and (k, place) not in named]
+        return Cause(str(rng.choice(free)), place, case.background, int(rng.integers(2)))
+
+    return tuple(map(one, JOINTS)) if case.background > 0.0 else ()
+
+
+def make(case: Case) -> Sealed:
+    """Build the arm of a case and measure it."""
+    rng = np.random.default_rng(case.seed)
+    world = world_of(case, rng)
+    still = measure(world, rigid(world))
+    away = np.linalg.norm(still, axis=-1)
+    spread = case.noise * (NOISE + NOISE_PER_METRE * away)
+    ruler = judge(world, spread, case.jitter)
+    small = small_effects(case, rng)
+    whole, parts, amplitudes = rigid(world), [], []
+    for cause in (*case.causes, *small):
+        unit = LAWS[cause.law](world, cause, rng)
+        amplitudes.append(sized(world, ruler, cause, unit))
+        whole += unit * amplitudes[-1]
+        parts.append(measure(world, unit * amplitudes[-1]) - still)
+    y = measure(world, whole)
+    noisy = y + spread[..., None] * rng.normal(size=y.shape)
+    count = len(case.causes)
+    shape = (count, len(world.spots), len(y), 3)
+    return Sealed(
+        case=case,
+        robot=world.told,
+        data=measured(world, case, noisy, rng),
+        true=world.robot,
+        truth=tuple((cause.effect, cause.place) for cause in case.causes),
+        background=tuple((cause.effect, cause.place) for cause in small),
+        displacement=np.moveaxis(y - still, 1, 0),
+        parts=np.array([np.moveaxis(part, 1, 0) for part in parts[:count]]).reshape(shape),
+        powers=tuple(ruler.power(part) for part in parts[:count]),
+        power=ruler.power(y - still),
+        amplitudes=tuple(amplitudes[:count]),
+        floor=ruler.floor,
+    )
+
+
+def measured(world: World, case: Case, y: Array, rng: np.random.Generator) -> Measurements:
+    """What stands in the file.  y: (m, k, 3) with its noise [m]."""
+    warm = -6.0 * np.expm1(-world.time / world.warm)
+    _, same = np.unique(world.q, axis=0, return_inverse=True)
+    names = np.array([f"p{i + 1:03d}" for i in rng.permutation(same.max() + 1)])
+    return measurements(
+        world.q,
+        y,
+        order=np.arange(len(y), dtype=float),
+        time=np.round(world.time, 1),
+        temperature=np.round(21.0 + warm + 0.1 * rng.normal(size=len(y)), 2),
+        pose=names[same.reshape(-1)],
+        split=np.where(world.train, "train", "holdout"),
+    )
+
+
+# ---- files -------------------------------------------------------------------------------------
+
+ROBOT, DATA, TRUTH = "robot.json", "data.csv", "sealed/truth.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a seal held: the fields of `Sealed` of the same names."""
+
+    truth: tuple[tuple[str, str], ...]
+    background: tuple[tuple[str, str], ...]
+    displacement: Array
+    parts: Array
+    powers: tuple[float, ...]
+    power: float
+    amplitudes: tuple[float, ...]
+    floor: float
+
+
+def write(sealed: Sealed, folder: Path) -> None:
+    """Leave robot.json and data.csv for the diagnosis, and the truth in a folder apart."""
+    (folder / TRUTH).parent.mkdir(parents=True, exist_ok=True)
+    sealed.robot.save(folder / ROBOT)
+    write_measurements(folder / DATA, sealed.data)
+    content: dict[str, Any] = {name: getattr(sealed, name) for name in Truth.__annotations__}
+    for name in ("displacement", "parts"):
+        content[name] = content[name].tolist()
+    write_whole(folder / TRUTH, json_text(content))
+
+
+def open_seal(folder: Path) -> Truth:
+    """The truth that `write` left."""
+    content = json.loads((folder / TRUTH).read_text("utf-8"))
+    for name in ("truth", "background"):
+        content[name] = tuple((effect, place) for effect, place in content[name])
+    for name in ("displacement", "parts"):
+        content[name] = np.array(content[name], dtype=float)
+    for name in ("powers", "amplitudes"):
+        content[name] = tuple(content[name])
+    return Truth(**content)
