@@ -19,6 +19,7 @@ from minimax_cal.data import Measurements, groups, read_measurements, split
 from minimax_cal.effects.table import Fitted, Term, names_of
 from minimax_cal.effects.table import terms as terms_of
 from minimax_cal.errors import DataError, OptionError
+from minimax_cal.evidence import best_variant
 from minimax_cal.extend import extended, fitted, scene_of
 from minimax_cal.history import with_history
 from minimax_cal.identify import Identification
@@ -34,6 +35,7 @@ from minimax_cal.model import (
     pose_weights,
     with_poses,
 )
+from minimax_cal.noise import linearised
 from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares, minimax
@@ -311,8 +313,10 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     terms: tuple[Term, ...] = ()
     if options.effects:
         report("effects")
-        scene = scene_of(robot, data, model, squares.x.take(np.array(0)))
-        terms = terms_of(scene, options.effects)
+        here = squares.x.take(np.array(0))
+        scene = scene_of(robot, data, model, here)
+        rows = linearised(model, here, scene.slope)
+        terms = terms_of(scene, options.effects, partial(best_variant, scene, rows))
         known_ones = np.isfinite(sigma)
         for _ in range(PASSES):
             model, begin = extended(

@@ -17,11 +17,15 @@ from minimax_cal import gates
 from minimax_cal.calibrate import POOR_FIT, Options, calibrate
 from minimax_cal.cell import evaluate, load_cell
 from minimax_cal.data import read_measurements, write_measurements
+from minimax_cal.diagnose import diagnose
 from minimax_cal.errors import CalibrationError, OptionError
 from minimax_cal.figures import PICTURES, save_errors
 from minimax_cal.files import check_writable, json_text, write_whole
+from minimax_cal.history import with_history
 from minimax_cal.kinematics import MDH_NAMES
+from minimax_cal.pictures import save_diagnosis
 from minimax_cal.robot import builtin_robots, load_robot
+from minimax_cal.sheets import closing_tables, effects_list, effects_table, where_tables
 from minimax_cal.simulate import Truth, simulate
 from minimax_cal.solvers.least_squares import METHODS
 from minimax_cal.solvers.status import Status
@@ -68,6 +72,29 @@ JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
 QUIET = click.option("--quiet", "-q", is_flag=True, help="No notices and no progress on stderr.")
+HOLDOUT = click.option(
+    "--holdout",
+    type=float,
+    default=DEFAULTS.holdout,
+    show_default=True,
+    help="Share of the poses kept out of the fit; a split column overrides it.",
+)
+SEED = click.option(
+    "--seed",
+    type=int,
+    default=DEFAULTS.seed,
+    show_default=True,
+    help="Seed of the choice of held-out poses.",
+)
+
+
+def figure_option(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The option --figure."""
+    return click.option(
+        "--figure",
+        type=click.Path(path_type=Path),
+        help=f"Draw {what} to this PNG, SVG or PDF.",
+    )
 
 
 def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -87,20 +114,8 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     help="sum, minimax (worst target), point (worst point), pose, or one target: smr:K.",
 )
 @click.option("--qp", default=DEFAULTS.qp, show_default=True, help="QP backend of minimax.")
-@click.option(
-    "--holdout",
-    type=float,
-    default=DEFAULTS.holdout,
-    show_default=True,
-    help="Share of the poses kept out of the fit; a split column overrides it.",
-)
-@click.option(
-    "--seed",
-    type=int,
-    default=DEFAULTS.seed,
-    show_default=True,
-    help="Seed of the choice of held-out poses.",
-)
+@HOLDOUT
+@SEED
 @click.option("--fix", multiple=True, help="Parameters to keep nominal, as d2,beta*.")
 @click.option("--free", multiple=True, help="Parameters to prefer among redundant ones.")
 @click.option(
@@ -108,6 +123,12 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     multiple=True,
     metavar="NAME=SIGMA",
     help="Known tolerance of a parameter about its nominal value, as a*=0.5mm.",
+)
+@click.option(
+    "--effects",
+    multiple=True,
+    metavar="NAME:PLACE",
+    help="Fit these too, as joint_compliance:all,backlash:J6; `minimax-cal effects` lists them.",
 )
 @click.option(
     "--method",
@@ -139,11 +160,7 @@ def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     metavar="MM",
     help="How far a distance between targets may be off [default: as measured].",
 )
-@click.option(
-    "--figure",
-    type=click.Path(path_type=Path),
-    help="Draw the errors before and after to this PNG, SVG or PDF.",
-)
+@figure_option("the errors before and after")
 @JSON
 @output("the result (JSON)")
 @QUIET
@@ -153,6 +170,7 @@ def calibrate_command(
     prior: Sequence[str],
     fix: Sequence[str],
     free: Sequence[str],
+    effects: Sequence[str],
     lever: float | None,
     distance_tolerance: float | None,
     figure: Path | None,
@@ -174,6 +192,7 @@ def calibrate_command(
             data,
             fix=names_of(fix),
             free=names_of(free),
+            effects=names_of(effects),
             priors=dict(map(prior_of, prior)),
             distance_tolerance=millimetres * 1e-3,
             lever=float("nan") if lever is None else lever * 1e-3,
@@ -194,6 +213,82 @@ def calibrate_command(
     if fit.status is not Status.CONVERGED:
         click.echo(f"error: {fit.status}: {fit.status.advice}", err=True)
         return FAILED
+    return 0
+
+
+@cli.command(name="diagnose")
+@ROBOT
+@DATA
+@HOLDOUT
+@SEED
+@click.option(
+    "--without",
+    multiple=True,
+    metavar="EFFECT",
+    help="Do not consider this effect; `minimax-cal effects` lists them.",
+)
+@figure_option("the gap and where it lies")
+@JSON
+@output("the diagnosis (JSON)")
+@QUIET
+def diagnose_command(
+    robot: str,
+    data: Path,
+    holdout: float,
+    seed: int,
+    without: Sequence[str],
+    figure: Path | None,
+    as_json: bool,
+    output: Path | None,
+    quiet: bool,
+) -> int:
+    """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
+    if output:
+        check_writable(output)
+    if figure:
+        check_writable(figure, PICTURES)
+    notes = Console(stderr=True, quiet=quiet, highlight=False)
+    with notes.status("reading") as status:
+        found = diagnose(
+            robot,
+            data,
+            seed=seed,
+            holdout=holdout,
+            exclude=names_of(without),
+            report=status.update,
+        )
+    for notice in found.notices:
+        notes.print(f"notice: {notice}", markup=False, soft_wrap=True)
+    if output:
+        found.save(output)
+    if figure:
+        save_diagnosis(found, figure)
+    if as_json:
+        click.echo(found.json(), nl=False)
+    else:
+        terminal().print(found.headline(), markup=False)
+        show(*found.tables(), *where_tables(found.where), *closing_tables(found))
+    return 0
+
+
+@cli.command(name="effects")
+@click.argument("robot", required=False)
+@click.argument("data", type=click.Path(path_type=Path), required=False)
+@JSON
+def effects_command(robot: str | None, data: Path | None, as_json: bool) -> int:
+    """The library of effects; with ROBOT and DATA, where these measurements can test them."""
+    scene = None
+    if robot is not None:
+        if data is None:
+            raise OptionError("effects needs both ROBOT and DATA, or neither")
+        measured = with_history(read_measurements(data))
+        fit = calibrate(robot, measured, objective="sum", holdout=0.0)
+        scene = fit.cell.scene(measured)
+    entries = effects_list(scene)
+    if as_json:
+        click.echo(json_text({"schema": 1, "effects": entries}), nl=False)
+    else:
+        show(effects_table(entries))
     return 0
 
 
@@ -353,11 +448,15 @@ def robots_command(as_json: bool) -> int:
     return 0
 
 
-def show(*tables: Table) -> None:
-    """Print tables on stdout, as wide as the terminal, or 110 columns elsewhere."""
+def terminal() -> Console:
+    """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=110)
+    return console if console.is_terminal else Console(highlight=False, width=110)
+
+
+def show(*tables: Table) -> None:
+    """Print tables on stdout."""
+    console = terminal()
     for table in tables:
         console.print(table.rich())
 
@@ -378,6 +477,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         context = getattr(error, "ctx", None)
         hint = f" (see {context.command_path} --help)" if context else ""
         code = complain(error.format_message() + hint)
+    except np.linalg.LinAlgError as error:
+        code = complain(f"the numbers did not work out ({error}): more poses may help", FAILED)
     except (KeyboardInterrupt, click.Abort):
         code = complain("interrupted", 130)
     except OSError as error:

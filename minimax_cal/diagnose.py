@@ -23,10 +23,10 @@ from minimax_cal.extend import refitted, scene_of
 from minimax_cal.faults import Fault, find_faults, looks_read_back, mended
 from minimax_cal.history import with_history
 from minimax_cal.kinematics import Array
-from minimax_cal.metrics import accuracy
+from minimax_cal.metrics import Accuracy, accuracy
 from minimax_cal.mixups import misplaced, put_right
 from minimax_cal.model import Model, model_of
-from minimax_cal.noise import Noise, Rows, rows_of
+from minimax_cal.noise import Noise, Rows, linearised
 from minimax_cal.rivals import resemblances, rivals
 from minimax_cal.robot import Robot, load_robot
 from minimax_cal.structure import Trace, rest_of, structure
@@ -34,11 +34,12 @@ from minimax_cal.where import where
 from minimax_cal.words import reasons
 
 LEVEL = 0.01  # chance that noise alone is called structure
-MATTERS = 0.01  # share of what was explained below which more structure is of no account
+MATTERS = 0.015  # share of what was explained below which more structure is of no account
 OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
 REVISITS = 5  # repeated poses that tell a noise floor
 RESAMPLES = 1000
 SUM = Options(objective="sum")
+ANY: Array = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +56,13 @@ class Study:
     scene: Scene
     rows: Rows
 
-    def cell(self, data: Measurements, terms: Sequence[Term] = ()) -> Cell:
-        """Geometry and effects fitted to some poses, from the fit of the training poses."""
+    def cell(self, data: Measurements, terms: Sequence[Term] = (), usual: Array = ANY) -> Cell:
+        """Geometry and effects fitted to some poses, from the fit of the training poses.
+
+        usual: (e,) size of the effects' parameters, where the poses may not tell them.
+        """
         active = self.fit.identification.active
-        state, effects = refitted(self.robot, data, self.fit.state, active, terms)
+        state, effects = refitted(self.robot, data, self.fit.state, active, terms, usual)
         return Cell.of(self.robot, state, self.data.targets, effects)
 
     @property
@@ -76,11 +80,7 @@ def studied(robot: Robot, data: Measurements, fit: Fit) -> Study:
     """A geometric fit linearised."""
     model, state = model_of(robot, data), fit.state
     scene = scene_of(robot, data, model, state)
-    error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
-    jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
-    return Study(
-        robot, data, model, fit, scene, rows_of(error, jacobian, scene.slope, model.weight)
-    )
+    return Study(robot, data, model, fit, scene, linearised(model, state, scene.slope))
 
 
 def diagnose(
@@ -126,10 +126,14 @@ def diagnose(
     report("gap ladder")
     wrong = [*faults, *read_back]
     steps, cells, raw_error = ladder(robot, raw, study, held, wrong, effects, seed, holdout)
-    floor, source = noise_floor(study.rows, choice.noise, sound, cells[-1])
+    floor, source = noise_floor(study.rows, choice.noise, sound, cells[-1], steps[-1].train)
     findings = with_shares([*fault_findings(wrong), *effects], steps, floor)
     closed, interval = closed_share(raw_error, cells[-1].error(held), floor, seed)
-    verdict, rest = judged(findings, choice, traces)
+    none = np.zeros((len(study.rows.error), 0))
+    without, with_all = (
+        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
+    )
+    verdict, rest = judged(findings, traces, without - with_all)
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = study.fit.state.rotation, study.fit.state.origin
     lies = where(
@@ -153,7 +157,7 @@ def diagnose(
         floor_from=source,
         closed=closed,
         closed_ci=interval,
-        blocked=blocked(study, sound, [term for found in effects for term in found.terms]),
+        blocked=blocked(study, sound, cells[-1]),
         noise=float(np.sqrt(choice.noise.variance)),
         jitter=choice.noise.jitter,
         structure=rest[1],
@@ -252,12 +256,22 @@ def fault_findings(faults: Sequence[Fault]) -> list[Finding]:
 
 
 def by_weight(study: Study, choice: Choice) -> list[int]:
-    """The effects by how far they move the points beyond what geometry would follow."""
-    weight = []
-    for one in choice.fits:
-        field = choice.library.columns[:, one.candidate.main] @ one.value
-        weight.append(float(((field - study.rows.basis @ (study.rows.basis.T @ field)) ** 2).sum()))
-    return [int(i) for i in np.argsort(weight)[::-1]]
+    """The effects in the order in which each takes most of what is left, points weighing alike."""
+    rows, columns = study.rows, choice.library.columns
+    fields = [columns[:, one.candidate.main] for one in choice.fits]
+    fields = [field - rows.basis @ (rows.basis.T @ field) for field in fields]
+    rest, order = rows.error, []
+    waiting = list(range(len(fields)))
+    taken = np.zeros((len(rest), 0))
+    while waiting:
+        left = []
+        for i in waiting:
+            basis = np.linalg.qr(np.concatenate([taken, fields[i]], axis=1))[0]
+            left.append(float(((rest - basis @ (basis.T @ rest)) ** 2).sum()))
+        best = waiting.pop(int(np.argmin(left)))
+        taken = np.concatenate([taken, fields[best]], axis=1)
+        order.append(best)
+    return order
 
 
 def finding(one: Added, table: Bench) -> Finding:
@@ -317,12 +331,14 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def judged(
-    findings: Sequence[Finding], choice: Choice, traces: Sequence[Trace]
+    findings: Sequence[Finding], traces: Sequence[Trace], explained: float
 ) -> tuple[str, tuple[str, float]]:
-    """The verdict; where what remains has structure, and the probability of that by chance."""
+    """The verdict; where what remains has structure, and the probability of that by chance.
+
+    explained: weighed square that the effects explain; structure far below it is of no account.
+    """
     worst = min(traces, key=lambda trace: trace.p)
     p = min(1.0, worst.p * len(traces))
-    explained = sum(found.size for found in findings if np.isfinite(found.size))
     loud = [t for t in traces if t.p * len(traces) < LEVEL and t.excess > MATTERS * explained]
     if loud:
         return "unknown", (min(loud, key=lambda t: t.p).name, p)
@@ -410,14 +426,17 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
     return sorted(out, key=lambda f: -f.share if np.isfinite(f.share) else -np.inf)
 
 
-def noise_floor(rows: Rows, noise: Noise, data: Measurements, cell: Cell) -> tuple[float, str]:
+def noise_floor(
+    rows: Rows, noise: Noise, data: Measurements, cell: Cell, fitted: Accuracy
+) -> tuple[float, str]:
     """RMS distance that noise alone leaves [mm], and how it is known.
 
     From poses visited again, with the effects of time and approach taken out, where there are
     enough; from the noise of the final fit where that is less, because nobody repeats better.
+    Where the fit still has structure it is an upper bound.  fitted: of the final fit.
     """
     spread = noise.variance * (1.0 + noise.ratio * rows.stretch).sum() / max(rows.count, 1)
-    model = 1e3 * float(np.sqrt(3.0 * spread))
+    model = min(1e3 * float(np.sqrt(3.0 * spread)), fitted.rms_mm)
     group = groups(data)
     error = np.moveaxis(cell.error(data), 1, 0).reshape(data.poses, -1)
     total, freedom, again = 0.0, 0, 0
@@ -466,18 +485,20 @@ def closed_share(
     return float(share(*(part.sum(axis=1) for part in sums))), (float(low), float(high))
 
 
-def blocked(study: Study, data: Measurements, terms: Sequence[Term]) -> dict[str, float | None]:
+def blocked(study: Study, data: Measurements, cell: Cell) -> dict[str, float | None]:
     """RMS on the last fifth of the session, fitted to what came before [mm].
 
     A random choice of held-out poses does not show what drifts; this does.
     """
+    terms, values = cell.effects.terms, np.concatenate([np.zeros(0), *cell.effects.values])
     clock = data.columns["clock"]
     late = clock > np.quantile(clock, 0.8)
     first, last = data.take(~late), data.take(late)
     out: dict[str, float | None] = {"last_poses": last.poses}
     if last.poses and first.poses > 3 * last.poses:
         geometric = accuracy(study.cell(first).error(last)).rms_mm
-        final = accuracy(study.cell(first, terms).error(last)).rms_mm if terms else geometric
+        usual = 3.0 * np.abs(values)
+        final = accuracy(study.cell(first, terms, usual).error(last)).rms_mm if terms else geometric
         out |= {"geometric_rms_mm": geometric, "final_rms_mm": final}
     return out
 

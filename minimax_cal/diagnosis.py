@@ -18,6 +18,7 @@ from minimax_cal.tables import Cell as TableCell
 from minimax_cal.tables import Table
 
 SCHEMA = 1
+SHOWN = 4  # parameters of an effect in a table
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -219,12 +220,14 @@ class Diagnosis:
         rows: list[tuple[TableCell, ...]] = []
         for finding in self.findings:
             others = ", ".join(f"{a.effect} {a.place}" for a in finding.alternatives)
-            values = ", ".join(
+            each = [
                 f"{name} = {value:.3g} ± {sigma:.1g} {unit}"
                 for name, value, sigma, unit in zip(
                     finding.names, finding.values, finding.sigmas, finding.units, strict=True
                 )
-            )
+            ]
+            more = [f"and {len(each) - SHOWN} more"] if len(each) > SHOWN else []
+            values = ", ".join([*each[:SHOWN], *more])
             rows.append((finding.term.effect, finding.term.place, 100.0 * finding.share,
                          values, others))  # fmt: skip
         return Table(

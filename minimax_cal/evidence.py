@@ -23,6 +23,8 @@ from minimax_cal.spectrum import lines
 LEVEL = 0.005  # chance of any false name on data without an effect
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 TIE = 2.0  # of evidence that a replacement must gain
+SMALL = 0.02  # of the degrees of freedom: an effect that gains less is no matter
+REFINED = 6  # effects among which each is compared anew with all others
 NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
 TUNINGS = 3  # rounds of a finer search
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
@@ -451,7 +453,9 @@ def addition(lib: Library, table: Bench, fits: Sequence[Added]) -> tuple[Library
     ranked = [one for one in table.everyone if one.evidence > 0.0]
     open_ones = [
         one for one in ranked
-        if not repeated(one.candidate, table.chosen) and table.chance(one) < LEVEL
+        if not repeated(one.candidate, table.chosen)
+        and table.chance(one) < LEVEL
+        and one.gain > SMALL * table.spare
     ]  # fmt: skip
     if not open_ones:
         return lib, []
@@ -513,7 +517,9 @@ def refined(lib: Library, fits: list[Added]) -> list[Added]:
         return fits
     for _ in range(3):
         changed = False
-        for number in range(len(fits) - 1):  # the last one was just chosen beside the others
+        for number in range(
+            min(len(fits) - 1, REFINED)
+        ):  # the last one was just chosen beside the others
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
@@ -528,3 +534,15 @@ def refined(lib: Library, fits: list[Added]) -> list[Added]:
         if not changed:
             break
     return fits
+
+
+def best_variant(scene: Scene, rows: Rows, chosen: Sequence[Term], several: Sequence[Term]) -> Term:
+    """The variant of a law that explains most beside the effects chosen before."""
+    empty = Library(scene, rows, np.zeros((len(rows.error), 0)), ())
+    lib, before = empty.with_terms([(term, 1.0) for term in chosen])
+    lib, among = lib.with_terms([(term, 1.0) for term in several])
+    if not among:
+        return several[0]
+    table = bench(replace(lib, candidates=tuple(among)), before)
+    fits = [Added(c, 0.0, 0.0, 0.0, 0.0, np.zeros(0), np.zeros(0)) for c in before]
+    return tuned(lib, fits, table.everyone[0]).candidate.term

@@ -15,6 +15,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from minimax_cal.kinematics import Array
+from minimax_cal.model import Model
+from minimax_cal.parameters import State
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 17)])
@@ -68,6 +70,13 @@ def rows_of(error: Array, jacobian: Array, slope: Array, weight: Array) -> Rows:
     matrix = bare.of(np.moveaxis(jacobian, 1, 0))
     rest = bare.of(np.where(weight[:, None] > 0, error, 0.0)[None])[:, 0]
     return Rows(rest, orthonormal(matrix), spread / size, size, count, turn, root)
+
+
+def linearised(model: Model, state: State, slope: Array) -> Rows:
+    """The rows of a model at a fitted state.  slope: (n, k, 3, m) as `effects.scene.Scene`."""
+    error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
+    jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
+    return rows_of(error, jacobian, slope, model.weight)
 
 
 def orthonormal(matrix: Array, rank: float = RANK) -> Array:

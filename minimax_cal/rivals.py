@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.evidence import Added, Bench, Library
+from minimax_cal.evidence import LEVEL, Added, Bench, Library
 from minimax_cal.kinematics import Array
 from minimax_cal.noise import restricted
 
 LIGHT = 4.0  # of fit, in the same sense
+ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
 BAND = 12.0  # of evidence: what fits worse by less may be the truth
 
 
 def rivals(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
-    """Other effects or places within the band: each with rho^2 and the power to tell it apart."""
+    """Other effects or places that may be the truth, with rho^2 and the power to tell them apart.
+
+    Those that do nearly as well; and those that do worse by some luck, the data having too little
+    power to tell them apart.
+    """
     out, seen = [], {one.candidate.key, *(c.key for c in table.chosen)}
     for other in table.everyone:
-        if other.candidate.key in seen or other.evidence <= 0.0 or not near(one, other):
+        if other.candidate.key in seen or other.evidence <= 0.0 or table.chance(other) > LEVEL:
             continue
-        seen.add(other.candidate.key)
+        close = near(one, other)
+        if not close and other.evidence < one.evidence - LUCK:
+            continue
         size, rho2 = table.setting(one).likeness(one, other.candidate)
-        out.append((other, rho2, size * (1.0 - rho2)))
+        power = size * (1.0 - rho2)
+        if close or power < ENOUGH:
+            seen.add(other.candidate.key)
+            out.append((other, rho2, power))
     return out
 
 

@@ -42,6 +42,11 @@ def opening(ladder: Sequence[Step], floor: float) -> str:
 
 def named(finding: Finding) -> str:
     """One effect."""
+    if not np.isfinite(finding.before):
+        amounts = dict(zip(finding.names, finding.values, strict=True))
+        share = amounts.get("explained", float("nan"))
+        seen = f"; {100.0 * share:.0f} % of the rest lies along the last moves" * np.isfinite(share)
+        return f"{finding.term.effect}: {cause(finding.term.effect)}{seen}."
     text = (
         f"{finding.term.effect} {at(finding.term.place)} ({cause(finding.term.effect)}) takes the "
         f"error from {finding.before:.3f} to {finding.after:.3f} mm"

@@ -17,8 +17,9 @@ LAYERS = (
     "model cell",
     "identify start worst extend noise",
     "calibration simulate minimize mixups spectrum structure",
-    "calibrate figures evidence diagnosis",
-    "rivals words",
+    "evidence",
+    "calibrate figures diagnosis rivals",
+    "words pictures sheets separate",
     "diagnose",
     "cli",
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -93,12 +93,18 @@ def parse(text: str) -> tuple[str, str, dict[str, float]]:
     return name, place, choice
 
 
-def terms(scene: Scene, texts: Sequence[str | Term]) -> tuple[Term, ...]:
-    """The effects that texts name; what a text leaves open takes the first variant.
+Pick = Callable[[Sequence[Term], Sequence[Term]], Term]  # one of several, beside those chosen
 
-    A text without a place means `all`, or the only place there is.  Raises OptionError.
+
+def terms(
+    scene: Scene, texts: Sequence[str | Term], pick: Pick = lambda chosen, several: several[0]
+) -> tuple[Term, ...]:
+    """The effects that texts name.
+
+    A text without a place means `all`, or the only place there is.  pick: chooses among the
+    variants of a law that a text leaves open.  Raises OptionError.
     """
-    out = []
+    out: list[Term] = []
     for text in texts:
         if isinstance(text, Term):
             out.append(text)
@@ -113,13 +119,14 @@ def terms(scene: Scene, texts: Sequence[str | Term]) -> tuple[Term, ...]:
         if place not in places:
             here = ", ".join(places) or "none with these data"
             raise OptionError(f"effect {name}: no place {place!r}; choose {here}")
-        choice = variants(text, effect.choices(scene, place), given)[0]
-        if name == "gear_ripple" and "turns" not in choice:
+        choices = variants(text, effect.choices(scene, place), given)
+        if name == "gear_ripple" and "turns" not in choices[0]:
             raise OptionError(
                 f"effect {text!r}: the robot file gives no ratio; write {name}:{place}:turns=17"
             )
-        term = Term(name, place, choice)
+        several = [Term(name, place, choice) for choice in choices]
         try:
+            term = pick(out, several) if len(several) > 1 else several[0]
             term.columns(scene)
         except KeyError as error:
             key = str(error.args[0])
