@@ -266,7 +266,7 @@ def diagnose_command(
     if as_json:
         click.echo(found.json(), nl=False)
     else:
-        terminal().print(found.headline(), markup=False)
+        terminal().print(found.headline() + "\n", markup=False)
         show(*found.tables(), *where_tables(found.where), *closing_tables(found))
     return 0
 

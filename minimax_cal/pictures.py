@@ -17,14 +17,13 @@ from minimax_cal.history import numbered, visits, with_history
 from minimax_cal.kinematics import Array
 from minimax_cal.where import joint_equivalent
 
-BY_ANGLE = ("gear_error", "encoder_gain", "gravity_compensator")
 BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
 BY_MOVE = {"backlash": "approach", "settling": "move"}
 BY_TIME = ("thermal_growth", "frame_drift", "target_shift")
 VIEWS = {  # what is drawn: name, colour
     "geometry alone": BEFORE,
-    "with the effects": AFTER,
-    "law: the effect taken out of that": "#999999",
+    "with effects": AFTER,
+    "the first effect taken out": "#999999",
 }
 FLAT = 1e-6  # of its size: what varies less does not vary
 
@@ -162,34 +161,39 @@ def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
     return value_of(scene, joint)
 
 
-def of_target(left: Leftover, term: Term) -> Curve:
-    """What is left of targets along the motion that an effect of theirs gives them."""
-    scene = left.scene
-    names = scene.data.targets
-    chosen = range(len(names)) if term.place == "all" else [names.index(term.place)]
+def along_motion(left: Leftover, term: Term) -> Curve:
+    """What is left of the targets along the motion that an effect gives them."""
+    scene, names = left.scene, left.scene.data.targets
+    chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
+    sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
     if term.effect == "target_offset":
-        away = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
-        x, xlabel = np.linalg.norm(away, axis=1), "distance from the instrument (m)"
-        along, words = away / x[:, None], "along the line of sight"
+        motion, words = sight, "along the line of sight"
+        xlabel, x = "distance from the instrument (m)", np.linalg.norm(sight, axis=1)
     else:
-        whole = replace(term, choice={**term.choice, "since": -1.0})  # moved from the start
-        at = [t.label for t in left.diagnosis.cells[-1].effects.terms].index(term.label)
-        value = left.diagnosis.cells[-1].effects.values[at]
-        field = np.tensordot(value, whole.columns(scene).displacement(scene), 1)
-        along = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-12)
+        motion, words = motion_of(left, term), f"along its {term.effect.partition('_')[2]}"
         xlabel, time = against(scene, term, 0)
-        x, words = np.broadcast_to(time, (len(names), len(time))), "along the shift"
-    y = tuple(
-        1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in (*left.errors, *left.law)
-    )
-    where = "all targets" if len(chosen) > 1 else names[chosen[0]]
-    return Curve(f"error of {where} {words}", xlabel, f"error {words} (mm)", x[chosen], y)
+        x = np.broadcast_to(time, (len(names), len(time)))
+    along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
+    views = (*left.errors, *left.law)
+    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in views)
+    whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
+    title = f"error of {whose}, for {term.effect} {term.place}"
+    return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
+
+
+def motion_of(left: Leftover, term: Term) -> Array:
+    """(k, 3, m) how an effect moves the targets, as fitted; a nest as if it had always sat so."""
+    fitted = left.diagnosis.cells[-1].effects
+    value = fitted.values[[other.label for other in fitted.terms].index(term.label)]
+    always = {"since": -1.0} if "since" in term.choice else {}
+    columns = replace(term, choice={**term.choice, **always}).columns(left.scene)
+    return np.asarray(np.tensordot(value, columns.displacement(left.scene), 1))
 
 
 def residual_curve(left: Leftover) -> Curve:
     """The errors as turns of the guilty joint, against what its effect depends on."""
-    if left.term and left.term[0].effect in ("target_offset", "target_shift"):
-        return of_target(left, left.term[0])
+    if left.term and left.term[0].effect in ("target_offset", *BY_TIME):
+        return along_motion(left, left.term[0])
     turn = turns(left)
     joint = guilty(left, turn)
     xlabel, x = (
@@ -284,7 +288,7 @@ def draw_curve(axes: Any, left: Leftover, curve: Curve, *, log: bool = False) ->
         depth = 2.0 + number % 2  # the last view lies under the others
         axes.plot(curve.x[~held], y[~held], ".", color=colour, ms=4, alpha=0.5, zorder=depth)
         axes.plot(curve.x[held], y[held], "o", color=colour, ms=5, label=name, zorder=depth)
-    axes.plot([], [], ".", color="black", ms=4, label="(small: fitted poses)")
+    axes.plot([], [], ".", color="black", ms=4, label="small: fitted")
     if log and all(np.nanmin(y) > 0.0 for y in curve.y):
         axes.set_yscale("log")
         plain_ticks(axes.yaxis, np.concatenate(curve.y))
@@ -364,7 +368,7 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
     residual, order = residual_curve(left), order_curve(left)
     figure = Figure(figsize=(12.5, 10), layout="constrained")
     figure.suptitle(f"{diagnosis.robot}: {verdict_of(diagnosis)}", fontweight="bold")
-    parts = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)
+    parts: Any = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)
     titles = ("a  the gap, step by step", f"b  {residual.title}", f"c  {order.title}",
               "d  errors over the workspace (base frame)")  # fmt: skip
     for part, title in zip(parts.flat, titles, strict=True):

@@ -24,7 +24,8 @@ def rivals(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
         if other.candidate.key in seen or other.evidence <= 0.0 or table.chance(other) > LEVEL:
             continue
         close = near(one, other)
-        if not close and other.evidence < one.evidence - LUCK:
+        alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one
+        if not close and (alike or other.evidence < one.evidence - LUCK):
             continue
         size, rho2 = table.setting(one).likeness(one, other.candidate)
         power = size * (1.0 - rho2)

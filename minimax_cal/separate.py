@@ -31,7 +31,7 @@ GOLDEN = 0.6180339887498949
 COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
 LOAD = 0.05  # payload that is proposed, as a share of the arm's mass
-FOOT = 0.1  # radius of the reflectors on the foot, as a share of the reach
+FOOT = 0.2  # radius of the reflectors on the foot, as a share of the reach
 SAME = 1e-6  # relative change of a field below which a proposal does not concern an effect
 
 
@@ -87,11 +87,9 @@ class Site:
     @cached_property
     def whole(self) -> Scene:
         """The scene of all rows of the plan."""
-        old = self.scene
-        q = self.plan.data.q * old.robot.sign
-        return Scene.of(
-            old.robot, self.plan.data, (old.rotation, old.origin), old.spots, q
-        )  # fmt: skip
+        robot, base = self.scene.robot, (self.scene.rotation, self.scene.origin)
+        data = self.plan.data
+        return Scene.of(robot, data, base, self.scene.spots, data.q * robot.sign)
 
     @cached_property
     def turned(self) -> Rows:
@@ -116,7 +114,7 @@ class Site:
             y=np.zeros((k, 3, m)),
             weight=self.plan.weight,
         )
-        return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1, 2), (0, 3, 1)))
+        return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1), (0, 3)))
 
     def lines(self, poses: slice) -> slice:
         """The rows of some poses."""
@@ -155,20 +153,20 @@ class Site:
 def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
     """The poses at hand, and after them those that are proposed."""
     m, n = scene.poses, scene.joints
-    mixed = rng.permutation(m)[: max(AGAIN)]
+    outer = np.argsort(-aside(scene), kind="stable")[: max(AGAIN)]
     first = np.argsort(scene.column("clock"), kind="stable")[: max(AGAIN)]
     old = with_columns(scene.data, scene)
     like = rng.integers(0, m, max(MORE))  # which targets are seen, and what is not told below
     some = [old, more(scene, old.take(like), rng)]
-    fresh = 1.0 + (np.arange(len(mixed)) + 0.5) * GOLDEN % 1.0  # all over another session
-    again = then(old.take(mixed), clock=fresh)
+    fresh = 1.0 + (np.arange(len(outer)) + 0.5) * GOLDEN % 1.0  # all over another session
+    again = then(old.take(outer), clock=fresh)
     sides = {f"approach{j + 1}": flipped(again.columns[f"approach{j + 1}"]) for j in range(n)}
     moves = {f"move{j + 1}": STEP * sides[f"approach{j + 1}"] for j in range(n)}
     heavier = again.columns["payload"] + payload(scene)
-    hung = then(again, payload=heavier, **hanging(scene, mixed, payload(scene)))
+    hung = then(again, payload=heavier, **hanging(scene, outer, payload(scene)))
     late = then(old.take(first), clock=1.0 + (np.arange(len(first)) + 1.0) / m, **warm(old))
     some += [late, again, hung, then(again, **sides, **moves)]
-    parts = [weight[:, rows] for rows in (np.arange(m), like, first, mixed, mixed, mixed)]
+    parts = [weight[:, rows] for rows in (np.arange(m), like, first, outer, outer, outer)]
     starts = np.cumsum([0, *(part.poses for part in some)])
     kinds = ("old", "more", "late", "foot", "load", "side")
     at = {
@@ -176,6 +174,12 @@ def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
         for kind, start, part in zip(kinds, starts[:-1], some, strict=True)
     }
     return Plan(joined(some), np.concatenate(parts, axis=1), at)
+
+
+def aside(scene: Scene) -> Array:
+    """(m,) how far out the arm reaches from the vertical through its base [m]."""
+    tip, up = scene.points.mean(axis=0), scene.robot.up
+    return np.asarray(np.linalg.norm(tip - up[:, None] * (up @ tip), axis=0))
 
 
 def with_columns(data: Measurements, scene: Scene) -> Measurements:
@@ -277,19 +281,17 @@ def predicted(scene: Scene, data: Measurements) -> dict[str, Array]:
     """Torques that would be measured at other poses, by the weights that those at hand suggest."""
     if not scene.measured_torques:
         return {}
-    there = Scene.of(
-        scene.robot, data, (scene.rotation, scene.origin), scene.spots, data.q * scene.robot.sign
-    )
+    robot, base = scene.robot, (scene.rotation, scene.origin)
+    there = Scene.of(robot, data, base, scene.spots, data.q * robot.sign)
     mass, com = scene.masses
-    parts = [(np.where(np.arange(scene.joints) == i, mass, 0.0), com) for i in range(scene.joints)]
-    known = [s.torque(*part) for part in parts for s in (scene,)]
-    new = [there.torque(*part) for part in parts]
+    links = np.diag(mass)
+    known, new = ([s.torque(one, com) for one in links] for s in (scene, there))
     out = {}
     for j in range(scene.joints):
         if f"tau{j + 1}" in scene.data.columns:
             tau = scene.data.columns[f"tau{j + 1}"]
-            old = np.stack([np.ones(scene.poses), *(part[j] for part in known)], axis=1)
-            ahead = np.stack([np.ones(data.poses), *(part[j] for part in new)], axis=1)
+            old = np.stack([part[j] for part in known] + [np.ones(scene.poses)], axis=1)
+            ahead = np.stack([part[j] for part in new] + [np.ones(data.poses)], axis=1)
             told = np.isfinite(tau)
             out[f"tau{j + 1}"] = ahead @ np.linalg.lstsq(old[told], tau[told], rcond=1e-6)[0]
     return out
@@ -451,7 +453,8 @@ def concerning(site: Site, everything: Fields, known: int) -> list[str]:
     again = points[..., site.plan.rows("foot", max(AGAIN))]
     for kind, before in (("late", points[..., first]), ("load", again), ("side", again)):
         after = points[..., site.plan.rows(kind, max(AGAIN))]
-        if np.abs(after - before).max() > SAME * np.abs(before).max():
+        change, size = (np.abs(x).max(axis=(1, 2, 3)) for x in (after - before, before))
+        if np.any(change > SAME * size):
             found.append(kind)
     return found
 
@@ -503,12 +506,15 @@ def words(site: Site, kind: str, count: int) -> str:
     if kind == "load":
         extra = " more" if scene.column("payload").any() else ""
         return (
-            f"measure {count} of these poses again with a payload of {payload(scene):g} kg{extra}"
+            f"measure the {count} poses that reach out farthest again, with a payload of "
+            f"{payload(scene):g} kg{extra}"
         )
     return {
         "late": f"measure the first {count} poses again at the end, with the arm warm",
-        "side": f"approach {count} of these poses from the other side, by a short move",
-        "foot": f"put three reflectors on the robot's foot and measure them at {count} poses",
+        "side": f"measure {count} of these poses again, each approached from its other side by a "
+        "short move of all joints",
+        "foot": "put three reflectors on the robot's foot, far apart, and measure them at the "
+        f"{count} poses that reach out farthest",
     }[kind]
 
 

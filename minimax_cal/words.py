@@ -45,7 +45,8 @@ def named(finding: Finding) -> str:
     if not np.isfinite(finding.before):
         amounts = dict(zip(finding.names, finding.values, strict=True))
         share = amounts.get("explained", float("nan"))
-        seen = f"; {100.0 * share:.0f} % of the rest lies along the last moves" * np.isfinite(share)
+        seen = f"; {100.0 * share:.0f} % of the rest lies along the last moves"
+        seen = seen if np.isfinite(share) else ""
         return f"{finding.term.effect}: {cause(finding.term.effect)}{seen}."
     text = (
         f"{finding.term.effect} {at(finding.term.place)} ({cause(finding.term.effect)}) takes the "
