@@ -268,6 +268,9 @@ def diagnose_command(
     else:
         terminal().print(found.headline() + "\n", markup=False)
         show(*found.tables(), *where_tables(found.where), *closing_tables(found))
+    if found.status is not Status.CONVERGED:
+        click.echo(f"error: {found.status}: {found.status.advice}", err=True)
+        return FAILED
     return 0
 
 

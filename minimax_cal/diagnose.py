@@ -18,7 +18,7 @@ from minimax_cal.diagnosis import Alternative, Diagnosis, Finding, Step
 from minimax_cal.effects.scene import Scene
 from minimax_cal.effects.table import EFFECTS, NOTHING, Term
 from minimax_cal.errors import DataError, OptionError
-from minimax_cal.evidence import Added, Bench, Choice, Library
+from minimax_cal.evidence import Choice, Library
 from minimax_cal.extend import refitted, scene_of
 from minimax_cal.faults import Fault, find_faults, looks_read_back, mended
 from minimax_cal.history import with_history
@@ -27,8 +27,9 @@ from minimax_cal.metrics import Accuracy, accuracy
 from minimax_cal.mixups import misplaced, put_right
 from minimax_cal.model import Model, model_of
 from minimax_cal.noise import Noise, Rows, linearised
-from minimax_cal.rivals import resemblances, rivals
+from minimax_cal.rivals import ENOUGH, resemblances, rivals
 from minimax_cal.robot import Robot, load_robot
+from minimax_cal.separate import Site, separate_with
 from minimax_cal.structure import Trace, rest_of, structure
 from minimax_cal.where import where
 from minimax_cal.words import reasons
@@ -36,6 +37,9 @@ from minimax_cal.words import reasons
 LEVEL = 0.01  # chance that noise alone is called structure
 MATTERS = 0.015  # share of what was explained below which more structure is of no account
 OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+SHAKY = 3.0  # times what the instrument alone would show between visits
+REPEATS = "repeated poses"
+ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 REVISITS = 5  # repeated poses that tell a noise floor
 RESAMPLES = 1000
 SUM = Options(objective="sum")
@@ -122,7 +126,7 @@ def diagnose(
     report("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
     order = by_weight(study, choice)
-    effects = merged([finding(choice.fits[i], choice.benches[i]) for i in order])
+    effects = merged([finding(study, choice, i) for i in order])
     report("gap ladder")
     wrong = [*faults, *read_back]
     steps, cells, raw_error = ladder(robot, raw, study, held, wrong, effects, seed, holdout)
@@ -134,6 +138,9 @@ def diagnose(
         rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
     )
     verdict, rest = judged(findings, traces, without - with_all)
+    noise = float(np.sqrt(choice.noise.variance))
+    if verdict == "none" and source == REPEATS and shaky(floor, noise, steps[-1].holdout.rms_mm):
+        verdict = "not_repeatable"
     base = np.eye(4)
     base[:3, :3], base[:3, 3] = study.fit.state.rotation, study.fit.state.origin
     lies = where(
@@ -149,6 +156,7 @@ def diagnose(
     settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
     return Diagnosis(
         robot=robot.name,
+        status=study.fit.status,
         verdict=verdict,
         reasons=reasons(verdict, steps, floor, findings, closed, interval, rest),
         findings=tuple(findings),
@@ -158,7 +166,7 @@ def diagnose(
         closed=closed,
         closed_ci=interval,
         blocked=blocked(study, sound, cells[-1]),
-        noise=float(np.sqrt(choice.noise.variance)),
+        noise=noise,
         jitter=choice.noise.jitter,
         structure=rest[1],
         structure_in=rest[0],
@@ -274,9 +282,18 @@ def by_weight(study: Study, choice: Choice) -> list[int]:
     return order
 
 
-def finding(one: Added, table: Bench) -> Finding:
-    """An effect with its rivals."""
+def finding(study: Study, choice: Choice, number: int) -> Finding:
+    """An effect with its rivals, and what would tell the nearest of them apart."""
+    one, table = choice.fits[number], choice.benches[number]
     found = rivals(table, one)
+    advice = [""] * len(found)
+    unclear = [i for i, (_, _, power) in enumerate(found) if power < ENOUGH][:ADVISED]
+    if unclear:
+        site = Site(study.scene, study.model, study.fit.state, choice.noise)
+        others = [(f.candidate.term, f.value) for f in choice.fits if f is not one]
+        for i in unclear:
+            rival = found[i][0].candidate.term
+            advice[i] = separate_with(site, one.candidate.term, one.value, rival, others)
     columns = one.candidate.term.columns(table.library.scene)
     size, _ = table.setting(one).likeness(one, one.candidate)
     return Finding(
@@ -294,8 +311,9 @@ def finding(one: Added, table: Bench) -> Finding:
                 rho2,
                 power,
                 one.evidence - other.evidence,
+                text,
             )
-            for other, rho2, power in found
+            for (other, rho2, power), text in zip(found, advice, strict=True)
         ),
         fixed=columns.fixed,
     )
@@ -348,6 +366,15 @@ def judged(
         return "none", (worst.name, p)
     several = any(found.alternatives for found in findings)
     return ("one_of" if several else "named"), (worst.name, p)
+
+
+def shaky(floor: float, noise: float, error: float) -> bool:
+    """Whether what is left is mostly that the arm does not come back to the same place.
+
+    floor: RMS between repeated poses [mm].  noise: of the instrument per coordinate [m].
+    error: held-out RMS [mm].
+    """
+    return floor > SHAKY * 1e3 * np.sqrt(3.0) * noise and floor > error / SHAKY
 
 
 def patched(findings: Sequence[Finding]) -> bool:
@@ -451,7 +478,7 @@ def noise_floor(
     if again >= REVISITS and freedom:
         revisits = 1e3 * float(np.sqrt(3.0 * total / freedom))
         if revisits < model:
-            return revisits, "repeated poses"
+            return revisits, REPEATS
     return model, "noise of the fit"
 
 

@@ -14,6 +14,7 @@ from minimax_cal.effects.table import Term
 from minimax_cal.files import json_text, write_whole
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import Accuracy
+from minimax_cal.solvers.status import Status
 from minimax_cal.tables import Cell as TableCell
 from minimax_cal.tables import Table
 
@@ -113,7 +114,8 @@ class Step:
 class Diagnosis:
     """What is still wrong with a calibrated robot.
 
-    verdict: one of VERDICTS.  reasons: one sentence each, why.  findings: by share of the gap.
+    status: of the geometric fit.  verdict: one of VERDICTS.  reasons: one sentence each, why.
+    findings: by share of the gap.
     ladder: nominal, geometric, then with each effect.  blocked: held-out RMS where the last part
     of the session is held out instead [mm].  floor: RMS that noise alone would leave [mm].
     closed: share of the gap closed, with its interval.
@@ -125,6 +127,7 @@ class Diagnosis:
     """
 
     robot: str
+    status: Status
     verdict: str
     reasons: tuple[str, ...]
     findings: tuple[Finding, ...]
@@ -160,6 +163,7 @@ class Diagnosis:
             "schema": SCHEMA,
             "kind": "diagnosis",
             "robot": self.robot,
+            "status": str(self.status),
             "verdict": self.verdict,
             "reasons": list(self.reasons),
             "effects": [finding.to_dict() for finding in self.findings],
@@ -221,14 +225,15 @@ class Diagnosis:
         for finding in self.findings:
             others = ", ".join(f"{a.effect} {a.place}" for a in finding.alternatives)
             each = [
-                f"{name} = {value:.3g} ± {sigma:.1g} {unit}"
+                f"{name} = {value:.3g}"
+                + (f" ± {sigma:.1g} {unit}" if sigma == sigma else f" {unit}")
                 for name, value, sigma, unit in zip(
                     finding.names, finding.values, finding.sigmas, finding.units, strict=True
                 )
             ]
             more = [f"and {len(each) - SHOWN} more"] if len(each) > SHOWN else []
             values = ", ".join([*each[:SHOWN], *more])
-            rows.append((finding.term.effect, finding.term.place, 100.0 * finding.share,
+            rows.append((finding.term.effect, finding.term.place, 100.0 * finding.share + 0.0,
                          values, others))  # fmt: skip
         return Table(
             "effects found",

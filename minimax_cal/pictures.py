@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from minimax_cal.kinematics import Array
 from minimax_cal.where import joint_equivalent
 
 BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
+LINEAR = ("encoder_gain", "joint_coupling")
 BY_MOVE = {"backlash": "approach", "settling": "move"}
 BY_TIME = ("thermal_growth", "frame_drift", "target_shift")
 VIEWS = {  # what is drawn: name, colour
@@ -204,6 +206,8 @@ def residual_curve(left: Leftover) -> Curve:
     title = f"errors as a {what} of joint {joint + 1}"
     if left.term:
         title += f", for {left.term[0].effect} {left.term[0].place}"
+    if left.term and left.term[0].effect in LINEAR:  # a constant turn is geometry: leave it out
+        turn[-1] = turn[-1] - turn[-1].mean(axis=0)
     return Curve(
         title,
         xlabel,
@@ -253,7 +257,7 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
         plain_ticks(axes.xaxis, numbers)
     else:
         axes.set_xlim(left=0.0)
-    axes.set_yticks(at, [step.name for step in steps])
+    axes.set_yticks(at, [textwrap.fill(step.name, 24) for step in steps])
     axes.set_ylim(len(steps) - 0.5, -0.5)
     right = axes.secondary_yaxis("right")
     right.set_yticks(at, [f"{value:.3f}" for value in held])
@@ -299,6 +303,13 @@ def draw_curve(axes: Any, left: Leftover, curve: Curve, *, log: bool = False) ->
     outside(axes, 4)
 
 
+def room(values: Array, widest: float) -> tuple[float, float]:
+    """Limits of an axis that hold the values, a third as wide as the widest at least."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    half = 0.55 * max(high - low, widest / 3.0)
+    return (low + high) / 2.0 - half, (low + high) / 2.0 + half
+
+
 def draw_maps(part: Any, left: Leftover) -> None:
     """The errors over the workspace from above and from the side, all on one colour scale."""
     from matplotlib.colors import LogNorm
@@ -314,6 +325,9 @@ def draw_maps(part: Any, left: Leftover) -> None:
     height = left.points @ up
     views = (("top", left.points[..., second], f"{'xyz'[second]} (m)"),
              ("side", height, "height (m)"))  # fmt: skip
+    spans = [np.nanmax(p) - np.nanmin(p) for p in
+             (left.points[..., first], left.points[..., second], height)]  # fmt: skip
+    widest = float(max(spans))
     wide = len(sizes) > 1  # one view stands beside the other; two above each other
     grid = part.subplots(
         len(sizes), 2, squeeze=False, sharex=True, sharey="row" if wide else "none"
@@ -326,6 +340,7 @@ def draw_maps(part: Any, left: Leftover) -> None:
             c=size.ravel()[order], norm=scale, cmap="cividis_r", s=9,
         )  # fmt: skip
         axes.set_aspect("equal", adjustable="box")
+        axes.set(xlim=room(left.points[..., first], widest), ylim=room(down, widest))
         axes.set_title(f"{name}, {view}", fontsize="medium")
         axes.grid(visible=True, alpha=0.3)
         if axes in grid[:, 0] or not wide:
@@ -367,7 +382,8 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
     left = Leftover.of(diagnosis)
     residual, order = residual_curve(left), order_curve(left)
     figure = Figure(figsize=(12.5, 10), layout="constrained")
-    figure.suptitle(f"{diagnosis.robot}: {verdict_of(diagnosis)}", fontweight="bold")
+    title = textwrap.fill(f"{diagnosis.robot}: {verdict_of(diagnosis)}", 110)
+    figure.suptitle(title, fontweight="bold")
     parts: Any = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)
     titles = ("a  the gap, step by step", f"b  {residual.title}", f"c  {order.title}",
               "d  errors over the workspace (base frame)")  # fmt: skip

@@ -21,8 +21,8 @@ from minimax_cal.kinematics import Array
 from minimax_cal.model import Model
 from minimax_cal.noise import RANK, Noise, Rows, rows_of
 from minimax_cal.parameters import State
+from minimax_cal.rivals import ENOUGH
 
-ENOUGH = 25.0  # power that tells two effects apart
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
 PREPARE = {"more": 0.0, "late": 5.0, "side": 5.0, "load": 15.0, "foot": 20.0}  # once [min]
@@ -30,8 +30,9 @@ OF_BASE = frozenset({"base_flex", "frame_drift"})  # what moves the robot's foot
 GOLDEN = 0.6180339887498949
 COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
-LOAD = 0.05  # payload that is proposed, as a share of the arm's mass
+LOAD = 0.03  # payload that is proposed, as a share of the arm's mass
 FOOT = 0.2  # radius of the reflectors on the foot, as a share of the reach
+NOTHING = 0.01  # power that no proposal exceeds where a rival includes the effect
 SAME = 1e-6  # relative change of a field below which a proposal does not concern an effect
 
 
@@ -492,7 +493,9 @@ def separate_with(
         if advice.power >= ENOUGH:
             return advice.text
     best = max(advices, key=lambda advice: advice.power)
-    return f"{best.text}; that raises the power to {best.power:.0f} of the {ENOUGH:.0f} needed"
+    if one.effect == other.effect and best.power < NOTHING:
+        return "no measurement can: one includes the other; more poses show what it has besides"
+    return f"{best.text}; that raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
 
 
 # ---- in words ----------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ def cause(effect: str) -> str:
 def at(place: str) -> str:
     """Where, in words."""
     if place == "all":
-        return "on all joints or targets"
+        return "of the whole arm"
     return {"J": f"at joint {place[1:]}", "L": f"at link {place[1:]}"}.get(
         place[0] if place[1:].isdigit() else "", f"at {place}"
     )
@@ -60,8 +60,11 @@ def named(finding: Finding) -> str:
 
 def advice(finding: Finding) -> list[str]:
     """What to measure next."""
-    found = {a.separate_with for a in finding.alternatives if a.separate_with}
-    return [f"To tell them apart: {text}." for text in sorted(found)]
+    by_text: dict[str, list[str]] = {}
+    for a in finding.alternatives:
+        if a.separate_with:
+            by_text.setdefault(a.separate_with, []).append(f"{a.effect} {a.place}")
+    return [f"To tell it from {' and '.join(names)}: {text}." for text, names in by_text.items()]
 
 
 def reasons(
@@ -77,7 +80,8 @@ def reasons(
     out = [opening(ladder, floor)]
     final = ladder[-1].holdout
     if findings:
-        out += [named(finding) for finding in findings[:4]]
+        steps = sorted(findings[:4], key=lambda f: -f.before if np.isfinite(f.before) else -np.inf)
+        out += [named(finding) for finding in steps]
         if len(findings) > 4:
             out.append(f"{len(findings) - 4} smaller effects follow in the table.")
         share = f"{100.0 * closed:.0f} %" if np.isfinite(closed) else "an unknown share"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
+from test_cli import run
 
 import minimax_cal as mc
 
@@ -18,6 +19,32 @@ def test_the_result_is_the_one_of_the_first_command() -> None:
     )
     fit = mc.calibrate("irb2600", ROOT / "examples" / "irb2600.csv")
     assert quoted in fit.headline()
+
+
+def test_the_diagnosis_is_what_its_commands_print(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = README.partition("## Why does a calibrated arm still miss?")[2].partition("\n## ")[0]
+    blocks = re.findall(r"```bash\n(.*?)```", part, flags=re.S)
+    out = ""
+    for line in "".join(blocks).splitlines():
+        command = line.partition("#")[0].split()
+        assert command[0] == "minimax-cal"
+        assert run(*command[1:]) == 0, line
+        out += capsys.readouterr().out
+    (text,) = re.findall(r"```text\n(.*?)```", part, flags=re.S)
+    quoted, printed = text.split(), out.split()
+    number = re.compile(r"\(?(\d+(?:\.\d+)?)[;:,.)]*")
+    for said, found in zip(quoted, printed[: len(quoted)], strict=True):
+        one, other = number.fullmatch(said), number.fullmatch(found)
+        if one and other:  # the last digit may differ on another machine
+            assert float(one[1]) == pytest.approx(float(other[1]), abs=2e-3), (said, found)
+        else:
+            assert said == found
+    assert (tmp_path / "diagnosis.png").stat().st_size > 50_000
+    assert (ROOT / "docs" / "images" / "diagnosis.png").read_bytes().startswith(b"\x89PNG")
+    assert mc.load_cell(tmp_path / "fit.json").effects.terms[0].label == "joint_compliance:all"
 
 
 def test_the_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,9 @@ from minimax_cal.history import with_history
 from minimax_cal.kinematics import Array
 from minimax_cal.model import model_of
 from minimax_cal.noise import Noise, linearised
+from minimax_cal.rivals import ENOUGH
 from minimax_cal.separate import (
     AGAIN,
-    ENOUGH,
     MORE,
     PREPARE,
     Site,
@@ -114,6 +114,16 @@ def test_power_is_that_of_a_dense_fit_to_all_poses(wide: Site, key: tuple[str, i
         found = powers(place, GROWTH, np.array([1e-5]), DRIFT, [(GAIN, np.array([1e-4]))])
         expected = by_hand(place, key, GROWTH, np.array([1e-5]), DRIFT, [GAIN])
         assert_allclose(found[key], expected, rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("one", "value", "key"), [(J2, 1e-7, ("load", 20)), (PLAY, 1e-4, ("side", 40))]
+)
+def test_power_of_revisits_is_that_of_a_dense_fit(
+    wide: Site, one: Term, value: float, key: tuple[str, int]
+) -> None:
+    found = powers(wide, one, np.array([value]), GAIN)
+    assert_allclose(found[key], by_hand(wide, key, one, np.array([value]), GAIN, []), rtol=ROUNDING)
 
 
 @pytest.mark.parametrize(
@@ -247,6 +257,11 @@ def test_advice_is_sorted_by_cost_and_the_cheapest_that_is_enough_is_given(narro
     assert separate_with(narrow, BASE, np.array([1e-7]), J2) == enough[0].text
     weak = separate_with(narrow, BASE, np.array([1e-9]), J2)
     assert weak.endswith("of the 25 needed")
+
+
+def test_what_includes_the_effect_cannot_be_told_from_it(wide: Site) -> None:
+    everywhere = Term("encoder_gain", "all", {"joints": 63.0})
+    assert "no measurement can" in separate_with(wide, GAIN, np.array([1e-4]), everywhere)
 
 
 def test_proposed_poses_can_be_reached_and_seen(narrow: Site, wide: Site) -> None:
