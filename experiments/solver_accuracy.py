@@ -6,7 +6,8 @@ On the QPs that calibrations really produce, on the Maros-Meszaros problems in s
 hard ones.  Each backend is asked three times: through qpsolvers with its own defaults, and through
 our `solve` (no fallback) at a loose and at a tight tolerance.  A problem counts as solved where the
 judge finds primal, dual and gap at most 1e-6 relative to the problem's own scale
-(`qp_backends.accuracy` says how that is defined), whatever the solver claims.
+(`qp_backends.accuracy` says how that is defined), whatever the solver claims.  A problem has three
+seconds; defaults, which may know no clock, are not asked where our call ran out of time.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ if TYPE_CHECKING:
 
 SOLVED = 1e-6  # relative residual at which an answer counts as right
 LOOSE, TIGHT = 1e-6, 1e-9
-SETTINGS = ("own defaults", "ours 1e-6", "ours 1e-9")
+SETTINGS = ("ours 1e-6", "ours 1e-9", "own defaults")
 SHIFT = 1e-3  # of the shifted geometric mean of times [s]
-LIMIT = 10.0  # time for one problem [s]
+LIMIT = 3.0  # time for one problem [s]
 DIRECT = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
 ACROSS = "fallback order"
 
@@ -166,6 +167,13 @@ def attempt(case: Case, group: str, backend: str, setting: str) -> Run:
         judged.objective,
         seconds,
     )
+
+
+def unasked(case: Case, group: str, backend: str) -> Run:
+    """Not run: our call of this backend ran out of time, and its defaults may know no clock."""
+    far = float("inf")
+    return Run(group, case.name, case.kind, backend, "own defaults", "time_limit",
+               far, far, far, far, float("nan"), LIMIT)  # fmt: skip
 
 
 def references(cases: Sequence[Case]) -> dict[str, float]:
@@ -439,10 +447,15 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
             and not (backend == "subgradient" and (setting == "ours 1e-9" or "calib" not in group))
             for case in cases
         ]
-        runs[group] = [
-            attempt(case, group, backend, setting)
-            for case, backend, setting in track(jobs, description=group, transient=True)
-        ]
+        found: list[Run] = []
+        slow: set[tuple[str, str]] = set()
+        for case, backend, setting in track(jobs, description=group, transient=True):
+            late = setting == "own defaults" and (case.name, backend) in slow
+            run = unasked(case, group, backend) if late else attempt(case, group, backend, setting)
+            found.append(run)
+            if run.seconds >= LIMIT:
+                slow.add((case.name, backend))
+        runs[group] = found
     return runs, problems
 
 
