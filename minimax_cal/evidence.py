@@ -23,7 +23,7 @@ from minimax_cal.spectrum import lines
 LEVEL = 0.005  # chance of any false name on data without an effect
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 TIE = 2.0  # of evidence that a replacement must gain
-SMALL = 0.02  # of the degrees of freedom: an effect that gains less is no matter
+SMALL, PLENTY = 0.02, 2000.0  # of degrees of freedom beyond so many: less gain is no matter
 REFINED = 6  # effects among which each is compared anew with all others
 NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
 TUNINGS = 3  # rounds of a finer search
@@ -362,7 +362,7 @@ def columns_of(chosen: Sequence[Candidate], fits: Sequence[Added]) -> tuple[Arra
     values = {id(one.candidate): one.value for one in fits}
     loose, ridge = [none], [np.zeros(0)]
     for c in chosen:
-        if len(c.doubt) and id(c) in values:
+        if len(c.doubt) and len(values.get(id(c), ())):
             loose.append(c.doubt)
             ridge.append(1.0 / np.maximum(values[id(c)][c.owner] ** 2, 1e-60))
     return main, np.concatenate(loose), np.concatenate(ridge)
@@ -455,7 +455,7 @@ def addition(lib: Library, table: Bench, fits: Sequence[Added]) -> tuple[Library
         one for one in ranked
         if not repeated(one.candidate, table.chosen)
         and table.chance(one) < LEVEL
-        and one.gain > SMALL * table.spare
+        and one.gain > SMALL * (table.spare - PLENTY)
     ]  # fmt: skip
     if not open_ones:
         return lib, []
