@@ -1,8 +1,10 @@
 """Calibrate robot arms, and tell why a calibrated arm still misses."""
 
+from minimax_cal import datasets
 from minimax_cal.calibrate import Options, calibrate
 from minimax_cal.calibration import Calibration
 from minimax_cal.cell import Cell, evaluate, load_cell
+from minimax_cal.compensate import Compensation, compensate
 from minimax_cal.data import Measurements, measurements, read_measurements, write_measurements
 from minimax_cal.diagnose import diagnose
 from minimax_cal.diagnosis import Diagnosis
@@ -14,6 +16,7 @@ __all__ = [
     "Calibration",
     "CalibrationError",
     "Cell",
+    "Compensation",
     "DataError",
     "Diagnosis",
     "Measurements",
@@ -23,6 +26,8 @@ __all__ = [
     "RobotError",
     "builtin_robots",
     "calibrate",
+    "compensate",
+    "datasets",
     "diagnose",
     "evaluate",
     "load_cell",

@@ -16,12 +16,15 @@ import qp_backends
 from minimax_cal import gates
 from minimax_cal.calibrate import POOR_FIT, Options, calibrate
 from minimax_cal.cell import evaluate, load_cell
+from minimax_cal.compensate_command import compensate_command
 from minimax_cal.data import read_measurements, write_measurements
 from minimax_cal.diagnose import diagnose
 from minimax_cal.errors import CalibrationError, OptionError
+from minimax_cal.export_command import export_command
 from minimax_cal.figures import PICTURES, save_errors
 from minimax_cal.files import check_writable, json_text, write_whole
 from minimax_cal.history import with_history
+from minimax_cal.import_command import import_command
 from minimax_cal.kinematics import MDH_NAMES
 from minimax_cal.pictures import save_diagnosis
 from minimax_cal.robot import builtin_robots, load_robot
@@ -455,6 +458,11 @@ def terminal() -> Console:
     """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=110)
+
+
+cli.add_command(compensate_command)
+cli.add_command(export_command)
+cli.add_command(import_command)
 
 
 def show(*tables: Table) -> None:

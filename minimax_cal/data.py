@@ -328,8 +328,11 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
         row += ["" if np.isnan(value) else f"{value:.6f}" for value in y]
         for name, column in data.columns.items():
             value = column[j]
-            text = isinstance(value, str)
-            row.append(str(value) if text else f"{float(value) * named[name][1]:.9g}")
+            if isinstance(value, str):
+                row.append(str(value))
+            else:
+                number = float(value) * named[name][1]
+                row.append("" if np.isnan(number) else f"{number:.9g}")
         writer.writerow(row)
     write_whole(path, stream.getvalue())
 

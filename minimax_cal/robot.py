@@ -1,4 +1,4 @@
-"""A robot: nominal or calibrated geometry, limits and masses; JSON, TOML, YAML in, JSON out."""
+"""A robot: nominal or calibrated geometry, limits, masses; JSON, TOML, YAML, URDF in, JSON out."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from minimax_cal import kinematics
 from minimax_cal.errors import RobotError
 from minimax_cal.files import json_text, read_text, write_whole
 from minimax_cal.kinematics import MDH_NAMES, Array
+from minimax_cal.urdf import is_urdf, load_urdf
 
 CONVENTION = "Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
 METRES = {"mm": 1e-3, "m": 1.0}
@@ -228,14 +229,19 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 
 
 def load_robot(source: Path | str) -> Robot:
-    """A built-in robot by name, or a robot file (.json, .toml, .yaml).  Raises RobotError."""
+    """A built-in robot by name, or a robot file (.json, .toml, .yaml, .urdf).
+
+    ``robot.urdf#link`` names the last link of a chain.  Raises RobotError.
+    """
     path = Path(source)
     if str(source) in builtin_robots():
         text = (resources.files("minimax_cal") / "robots" / f"{source}.json").read_text("utf-8")
         return robot_from_dict(json.loads(text), str(source))
+    if is_urdf(source):
+        return robot_from_dict(load_urdf(source).content, str(source))
     if path.suffix.lower() not in PARSERS:
         if len(str(source)) < 200 and path.exists():
-            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}")
+            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}, .urdf")
         near = difflib.get_close_matches(str(source), builtin_robots(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
         raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")

@@ -8,18 +8,23 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     "errors kinematics solvers.status",
-    "files gravity tables solvers.least_squares solvers.minimax",
-    "metrics robot data",
-    "parameters gates history where",
-    "effects.scene faults",
+    "files frames gravity tables importers.sheet solvers.least_squares solvers.minimax",
+    "urdf_file",
+    "urdf",
+    "metrics robot data importers.reading",
+    "parameters gates history where importers.rapid importers.leica importers.robodk"
+    " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
+    " importers.smr_files importers.columns importers.join importers.times importers.units",
+    "effects.scene faults importers.assemble",
     "effects.compliance effects.bending effects.gears effects.time",
-    "effects.table",
+    "effects.table datasets import_command",
     "model cell",
-    "identify start worst extend noise",
-    "calibration simulate minimize mixups spectrum structure",
-    "evidence",
-    "calibrate figures diagnosis rivals",
-    "words pictures sheets separate",
+    "identify start worst extend noise exporters.job",
+    "calibration simulate minimize mixups spectrum structure exporters.correct exporters.dh_csv"
+    " exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
+    "evidence compensate exporters.urdf",
+    "calibrate figures diagnosis rivals compensate_command exporters.table",
+    "words pictures sheets separate export_command",
     "diagnose",
     "cli",
 )
