@@ -31,7 +31,7 @@ from minimax_cal.rivals import ENOUGH, resemblances, rivals
 from minimax_cal.robot import Robot, load_robot
 from minimax_cal.separate import Site, separate_with
 from minimax_cal.structure import Trace, rest_of, structure
-from minimax_cal.where import where
+from minimax_cal.where import Where, where
 from minimax_cal.words import reasons
 
 LEVEL = 0.01  # chance that noise alone is called structure
@@ -133,25 +133,11 @@ def diagnose(
     floor, source = noise_floor(study.rows, choice.noise, sound, cells[-1], steps[-1].train)
     findings = with_shares([*fault_findings(wrong), *effects], steps, floor)
     closed, interval = closed_share(raw_error, cells[-1].error(held), floor, seed)
-    none = np.zeros((len(study.rows.error), 0))
-    without, with_all = (
-        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
-    )
-    verdict, rest = judged(findings, traces, without - with_all)
+    verdict, rest = judged(findings, traces, explained(study, choice))
     noise = float(np.sqrt(choice.noise.variance))
     if verdict == "none" and source == REPEATS and shaky(floor, noise, steps[-1].holdout.rms_mm):
         verdict = "not_repeatable"
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = study.fit.state.rotation, study.fit.state.origin
-    lies = where(
-        train,
-        study.model.error(study.fit.state),
-        study.scene.slope,
-        base,
-        float("nan"),
-        fitted=study.model.jacobian(study.fit.state)[..., study.fit.identification.active],
-        up=robot.up,
-    )
+    lies = located(study)
     notices = (*given.notices, *notices, *remarks, *study.fit.notices)
     settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
     return Diagnosis(
@@ -182,6 +168,22 @@ def diagnose(
     )
 
 
+def located(study: Study) -> Where:
+    """Where the geometric errors of the training poses lie."""
+    state = study.fit.state
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = state.rotation, state.origin
+    return where(
+        study.data,
+        study.model.error(state),
+        study.scene.slope,
+        base,
+        float("nan"),
+        fitted=study.model.jacobian(state)[..., study.fit.identification.active],
+        up=study.robot.up,
+    )
+
+
 # ---- data faults -------------------------------------------------------------------------------
 
 
@@ -190,7 +192,8 @@ def cleaned(
 ) -> tuple[Measurements, list[Fault], tuple[str, ...], Fit | None]:
     """The data with rows and points put right or left out, the faults, and remarks.
 
-    Also the geometric fit of the training poses, where it is that of the clean data.
+    Rows of the faults are lines of the file.  Also the geometric fit of the training poses, where
+    it is that of the clean data.
     """
     rows, source = misplaced(robot, data)
     faults: list[Fault] = []
@@ -198,22 +201,27 @@ def cleaned(
         lines = ", ".join(str(data.line[row]) for row in rows[:8])
         text = f"{data.source}: rows hold each other's points: lines {lines}"
         none = np.zeros(0, dtype=int)
-        faults.append(Fault("swapped_rows", "all", rows, none, (), text))
+        faults.append(Fault("swapped_rows", "all", data.line[rows], none, (), text))
         data = put_right(data, rows, source)
     found = find_faults(data)
-    faults += [fault for fault in found if fault.effect in ("swapped_rows", "outliers")]
+    faults += in_lines(data, found, "swapped_rows", "outliers")
     data = mended(data, found)
     check_sense(robot, data)
     train, _, _ = split(data, holdout, seed)
     report("geometry")
     fit = fit_cell(robot, train, SUM, report)
     error = Cell.of(robot, fit.state, data.targets).error(data)
-    more = [fault for fault in find_faults(data, error) if fault.effect == "outliers"]
-    faults += more
-    data = mended(data, tuple(more))
+    more = tuple(fault for fault in find_faults(data, error) if fault.effect == "outliers")
+    faults += in_lines(data, more, "outliers")
+    data = mended(data, more)
     data = data.take(np.asarray(data.seen.any(axis=1)))
-    remarks = tuple(fault.text for fault in (*found,) if fault.notice or fault in faults)
+    remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
     return data, faults, remarks, None if more else fit
+
+
+def in_lines(data: Measurements, faults: Sequence[Fault], *effects: str) -> list[Fault]:
+    """Faults of some kinds, their rows as lines of the file."""
+    return [replace(f, rows=data.line[f.rows]) for f in faults if f.effect in effects]
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
@@ -235,7 +243,8 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     error = np.where(study.model.seen[..., None], error, np.nan)
     error = error @ study.fit.state.rotation.T
     push = np.einsum("ab,nkbm->kman", study.fit.state.rotation, study.scene.slope)
-    return list(looks_read_back(study.data, error, push * study.robot.sign))
+    found = looks_read_back(study.data, error, push * study.robot.sign)
+    return in_lines(study.data, found, "readback")
 
 
 def fault_findings(faults: Sequence[Fault]) -> list[Finding]:
@@ -375,6 +384,15 @@ def shaky(floor: float, noise: float, error: float) -> bool:
     error: held-out RMS [mm].
     """
     return floor > SHAKY * 1e3 * np.sqrt(3.0) * noise and floor > error / SHAKY
+
+
+def explained(study: Study, choice: Choice) -> float:
+    """Weighed square that the effects explain."""
+    none = np.zeros((len(study.rows.error), 0))
+    without, left = (
+        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
+    )
+    return without - left
 
 
 def patched(findings: Sequence[Finding]) -> bool:
