@@ -251,13 +251,6 @@ def test_read_joints_that_agree_are_nothing(robot: mc.Robot, rng: np.random.Gene
         assert all("settled" not in fault.text for fault in found)  # noise is no lag
 
 
-def test_round_joint_values_were_typed(robot: mc.Robot) -> None:
-    data = simulate(robot, 50, 3, seed=1).data
-    assert faults.round_joints(data) < 0.02
-    typed = replace(data, q=np.radians(np.round(np.degrees(data.q), 1)))
-    assert faults.round_joints(typed) == 1.0
-
-
 def halves(data: Measurements) -> Measurements:
     session = np.array(["a"] * (data.poses // 2) + ["b"] * (data.poses - data.poses // 2))
     return replace(data, columns={**data.columns, "session": session})

@@ -8,17 +8,21 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     "errors kinematics solvers.status",
-    "files frames gravity tables importers.sheet solvers.least_squares solvers.minimax",
+    "files frames gravity tables importers.sheet solvers.least_squares solvers.minimax"
+    " faults.chance faults.fault where.gaps where.rows",
     "urdf_file",
     "urdf",
-    "metrics robot data importers.reading",
-    "parameters gates history where importers.rapid importers.leica importers.robodk"
+    "metrics robot data importers.reading where.answer where.cuts where.residual",
+    "parameters gates history importers.rapid importers.leica importers.robodk"
     " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
-    " importers.smr_files importers.columns importers.join importers.times importers.units",
-    "effects.scene faults importers.assemble",
-    "effects.compliance effects.bending effects.gears effects.time",
-    "effects.table datasets import_command",
-    "model cell",
+    " importers.smr_files importers.columns importers.join importers.times importers.units"
+    " faults.distances where.chance where.features where.spread",
+    "effects.scene importers.assemble faults.declared faults.joints faults.nests faults.sessions"
+    " faults.surprise faults.swaps where.joints where.mean_squares where.trends",
+    "effects.compliance effects.bending effects.gears effects.time faults.outliers"
+    " where.curves where.locate",
+    "effects.table datasets import_command faults.find where",
+    "model cell faults",
     "identify start worst extend noise exporters.job",
     "calibration simulate minimize mixups spectrum structure exporters.correct exporters.dh_csv"
     " exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import shared
 from numpy.testing import assert_allclose
-from scipy.stats import binom, f
+from scipy.stats import binom
 
 import minimax_cal as mc
 from minimax_cal import kinematics
@@ -18,30 +18,13 @@ from minimax_cal.kinematics import Array
 from minimax_cal.model import model_of
 from minimax_cal.parameters import State
 from minimax_cal.simulate import Truth, gravity, simulate
-from minimax_cal.where import (
-    Where,
-    factors,
-    flat_of,
-    flips,
-    joint_equivalent,
-    joint_rows,
-    lack_of_fit,
-    levelled,
-    maps,
-    noise_of,
-    orthonormal,
-    positive,
-    residual_of,
-    scatter,
-    score_flips,
-    shape_energy,
-    shape_scatter,
-    smooth_rows,
-    structure,
-    structure_by_pose,
-    structure_p,
-    where,
-)
+from minimax_cal.where import Where, joint_equivalent, maps, noise_of, where
+from minimax_cal.where.chance import flips, score_flips, structure_by_pose
+from minimax_cal.where.features import factors, levelled, smooth_rows
+from minimax_cal.where.mean_squares import lack_of_fit
+from minimax_cal.where.residual import orthonormal, residual_of
+from minimax_cal.where.rows import joint_rows
+from minimax_cal.where.spread import scatter, shape_energy, shape_scatter
 
 SIGMA = 15e-6
 SEEDS = 300
@@ -132,30 +115,6 @@ def by_chance(p: list[float], level: float = 0.05) -> bool:
 # ---------------------------------------------------------------- distributions
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "c"), [(3, 50, 1.0), (3, 50, 0.2), (1, 1000, 0.05), (40, 1700, 3.0), (5, 100, 40.0)]
-)
-def test_positive_is_the_f_distribution(a: int, b: int, c: float) -> None:
-    """P(X_a / a > c X_b / b), from the middle to 1e-22: right to its own size."""
-    found = positive(np.array([1 / a, -c / b]), np.array([a, b], dtype=float))
-    assert_allclose(found, f.sf(c, a, b), rtol=1e-9)
-
-
-def test_positive_of_a_mixture_against_simulation(rng: np.random.Generator) -> None:
-    weight = 2.0 ** -np.arange(12)
-    count = 200_000
-    head = rng.chisquare(1, (count, 12)) @ weight
-    tail = rng.chisquare(50, count)
-    for ratio in (0.01, 0.03, 0.06, 0.12):
-        p = positive(np.append(weight, -ratio), np.append(np.ones(12), 50.0))
-        assert abs(np.mean(head > ratio * tail) - p) < 4.0 * math.sqrt(p * (1 - p) / count)
-
-
-def test_positive_of_one_sign() -> None:
-    assert positive(np.array([1.0, 2.0]), np.ones(2)) == 1.0
-    assert positive(np.array([-1.0, -2.0]), np.ones(2)) == 0.0
-
-
 @pytest.mark.parametrize("features", [3, 12, 40])
 def test_flips_against_flipping(features: int, rng: np.random.Generator) -> None:
     """By all sign patterns of twelve poses: the p of a typical and of a large total."""
@@ -184,33 +143,12 @@ def test_factors_make_the_kernel(rng: np.random.Generator) -> None:
 
 @cache
 def kernel() -> tuple[Array, Array]:
-    """Kernel rows and fitted basis of the scene, flat."""
+    """Features of the scene without what the fit spans: (m, 9, r), levelled and as they are."""
     made = scene()
-    basis = orthonormal(np.moveaxis(made.jacobian, 0, 1).reshape(-1, made.jacobian.shape[3]))
+    bare = residual_of(np.zeros(made.shape), made.jacobian, groups(made.data))
     motion = joint_rows(made.slope, np.ones((made.data.poses, 9), dtype=bool))
-    rows = flat_of(smooth_rows(made.data, motion))
-    return levelled(rows - basis @ (basis.T @ rows)), basis
-
-
-def test_structure_of_white_noise_is_uniform() -> None:
-    rows, basis = kernel()
-    p = [
-        structure(np.random.default_rng(seed).normal(size=len(rows)), rows, basis)
-        for seed in range(SEEDS)
-    ]
-    assert by_chance(p)
-    assert by_chance(p, 0.5)
-
-
-def test_structure_needs_no_noise_level_and_ignores_what_was_fitted(
-    rng: np.random.Generator,
-) -> None:
-    rows, basis = kernel()
-    residual = rng.normal(size=len(rows))
-    p = structure(residual, rows, basis)
-    assert_allclose(structure(1e-5 * residual, rows, basis), p, rtol=1e-9)
-    moved = residual + 100.0 * basis @ rng.normal(size=basis.shape[1])
-    assert_allclose(structure(moved, rows, basis), p, rtol=1e-6)
+    rows = bare.without_fit(smooth_rows(made.data, motion))
+    return levelled(rows), rows
 
 
 def smooth_error(made: Scene, rng: np.random.Generator, size: float) -> Array:
@@ -225,47 +163,28 @@ def smooth_error(made: Scene, rng: np.random.Generator, size: float) -> Array:
 def test_structure_finds_smooth_effects() -> None:
     """Effects as strong as lambda = 60 [sum (effect / sigma)^2], half of what 1035 rows of noise
     scatter by twice their standard deviation, are seen nearly always."""
-    made, (rows, basis) = scene(), kernel()
-    motion = joint_rows(made.slope, np.ones((made.data.poses, 9), dtype=bool))
-    plain = flat_of(smooth_rows(made.data, motion))
-    found, robust, steep = [], [], []
+    made, (rows, plain) = scene(), kernel()
+    found, steep = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         error = made.noise(rng) + smooth_error(made, rng, math.sqrt(60.0) * SIGMA)
-        flat = np.moveaxis(error, 0, 1).reshape(-1)
-        found.append(structure(flat, rows, basis))
-        steep.append(structure(flat, plain, basis))
         rest = residual_of(error, made.jacobian, groups(made.data))
-        robust.append(structure_by_pose(rest, rows.reshape(made.data.poses, 9, -1)))
+        found.append(structure_by_pose(rest, rows))
+        steep.append(structure_by_pose(rest, plain))
     assert np.mean(np.array(found) < 0.05) > 0.85
-    assert np.mean(np.array(robust) < 0.05) > 0.75
     assert np.median(found) < 0.3 * np.median(steep)  # what `levelled` is for
 
 
 def test_jitter_of_the_joints_is_not_structure() -> None:
-    """Poses may scatter as they like: only the test that takes points for independent is misled."""
-    made, (rows, basis) = scene(), kernel()
-    whole, naive = [], []
+    """Poses may scatter as they like, alike for all their targets."""
+    made, (rows, _) = scene(), kernel()
+    p = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
         error = made.noise(rng) + made.turned(20e-6 * rng.normal(size=(made.data.poses, 6)))
         rest = residual_of(error, made.jacobian, groups(made.data), made.slope, SIGMA)
-        whole.append(structure_by_pose(rest, rows.reshape(made.data.poses, 9, -1)))
-        if seed < 10:
-            naive.append(structure(np.moveaxis(error, 0, 1).reshape(-1), rows, basis))
-    assert by_chance(whole)
-    assert np.median(naive) < 1e-3
-
-
-def test_structure_p_of_vectors() -> None:
-    chance, found = [], []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(seed)
-        x, values = rng.normal(size=(80, 3)), rng.normal(size=(80, 2))
-        chance.append(structure_p(values, x))
-        found.append(structure_p(values + np.sin(2.0 * x[:, :2]), x))
-    assert by_chance(chance)
-    assert np.mean(np.array(found) < 0.05) > 0.95
+        p.append(structure_by_pose(rest, rows))
+    assert by_chance(p)
 
 
 # ---------------------------------------------------------------- nothing there
