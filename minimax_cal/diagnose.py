@@ -125,6 +125,8 @@ def diagnose(
         library, choice = chosen(study, (*exclude, "backlash"))
     report("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
+    if choice.noise.variance < evidence.EXACT**2:
+        traces = (Trace("rounding", 1.0, 0.0),)
     order = by_weight(study, choice)
     effects = merged([finding(study, choice, i) for i in order])
     report("gap ladder")

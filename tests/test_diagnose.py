@@ -13,6 +13,7 @@ from experiments.gap_cases import Case, Cause, Sealed, make
 from minimax_cal.diagnose import closed_share
 from minimax_cal.diagnosis import VERDICTS
 from minimax_cal.mixups import misplaced, put_right
+from minimax_cal.simulate import Simulation
 from tests.conftest import shared
 
 
@@ -179,6 +180,12 @@ def test_closed_share_is_of_squares_above_the_floor() -> None:
     assert low < share < high
     none = closed_share(before * 0.0, before * 0.0, 1.0, 0)
     assert np.isnan(none[0])
+
+
+def test_computed_points_have_no_gap(clean: Simulation, robot: mc.Robot) -> None:
+    found = mc.diagnose(robot, clean.data)
+    assert found.verdict == "none"
+    assert found.ladder[1].holdout.rms_mm < 1e-6
 
 
 def test_user_errors_say_what_to_do(robot: mc.Robot) -> None:
