@@ -239,21 +239,28 @@ def test_ur10_has_lines_at_about_17_a_turn() -> None:
     assert found.ladder[-1].holdout.rms_mm < 0.75 * found.ladder[1].holdout.rms_mm
 
 
-def test_irb120_gives_way_at_its_joints() -> None:
+def irb120(every: int, *, read_back: bool = False) -> mc.Diagnosis:
+    """The IRB 120's diagnosis on some of its rows, with commanded or read-back joints."""
     robot, path = shared("irb120")
-    found = mc.diagnose(robot, path)
+    data = mc.read_measurements(path)
+    q = np.stack([data.columns[f"qread{j + 1}"] for j in range(6)], axis=1)
+    kept = {k: v for k, v in data.columns.items() if not k.startswith(("qread", "base"))}
+    data = replace(data, q=q, columns=kept) if read_back else data
+    return mc.diagnose(mc.load_robot(robot), data.take(np.arange(0, data.poses, every)))
+
+
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_irb120_gives_way_at_its_joints(every: int) -> None:
+    found = irb120(every)
     assert found.findings[0].term.effect == "joint_compliance"
     final = found.ladder[-1].holdout
     assert final.rms_mm <= 0.10
     assert final.max_mm <= 0.35
 
 
+@pytest.mark.slow
 def test_read_back_joints_are_not_called_backlash() -> None:
-    robot, path = shared("irb120")
-    data = mc.read_measurements(path)
-    q = np.stack([data.columns[f"qread{j + 1}"] for j in range(6)], axis=1)
-    kept = {k: v for k, v in data.columns.items() if not k.startswith(("qread", "base"))}
-    found = mc.diagnose(mc.load_robot(robot), replace(data, q=q, columns=kept))
-    names = {f.term.effect for f in found.findings}
+    """Every row is needed: a row tells of its move only if the pose before it is there."""
+    names = {f.term.effect for f in irb120(1, read_back=True).findings}
     assert names & {"readback", "settling"}
     assert "backlash" not in names
