@@ -3,9 +3,7 @@
 import dataclasses
 import json
 import pickle
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -410,9 +408,7 @@ def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -
         return {GAIN: 1.0, J2: 0.7}
 
     monkeypatch.setattr(mc, "diagnose", diagnose, raising=False)
-    monkeypatch.setitem(
-        sys.modules, "minimax_cal.evidence", SimpleNamespace(resemblance=resemblance)
-    )
+    monkeypatch.setattr(blind_gap, "resemblance", resemblance)
     case = Case("irb2600", "single", (Cause(*GAIN, 1000.0),), poses=60, seed=8)
     row = blind_gap.run(case)
     assert given == [("robot.json", "data.csv", {"seed": 8, "exclude": ()})]
