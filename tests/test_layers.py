@@ -8,9 +8,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     "errors kinematics solvers.status",
-    "files frames gravity tables importers.sheet solvers.least_squares solvers.minimax"
+    "files frames gravity tables intervals importers.sheet solvers.least_squares solvers.minimax"
     " faults.chance faults.fault where.gaps where.rows",
-    "urdf_file",
+    "urdf_file solvers.cones",
     "urdf",
     "metrics robot data importers.reading where.answer where.cuts where.residual",
     "parameters gates history importers.rapid importers.leica importers.robodk"
@@ -23,12 +23,16 @@ LAYERS = (
     " where.curves where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
-    "identify start worst extend noise exporters.job",
-    "calibration simulate minimize mixups spectrum structure exporters.correct exporters.dh_csv"
+    "identify start worst extend noise robust visibility iso9283 exporters.job",
+    "uncertainty relative iso9283_command",
+    "calibration simulate minimize relative_command mixups spectrum structure exporters.correct exporters.dh_csv"
     " exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
     "evidence compensate exporters.urdf",
     "calibrate figures diagnosis rivals compensate_command exporters.table",
-    "words pictures sheets separate export_command",
+    "words pictures sheets separate export_command point_cones tradeoff bootstrap planning maps",
+    "tradeoff_command plan_command map_command report.content",
+    "report.charts report.scene report.page",
+    "report report_command",
     "diagnose",
     "cli",
 )
