@@ -169,7 +169,8 @@ def calibrate(
         worst=fit.worst,
         distances=fit.distances,
         trace=fit.trace,
-        train_lines=train.line,
+        data=data,
+        held=np.isin(data.line, held.line),
         notices=notices,
         provenance=Provenance.of(robot, data, settings_of(chosen)),
     )

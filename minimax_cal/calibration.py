@@ -19,6 +19,7 @@ from minimax_cal.identify import Identification
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import Accuracy
 from minimax_cal.parameters import State
+from minimax_cal.poses import pose_rows
 from minimax_cal.robot import Robot
 from minimax_cal.solvers.minimax import Optimum
 from minimax_cal.solvers.status import Status
@@ -88,7 +89,7 @@ class Calibration:
     predicted points under the same keys, NaN where not measured [m].  covariance: (p, p) of all
     parameters, NaN where not identified [SI, base in its own axes].  worst: the minimax answer, if
     one was asked for.  trace: cost at each iterate of the least squares [m^2].
-    train_lines: lines of the file that were fitted.
+    data: all poses, with their history where effects need it.  held: (m,) True where held out.
     """
 
     robot: Robot
@@ -107,7 +108,8 @@ class Calibration:
     worst: tuple[Optimum[State], ...]
     distances: Distances
     trace: tuple[float, ...]
-    train_lines: Array
+    data: Measurements
+    held: Array
     notices: tuple[str, ...]
     provenance: Provenance
 
@@ -209,7 +211,7 @@ class Calibration:
             return self.cell.targets
         seen = np.isfinite(self.errors["train"][..., 0])
         return tuple(
-            f"{self.cell.targets[target]} line {self.train_lines[pose]}"
+            f"{self.cell.targets[target]} line {self.data.line[~self.held][pose]}"
             for target, pose in np.argwhere(seen)
         )
 
@@ -256,6 +258,7 @@ class Calibration:
             "robot": self.robot.to_dict(),
             "nominal_robot": self.nominal.robot.to_dict(),
             **self.cell.to_dict(),
+            "nominal_cell": self.nominal.to_dict(),
             "objective": self.objective,
             "qp": self.qp,
             "status": str(self.status),
@@ -266,6 +269,11 @@ class Calibration:
             "accuracy": {key: value.to_dict() for key, value in self.accuracy.items()},
             "condition": finite(self.identification.condition),
             "trace_mm2": [value * 1e6 for value in self.trace],
+            "poses": pose_rows(
+                self.data,
+                self.held,
+                {"nominal": self.nominal.error(self.data), "final": self.cell.error(self.data)},
+            ),
             "notices": list(self.notices),
             "provenance": vars(self.provenance),
         }

@@ -98,6 +98,10 @@ class Cell:
             "effects": self.effects.to_list(),
         }
 
+    def whole(self) -> dict[str, Any]:
+        """`to_dict` with the robot, as `cell_from_dict` reads it."""
+        return {"robot": self.robot.to_dict(), **self.to_dict()}
+
 
 def still(q: Array, targets: tuple[str, ...], robot: Robot) -> Measurements:
     """Poses (m, n) that no motion led to, at the start of a session."""

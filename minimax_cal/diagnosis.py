@@ -9,11 +9,14 @@ from typing import Any
 
 from minimax_cal.calibration import Provenance, finite
 from minimax_cal.cell import Cell
+from minimax_cal.curves import Leftover, order_curve, residual_curve
 from minimax_cal.data import Measurements
 from minimax_cal.effects.table import Term
 from minimax_cal.files import json_text, write_whole
+from minimax_cal.history import with_history
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import Accuracy
+from minimax_cal.poses import pose_rows
 from minimax_cal.solvers.status import Status
 from minimax_cal.tables import Cell as TableCell
 from minimax_cal.tables import Table
@@ -151,8 +154,14 @@ class Diagnosis:
     cells: tuple[Cell, ...]
     maps: Array
 
+    def leftover(self) -> Leftover:
+        """What geometry leaves and what the effects leave, pose by pose."""
+        found = [finding.term for finding in self.findings]
+        return Leftover.of(self.data, self.held, self.noise, self.cells, found)
+
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more."""
+        left, told = self.leftover(), with_history(self.data)
 
         def held(kind: str) -> dict[str, float | None]:
             chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
@@ -191,6 +200,16 @@ class Diagnosis:
             "structure": {"p": finite(self.structure), "in": self.structure_in},
             "where": dict(self.where),
             "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
+            "curves": {
+                "residual": residual_curve(left).to_dict(),
+                "order": order_curve(left).to_dict(),
+            },
+            "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
+            "poses": pose_rows(
+                self.data,
+                self.held,
+                {"geometric": self.cells[0].error(told), "final": self.cells[-1].error(told)},
+            ),
             "notices": list(self.notices),
             "seconds": self.seconds,
             "provenance": vars(self.provenance),

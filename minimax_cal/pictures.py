@@ -3,233 +3,18 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from minimax_cal.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
 from minimax_cal.diagnosis import Diagnosis
-from minimax_cal.effects.scene import Scene
-from minimax_cal.effects.table import Fitted, Term
 from minimax_cal.errors import OptionError
 from minimax_cal.figures import AFTER, BEFORE, save
-from minimax_cal.history import numbered, visits, with_history
 from minimax_cal.kinematics import Array
-from minimax_cal.where import joint_equivalent
 
-BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
-LINEAR = ("encoder_gain", "joint_coupling")
-BY_MOVE = {"backlash": "approach", "settling": "move"}
-BY_TIME = ("thermal_growth", "frame_drift", "target_shift")
-VIEWS = {  # what is drawn: name, colour
-    "geometry alone": BEFORE,
-    "with effects": AFTER,
-    "the first effect taken out": "#999999",
-}
-FLAT = 1e-6  # of its size: what varies less does not vary
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Something against something.
-
-    x: (m,) or (k, m).  y: of each of VIEWS, or of the first ones, the shape of x.
-    """
-
-    title: str
-    xlabel: str
-    ylabel: str
-    x: Array
-    y: tuple[Array, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Leftover:
-    """What geometry leaves, then what the effects leave.
-
-    errors: (k, m, 3) of the first views in base axes, NaN where not measured [m].
-    law: as errors, of the fit with effects once the first effect is taken out; none without one.
-    points: (k, m, 3) measured, in base axes [m].  term: the first effect that was fitted, if any.
-    """
-
-    diagnosis: Diagnosis
-    scene: Scene
-    errors: tuple[Array, ...]
-    law: tuple[Array, ...]
-    points: Array
-    term: tuple[Term, ...]
-
-    @staticmethod
-    def of(diagnosis: Diagnosis) -> Leftover:
-        """From the first and the last cell of a diagnosis."""
-        data = with_history(diagnosis.data)
-        first, last = diagnosis.cells[0], diagnosis.cells[-1]
-        cells = (first, last) if last.effects.terms else (first,)
-        axes, origin = first.base[:3, :3], first.base[:3, 3]
-        known = {term.label for term in last.effects.terms}
-        term = tuple(f.term for f in diagnosis.findings if f.term.label in known)[:1]
-        law = tuple(replace(last, effects=without(last.effects, one)) for one in term)
-        return Leftover(
-            diagnosis=diagnosis,
-            scene=first.scene(data),
-            errors=tuple(cell.error(data) @ axes for cell in cells),
-            law=tuple(cell.error(data) @ axes for cell in law),
-            points=np.moveaxis((data.y - origin) @ axes, 1, 0),
-            term=term,
-        )
-
-    def distances(self) -> list[Array]:
-        """(k, m) sizes of the errors of each view [mm]."""
-        return [1e3 * np.linalg.norm(error, axis=-1) for error in self.errors]
-
-
-def without(effects: Fitted, term: Term) -> Fitted:
-    """Fitted effects less one, all its lines."""
-    kept = [i for i, other in enumerate(effects.terms) if other.label != term.label]
-    return Fitted(tuple(effects.terms[i] for i in kept), tuple(effects.values[i] for i in kept))
-
-
-# ---- the residual map --------------------------------------------------------------------------
-
-
-def turns(left: Leftover) -> list[Array]:
-    """(m, n) what each joint would have to turn to explain the errors of each view [rad, m].
-
-    Of all views at once, so that one ridge serves them all and they compare.
-    """
-    views = (*left.errors, *left.law)
-    slope = np.concatenate([left.scene.slope] * len(views), axis=-1)
-    together = np.concatenate(views, axis=1)
-    return np.split(joint_equivalent(together, slope, left.diagnosis.noise), len(views), axis=0)
-
-
-def guilty(left: Leftover, turn: list[Array]) -> int:
-    """Index of the joint to show: the effect's own, else the one whose part shrinks most.
-
-    Without an effect, the one that moves the targets most.
-    """
-    place = left.term[0].place if left.term else ""
-    if place[:1] == "J":
-        return int(place[1:]) - 1
-    lever = np.sqrt(np.nanmean((left.scene.slope**2).sum(axis=2), axis=(1, 2)))
-    fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
-    size = fell * lever**2
-    effect = left.term[0].effect if left.term else ""
-    if effect in BY_WEIGHT:
-        torque = left.scene.gravity
-        size = np.where(np.ptp(torque, axis=1) > FLAT * np.abs(torque).max(), size, -np.inf)
-    elif effect in BY_MOVE:
-        moved = [left.scene.has(f"{BY_MOVE[effect]}{j + 1}") for j in range(left.scene.joints)]
-        size = np.where(moved, size, -np.inf)
-    return int(np.argmax(size))
-
-
-def value_of(scene: Scene, joint: int) -> tuple[str, Array]:
-    """A joint's own value, as people read it."""
-    if scene.robot.prismatic[joint]:
-        return f"joint {joint + 1} (mm)", 1e3 * scene.data.q[:, joint]
-    return f"joint {joint + 1} (deg)", np.degrees(scene.data.q[:, joint])
-
-
-def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
-    """(m,) what the law of an effect looks at, for people, with its unit."""
-    name, stem = term.effect, BY_MOVE.get(term.effect, "")
-    if name == "gear_ripple":
-        period = 360.0 / term.choice["turns"]
-        return f"joint {joint + 1} within a wave of {period:.3g}° (deg)", np.mod(
-            np.degrees(scene.q[joint]), period
-        )
-    if name == "joint_coupling":
-        return value_of(scene, int(term.choice["source"]) - 1)
-    if name in BY_WEIGHT:
-        return f"static torque of joint {joint + 1} (N m)", scene.gravity[joint]
-    if stem and scene.has(f"move{joint + 1}"):
-        sliding = bool(scene.robot.prismatic[joint])
-        move = scene.column(f"move{joint + 1}")
-        unit, scale = ("mm", 1e3) if sliding else ("deg", 180.0 / np.pi)
-        return f"last move of joint {joint + 1} ({unit})", scale * move
-    if stem:
-        return f"side that joint {joint + 1} came from (-1 or 1)", scene.column(
-            f"{stem}{joint + 1}"
-        )
-    if name == "tool_flex":
-        tilt = np.clip((scene.links.axes[2] * scene.robot.up[:, None]).sum(axis=0), -1.0, 1.0)
-        return "flange axis from the vertical (deg)", np.degrees(np.arccos(tilt))
-    if name in BY_TIME and "temperature" in term.choice:
-        return "temperature (°C)", scene.data.columns["temperature"].astype(float)
-    if name in BY_TIME:
-        return "time in the session (0 first, 1 last)", scene.column("clock")
-    return value_of(scene, joint)
-
-
-def along_motion(left: Leftover, term: Term) -> Curve:
-    """What is left of the targets along the motion that an effect gives them."""
-    scene, names = left.scene, left.scene.data.targets
-    chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
-    sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
-    if term.effect == "target_offset":
-        motion, words = sight, "along the line of sight"
-        xlabel, x = "distance from the instrument (m)", np.linalg.norm(sight, axis=1)
-    else:
-        motion, words = motion_of(left, term), f"along its {term.effect.partition('_')[2]}"
-        xlabel, time = against(scene, term, 0)
-        x = np.broadcast_to(time, (len(names), len(time)))
-    along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
-    views = (*left.errors, *left.law)
-    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in views)
-    whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
-    title = f"error of {whose}, for {term.effect} {term.place}"
-    return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
-
-
-def motion_of(left: Leftover, term: Term) -> Array:
-    """(k, 3, m) how an effect moves the targets, as fitted; a nest as if it had always sat so."""
-    fitted = left.diagnosis.cells[-1].effects
-    value = fitted.values[[other.label for other in fitted.terms].index(term.label)]
-    always = {"since": -1.0} if "since" in term.choice else {}
-    columns = replace(term, choice={**term.choice, **always}).columns(left.scene)
-    return np.asarray(np.tensordot(value, columns.displacement(left.scene), 1))
-
-
-def residual_curve(left: Leftover) -> Curve:
-    """The errors as turns of the guilty joint, against what its effect depends on."""
-    if left.term and left.term[0].effect in ("target_offset", *BY_TIME):
-        return along_motion(left, left.term[0])
-    turn = turns(left)
-    joint = guilty(left, turn)
-    xlabel, x = (
-        against(left.scene, left.term[0], joint) if left.term else value_of(left.scene, joint)
-    )
-    unit = "mm" if left.scene.robot.prismatic[joint] else "mrad"
-    what = "travel" if unit == "mm" else "turn"
-    title = f"errors as a {what} of joint {joint + 1}"
-    if left.term:
-        title += f", for {left.term[0].effect} {left.term[0].place}"
-    if left.term and left.term[0].effect in LINEAR:  # a constant turn is geometry: leave it out
-        turn[-1] = turn[-1] - turn[-1].mean(axis=0)
-    return Curve(
-        title,
-        xlabel,
-        f"equivalent {what} of joint {joint + 1} ({unit})",
-        x,
-        tuple(1e3 * part[:, joint] for part in turn),
-    )
-
-
-def order_curve(left: Leftover) -> Curve:
-    """The error of each pose as it was visited."""
-    data = left.diagnosis.data
-    place = np.empty(data.poses)
-    place[visits(data)] = np.arange(1, data.poses + 1)
-    told = numbered(data)
-    rms = tuple(
-        np.sqrt(np.nansum(d**2, axis=0) / np.maximum(np.isfinite(d).sum(axis=0), 1))
-        for d in left.distances()
-    )
-    title = "error by visit order" if told else "error by row (the file tells no order)"
-    label = "visit (first to last)" if told else "row of the data"
-    return Curve(title, label, "error of a pose, RMS of its targets (mm)", place, rms)
+COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
 
 
 # ---- drawing -----------------------------------------------------------------------------------
@@ -287,8 +72,8 @@ def outside(axes: Any, columns: int) -> None:
 
 def draw_curve(axes: Any, left: Leftover, curve: Curve, *, log: bool = False) -> None:
     """Points of training poses small and pale, of held-out poses large."""
-    held = np.broadcast_to(left.diagnosis.held, curve.x.shape)
-    for number, (y, (name, colour)) in enumerate(zip(curve.y, VIEWS.items(), strict=False)):
+    held = np.broadcast_to(left.held, curve.x.shape)
+    for number, (y, (name, colour)) in enumerate(zip(curve.y, COLOURS.items(), strict=False)):
         depth = 2.0 + number % 2  # the last view lies under the others
         axes.plot(curve.x[~held], y[~held], ".", color=colour, ms=4, alpha=0.5, zorder=depth)
         axes.plot(curve.x[held], y[held], "o", color=colour, ms=5, label=name, zorder=depth)
@@ -332,7 +117,7 @@ def draw_maps(part: Any, left: Leftover) -> None:
     grid = part.subplots(
         len(sizes), 2, squeeze=False, sharex=True, sharey="row" if wide else "none"
     )
-    panels = [(view, *each) for view in views for each in zip(sizes, VIEWS, strict=False)]
+    panels = [(view, *each) for view in views for each in zip(sizes, COLOURS, strict=False)]
     for axes, ((view, down, label), size, name) in zip(grid.flat, panels, strict=True):
         order = np.argsort(np.nan_to_num(size), axis=None)  # the worst on top
         shown = axes.scatter(
@@ -379,7 +164,7 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
     except ModuleNotFoundError as error:
         raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
     mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
-    left = Leftover.of(diagnosis)
+    left = diagnosis.leftover()
     residual, order = residual_curve(left), order_curve(left)
     figure = Figure(figsize=(12.5, 10), layout="constrained")
     title = textwrap.fill(f"{diagnosis.robot}: {verdict_of(diagnosis)}", 110)

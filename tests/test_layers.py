@@ -17,14 +17,14 @@ LAYERS = (
     " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
     " importers.smr_files importers.columns importers.join importers.times importers.units"
     " faults.distances where.chance where.features where.spread",
-    "effects.scene importers.assemble faults.declared faults.joints faults.nests faults.sessions"
+    "effects.scene poses importers.assemble faults.declared faults.joints faults.nests faults.sessions"
     " faults.surprise faults.swaps where.joints where.mean_squares where.trends",
     "effects.compliance effects.bending effects.gears effects.time faults.outliers"
     " where.curves where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
     "identify start worst extend noise robust visibility iso9283 exporters.job",
-    "uncertainty relative iso9283_command",
+    "uncertainty relative iso9283_command curves",
     "calibration simulate minimize relative_command mixups spectrum structure exporters.correct exporters.dh_csv"
     " exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
     "evidence compensate exporters.urdf",

@@ -7,11 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal import pictures
+from minimax_cal import curves, pictures
 from minimax_cal.diagnosis import Diagnosis
 from minimax_cal.effects.table import EFFECTS, Fitted, Term
 from minimax_cal.history import with_history
-from minimax_cal.pictures import Leftover
 from minimax_cal.simulate import Truth, simulate
 
 ROBOT = mc.load_robot("ur10")
@@ -59,16 +58,16 @@ def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> 
     found = diagnosed("none", targets)
     assert not found.findings
     pictures.save_diagnosis(found, tmp_path / "gap.svg")
-    left = Leftover.of(found)
+    left = found.leftover()
     assert len(left.errors) == 1
-    assert len(pictures.residual_curve(left).y) == 1
-    assert "no order" in pictures.order_curve(left).title
+    assert len(curves.residual_curve(left).y) == 1
+    assert "no order" in curves.order_curve(left).title
     assert pictures.verdict_of(found) == "nothing beyond geometry and noise was found"
 
 
 def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:
-    left = Leftover.of(diagnosed("backlash"))
-    curve = pictures.residual_curve(left)
+    left = diagnosed("backlash").leftover()
+    curve = curves.residual_curve(left)
     assert "joint 3" in curve.title
     assert curve.xlabel == "last move of joint 3 (deg)"
     before, after, law = curve.y
@@ -90,8 +89,8 @@ def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:
 def test_effects_on_targets_are_drawn_along_their_motion(
     case: str, label: str, late: float, tmp_path: Path
 ) -> None:
-    left = Leftover.of(diagnosed(case))
-    curve = pictures.residual_curve(left)
+    left = diagnosed(case).leftover()
+    curve = curves.residual_curve(left)
     assert curve.xlabel.startswith(label)
     before, after, law = curve.y
     assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
@@ -104,10 +103,10 @@ def test_effects_on_targets_are_drawn_along_their_motion(
 
 def test_errors_are_those_of_the_ladder() -> None:
     found = diagnosed("backlash")
-    left = Leftover.of(found)
+    left = found.leftover()
     for distance, step in zip(left.distances(), (found.ladder[1], found.ladder[-1]), strict=True):
         assert_allclose(np.sqrt(np.mean(distance[:, found.held] ** 2)), step.holdout.rms_mm)
-    rms = pictures.order_curve(left).y[1]
+    rms = curves.order_curve(left).y[1]
     assert_allclose(np.sqrt(np.mean(rms[found.held] ** 2)), found.ladder[-1].holdout.rms_mm)
 
 
@@ -116,7 +115,7 @@ def test_visits_are_in_their_order() -> None:
     order = found.data.columns["order"][::-1].copy()
     turned = replace(found, data=replace(found.data, columns={
         **with_history(found.data).columns, "order": order}))  # fmt: skip
-    curve = pictures.order_curve(Leftover.of(turned))
+    curve = curves.order_curve(turned.leftover())
     assert_allclose(curve.x, np.arange(60, 0, -1))
 
 
@@ -124,12 +123,12 @@ def test_visits_are_in_their_order() -> None:
 def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
     """With its unit, one number for each pose."""
     found = diagnosed("backlash")
-    scene = Leftover.of(found).scene
+    scene = found.leftover().scene
     effect = EFFECTS[name]
     place = effect.places(scene)[0]
     choices = effect.choices(scene, place) or ({"turns": 100.0},)
     for choice in choices:
-        label, values = pictures.against(scene, Term(name, place, choice), 2)
+        label, values = curves.against(scene, Term(name, place, choice), 2)
         assert values.shape == (60,)
         assert np.isfinite(values).all()
         assert np.ptp(values) > 0.0
