@@ -10,44 +10,46 @@ from pathlib import Path
 import click
 import numpy as np
 
+from minimax_cal import options
 from minimax_cal.compensate import FRAMES, Compensation, compensate
-from minimax_cal.data import (
+from minimax_cal.csv_columns import (
     JOINT,
     TARGET,
     TEXT,
     UNITS,
-    Measurements,
+    Rows,
     header_check,
     near,
-    numbers,
     optional_kind,
+    read_rows,
+    whole_rows,
 )
+from minimax_cal.data import Measurements
 from minimax_cal.errors import DataError
-from minimax_cal.files import check_writable, json_text, read_text, write_whole
+from minimax_cal.files import json_text, write_whole
 from minimax_cal.kinematics import Array
+from minimax_cal.options import FAILED, WIDTH
 from minimax_cal.robot import load_robot
 
 ADDED = ("residual_mm", "residual_mrad", "status")
 USED = ("order", "temperature", "payload", "tau", "approach", "session")
 ANY_TARGET = ["smr1_x_mm", "smr1_y_mm", "smr1_z_mm"]  # the header's rules ask for one
-FAILED, WIDTH = 1, 110
 
 
 @dataclass(frozen=True, eq=False)
 class TargetFile:
     """A file of joint targets: its cells as text, and what they mean."""
 
-    header: list[str]
-    rows: list[list[str]]
+    file: Rows
     data: Measurements
 
     def corrected(self, found: Compensation) -> str:
         """The same file with other joints, and what remains at each target."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*self.header, *ADDED])
-        joints = {i: m for i, name in enumerate(self.header) if (m := JOINT.fullmatch(name))}
-        for k, row in enumerate(self.rows):
+        writer.writerow([*self.file.header, *ADDED])
+        joints = {i: m for i, name in enumerate(self.file.header) if (m := JOINT.fullmatch(name))}
+        for k, row in enumerate(self.file.rows):
             out = list(row)
             for i, match in joints.items():
                 out[i] = f"{found.q[k, int(match[1]) - 1] / UNITS[match[2]]:.9f}"
@@ -61,20 +63,8 @@ def read_targets(path: Path | str) -> TargetFile:
 
     Raises DataError.
     """
-    text = read_text(path, kind=DataError)
-    if "\0" in text:
-        raise DataError(f"{path}: is not a text file; expected CSV")
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except csv.Error as error:
-        raise DataError(f"{path}:{reader.line_num}: is not CSV ({error})") from error
-    filled = [(number, row) for number, row in lines if any(row)]
-    if not filled:
-        raise DataError(f"{path}: is empty")
-    (_, header), *body = filled
-    while header and not header[-1]:  # a trailing comma
-        header.pop()
+    file = read_rows(path)
+    header = file.header
     header_check(path, [name for name in header if not TARGET.fullmatch(name)] + ANY_TARGET)
     done = [name for name in ADDED if name in header]
     if done:
@@ -82,38 +72,30 @@ def read_targets(path: Path | str) -> TargetFile:
             f"{path}:1: column {done[0]}: these joints are corrected already, and would be twice; "
             "give the targets as programmed"
         )
-    if not body:
-        raise DataError(f"{path}: holds a header but no rows")
-    for at, row in body:
-        if len(row) < len(header) or any(row[len(header) :]):
-            raise DataError(f"{path}:{at}: {len(row)} cells, but the header has {len(header)}")
-    rows = [row[: len(header)] for _, row in body]
-    line = np.array([number for number, _ in body])
-    cells = {name: [row[i] for row in rows] for i, name in enumerate(header)}
-    joints = sorted((int(m[1]), m[2], name) for name in header if (m := JOINT.fullmatch(name)))
-    q = [numbers(path, name, cells[name], line, empty=False) * UNITS[u] for _, u, name in joints]
+    file = whole_rows(file)
+    q, sliding = file.joints()
     columns: dict[str, Array] = {}
     notices = []
     for name in header:
         kind, match = optional_kind(name)
         if kind in USED and kind in TEXT:
-            columns[name] = np.array(cells[name])
+            columns[name] = np.array(file.text(name))
         elif kind in USED and match:
             stem = name.removesuffix(f"_{match[1]}") if match.re.groups else name
-            columns[stem] = numbers(path, name, cells[name], line, empty=True)
+            columns[stem] = file.number(name, empty=True)
         elif not (kind or JOINT.fullmatch(name) or TARGET.fullmatch(name)):
             notices.append(f"{path}: column {name} is kept and not used{near(name)}")
     data = Measurements(
-        q=np.stack(q, axis=1),
-        y=np.zeros((len(rows), 0, 3)),
+        q=q,
+        y=np.zeros((len(q), 0, 3)),
         targets=(),
-        sliding=np.array([unit in ("m", "mm") for _, unit, _ in joints]),
-        line=line,
+        sliding=sliding,
+        line=file.line,
         columns=columns,
         notices=tuple(notices),
         source=str(path),
     )
-    return TargetFile(header, rows, data)
+    return TargetFile(file, data)
 
 
 @click.command(name="compensate")
@@ -158,11 +140,9 @@ def read_targets(path: Path | str) -> TargetFile:
     show_default=True,
     help="Effects of time: as at this moment of the calibration's session, 0 to 1.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout.")
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Write the targets (CSV) to this file."
-)
-@click.option("--quiet", "-q", is_flag=True, help="No notices on stderr.")
+@options.JSON
+@options.output("the targets (CSV)")
+@options.QUIET
 def compensate_command(
     fit: Path,
     targets: Path,
@@ -181,8 +161,7 @@ def compensate_command(
     FIT is what `calibrate -o` wrote.  Without -o the corrected file goes to stdout, its summary to
     stderr.
     """
-    if output:
-        check_writable(output)
+    options.writable(output)
     given = read_targets(targets)
     found = compensate(
         fit,
@@ -194,9 +173,7 @@ def compensate_command(
         lever=float("nan") if lever is None else lever * 1e-3,
         clock=clock,
     )
-    if not quiet:
-        for notice in found.notices:
-            click.echo(f"notice: {notice}", err=True)
+    options.notify(found.notices, quiet=quiet)
     text = given.corrected(found)
     if output:
         write_whole(output, text)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import click
 
+from minimax_cal import options
 from minimax_cal.exporters.job import read_job
 from minimax_cal.exporters.table import EXPORTERS, export
-from minimax_cal.files import check_writable, write_whole
+from minimax_cal.files import write_whole
 from minimax_cal.urdf_file import read_urdf
 
 
@@ -29,8 +30,8 @@ from minimax_cal.urdf_file import read_urdf
     is_flag=True,
     help="Agree to a format whose frames its maker does not document (moc).",
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write to this file.")
-@click.option("--quiet", "-q", is_flag=True, help="No notices on stderr.")
+@options.output("the robot")
+@options.QUIET
 def export_command(
     fit: str,
     to: str,
@@ -41,13 +42,11 @@ def export_command(
     quiet: bool,
 ) -> int:
     """Write the robot of FIT (a saved calibration or a robot) as a file others can load."""
-    if output:
-        check_writable(output)
+    options.writable(output)
     originals = (read_urdf(original),) if original else ()
     job = replace(read_job(fit), originals=originals, tip=tip, experimental=experimental)
     made = export(job, to)
-    for notice in () if quiet else made.notices:
-        click.echo(f"notice: {notice}", err=True)
+    options.notify(made.notices, quiet=quiet)
     if output:
         write_whole(output, made.content)
     else:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import click
-from rich.console import Console
 
+from minimax_cal import options
 from minimax_cal.data import read_measurements
-from minimax_cal.files import check_writable, json_text
+from minimax_cal.files import json_text
 from minimax_cal.importers import Imported, import_files, save
 
 PATH = click.Path(path_type=Path)
@@ -37,9 +37,9 @@ PATH = click.Path(path_type=Path)
     help="Of a file with several points a pose: which of them follow each other.",
 )
 @click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout.")
-@click.option("--quiet", "-q", is_flag=True, help="No notices on stderr.")
-@click.option("-o", "--output", type=PATH, help="Write the measurements (CSV) to this file.")
+@options.JSON
+@options.QUIET
+@options.output("the measurements (CSV)")
 def import_command(
     files: Sequence[Path],
     joints: Path | None,
@@ -55,8 +55,7 @@ def import_command(
 
     Without -o nothing is written.
     """
-    if output:
-        check_writable(output)
+    options.writable(output)
     found = import_files(
         files,
         joints,
@@ -65,19 +64,14 @@ def import_command(
         layout=layout or "",
         decimal=decimal or "",
     )
-    notices = found.data.notices
     if output:
         save(output, found)
         read_measurements(output)  # what was written can be read
-    for notice in () if quiet else notices:
-        click.echo(f"notice: {notice}", err=True)
+    options.notify(found.data.notices, quiet=quiet)
     if as_json:
         click.echo(json_text(content(found, output)), nl=False)
         return 0
-    console = Console(highlight=False)
-    console = console if console.is_terminal else Console(highlight=False, width=110)
-    for table in (found.files(), *found.columns()):
-        console.print(table.rich())
+    options.show(found.files(), *found.columns())
     wrote = f"wrote {output}" if output else "nothing written; add -o FILE"
     click.echo(f"{found.headline()}\n{wrote}")
     return 0

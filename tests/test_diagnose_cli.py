@@ -140,7 +140,7 @@ def test_numbers_that_break_down_are_exit_1(
     def broken(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("minimax_cal.cli.diagnose", broken)
+    monkeypatch.setattr("minimax_cal.diagnose_command.diagnose", broken)
     assert run("diagnose", "ur10", "gap.csv", "-o", "gap.json") == 1
     out, err = capsys.readouterr()
     assert err.startswith("error: the numbers did not work out (Singular matrix)")

@@ -7,33 +7,35 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 LAYERS = (
-    "errors kinematics solvers.status",
-    "files frames gravity tables intervals importers.sheet solvers.least_squares solvers.minimax"
+    "errors kinematics solvers.status tables",
+    "files frames gravity intervals importers.sheet solvers.least_squares solvers.minimax"
     " faults.chance faults.fault where.gaps where.rows",
-    "urdf_file solvers.cones",
+    "options csv_columns urdf_file solvers.cones",
     "urdf",
     "metrics robot data importers.reading where.answer where.cuts where.residual",
     "parameters gates history importers.rapid importers.leica importers.robodk"
     " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
     " importers.smr_files importers.columns importers.join importers.times importers.units"
     " faults.distances where.chance where.features where.spread",
-    "effects.scene poses importers.assemble faults.declared faults.joints faults.nests faults.sessions"
-    " faults.surprise faults.swaps where.joints where.mean_squares where.trends",
+    "effects.scene poses relative_data relative_file importers.assemble faults.declared"
+    " faults.joints faults.nests faults.sessions faults.surprise faults.swaps where.joints"
+    " where.mean_squares where.trends",
     "effects.compliance effects.bending effects.gears effects.time faults.outliers"
     " where.curves where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
     "identify start worst extend noise robust visibility iso9283 exporters.job",
     "uncertainty relative iso9283_command curves",
-    "calibration simulate minimize relative_command mixups spectrum structure exporters.correct exporters.dh_csv"
-    " exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
+    "calibration simulate minimize relative_command mixups spectrum structure exporters.correct"
+    " exporters.dh_csv exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
     "evidence compensate exporters.urdf",
     "calibrate figures diagnosis rivals compensate_command exporters.table",
     "words pictures sheets separate export_command point_cones tradeoff bootstrap planning maps",
     "tradeoff_command plan_command map_command report.content",
     "report.charts report.scene report.page",
     "report report_command",
-    "diagnose",
+    "diagnose calibrate_command simulate_command",
+    "diagnose_command",
     "cli",
 )
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names.split()}
