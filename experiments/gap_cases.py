@@ -137,10 +137,9 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Sealed:
-    """A measured arm: what is told, and the truth.
+class Truth:
+    """What is wrong with an arm.
 
-    robot: as told, nominal geometry and wrong masses.  data: as measured.  true: the arm itself.
     truth: (effect, place) of every cause of the case.  background: those of the background.
     displacement: (k, m, 3) of the points by all effects, in the measurement frame [m].
     parts: (c, k, m, 3) the same by each cause of the case alone [m].  powers: (c,) lambda of each.
@@ -148,10 +147,6 @@ class Sealed:
     floor: RMS that the noise and the jitter alone leave on the held-out poses [m].
     """
 
-    case: Case
-    robot: Robot
-    data: Measurements
-    true: Robot
     truth: tuple[tuple[str, str], ...]
     background: tuple[tuple[str, str], ...]
     displacement: Array
@@ -160,6 +155,19 @@ class Sealed:
     power: float
     amplitudes: tuple[float, ...]
     floor: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sealed(Truth):
+    """A measured arm: what is told, and the truth.
+
+    robot: as told, nominal geometry and wrong masses.  data: as measured.  true: the arm itself.
+    """
+
+    case: Case
+    robot: Robot
+    data: Measurements
+    true: Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -885,20 +893,6 @@ def measured(world: World, case: Case, y: Array, rng: np.random.Generator) -> Me
 # ---- files -------------------------------------------------------------------------------------
 
 ROBOT, DATA, TRUTH = "robot.json", "data.csv", "sealed/truth.json"
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What a seal held: the fields of `Sealed` of the same names."""
-
-    truth: tuple[tuple[str, str], ...]
-    background: tuple[tuple[str, str], ...]
-    displacement: Array
-    parts: Array
-    powers: tuple[float, ...]
-    power: float
-    amplitudes: tuple[float, ...]
-    floor: float
 
 
 def write(sealed: Sealed, folder: Path) -> None:

@@ -148,12 +148,17 @@ def moved_places(scene: Scene, stem: str) -> tuple[str, ...]:
     return (*each, "all") if len(joints) > 1 else each
 
 
+def turns_by(
+    scene: Scene, joints: Sequence[int], history: Array, letter: str, unit: str
+) -> Columns:
+    """Each of some joints turns by a parameter of its own times its history (n, m)."""
+    turn = np.concatenate([one_joint(scene, j, history[j][None]) for j in joints])
+    return Columns(tuple(f"{letter}{j + 1}" for j in joints), (unit,) * len(joints), turn)
+
+
 def play(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = b/2 sign(last move of j)."""
-    joints = joints_at(place, choice)
-    side = scene.each("approach")
-    turn = np.concatenate([one_joint(scene, j, 0.5 * side[j][None]) for j in joints])
-    return Columns(tuple(f"b{j + 1}" for j in joints), ("rad",) * len(joints), turn)
+    return turns_by(scene, joints_at(place, choice), 0.5 * scene.each("approach"), "b", "rad")
 
 
 BACKLASH = Effect(
@@ -171,10 +176,7 @@ BACKLASH = Effect(
 
 def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = e (q_n - q_(n-1)), or the same moves counted up to a limit."""
-    joints = joints_at(place, choice)
-    move = scene.each("move")
-    turn = np.concatenate([one_joint(scene, j, move[j][None]) for j in joints])
-    return Columns(tuple(f"e{j + 1}" for j in joints), ("1",) * len(joints), turn)
+    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
 
 
 SETTLING = Effect(
