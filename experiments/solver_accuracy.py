@@ -16,7 +16,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from rich.progress import track
 from scipy import sparse
 
 from experiments import sweep
+from experiments.clocked import Clocked
 from experiments.qp_cases import SETS, Case
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
 
 SOLVED = 1e-6  # relative residual at which an answer counts as right
 LOOSE, TIGHT = 1e-6, 1e-9
-SETTINGS = ("ours 1e-6", "ours 1e-9", "own defaults")
+TOLERANCES = {"ours 1e-6": LOOSE, "ours 1e-9": TIGHT}
+SETTINGS = (*TOLERANCES, "own defaults")
 SHIFT = 1e-3  # of the shifted geometric mean of times [s]
 LIMIT = 3.0  # time for one problem [s]
 DIRECT = ("daqp", "quadprog", "piqp", "clarabel", "proxqp", "highs", "osqp", "scs")
@@ -129,29 +131,46 @@ def dense(matrix: Any) -> Array:
     return np.asarray(matrix.toarray() if hasattr(matrix, "toarray") else matrix)
 
 
-def attempt(case: Case, group: str, backend: str, setting: str) -> Run:
-    """Run one backend in one setting on one problem, and judge it."""
-    problem = case.problem
-    began = time.perf_counter()
-    solution = Solution(np.zeros(0), np.zeros(0), Status.FAILED, 0.0, backend)
+def own_defaults(problem: Problem, name: str) -> tuple[Solution, float]:
+    """The answer of a solver with its own defaults, and its seconds."""
+    call, answer = direct(problem, name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # solvers warn about what the judge measures
-        try:
-            if setting == "own defaults":
-                call, answer = direct(problem, backend)
-                began = time.perf_counter()
-                found = call()
-                seconds = time.perf_counter() - began
-                solution = answer(found)
-            else:
-                tolerance = LOOSE if setting == "ours 1e-6" else TIGHT
-                name = "daqp" if backend == ACROSS else backend
-                solution = solve_qp(
-                    problem, name, tolerance=tolerance, time_limit=LIMIT, fallback=backend == ACROSS
-                )
-                seconds = time.perf_counter() - began
-        except Exception:  # a third-party solver may raise anything; the row then says failed
-            seconds = time.perf_counter() - began
+        began = time.perf_counter()
+        found = call()
+        seconds = time.perf_counter() - began
+    return answer(found), seconds
+
+
+def ours(problem: Problem, name: str, tolerance: float) -> tuple[Solution, float]:
+    """The answer of our `solve`, or of its fallback order, and its seconds."""
+    across = name == ACROSS
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        began = time.perf_counter()
+        solution = solve_qp(
+            problem,
+            "daqp" if across else name,
+            tolerance=tolerance,
+            time_limit=LIMIT,
+            fallback=across,
+        )
+        return solution, time.perf_counter() - began
+
+
+def attempt(case: Case, group: str, backend: str, setting: str, clocked: Clocked) -> Run:
+    """Run one backend in one setting on one problem, and judge it."""
+    problem, seconds = case.problem, LIMIT
+    solution = Solution(np.zeros(0), np.zeros(0), Status.FAILED, 0.0, backend)
+    try:
+        if setting == "own defaults":
+            solution, seconds = clocked.call(problem, backend)
+        else:
+            solution, seconds = ours(problem, backend, TOLERANCES[setting])
+    except TimeoutError:
+        solution = replace(solution, status=Status.TIME_LIMIT)
+    except Exception as error:  # a third-party solver may raise anything; the row then says failed
+        solution = replace(solution, notes=(str(error),))
     judged = accuracy(problem, solution)
     return Run(
         group,
@@ -167,13 +186,6 @@ def attempt(case: Case, group: str, backend: str, setting: str) -> Run:
         judged.objective,
         seconds,
     )
-
-
-def unasked(case: Case, group: str, backend: str) -> Run:
-    """Not run: our call of this backend ran out of time, and its defaults may know no clock."""
-    far = float("inf")
-    return Run(group, case.name, case.kind, backend, "own defaults", "time_limit",
-               far, far, far, far, float("nan"), LIMIT)  # fmt: skip
 
 
 def references(cases: Sequence[Case]) -> dict[str, float]:
@@ -447,15 +459,11 @@ def study(quick: bool) -> tuple[dict[str, list[Run]], dict[str, list[Case]]]:
             and not (backend == "subgradient" and (setting == "ours 1e-9" or "calib" not in group))
             for case in cases
         ]
-        found: list[Run] = []
-        slow: set[tuple[str, str]] = set()
-        for case, backend, setting in track(jobs, description=group, transient=True):
-            late = setting == "own defaults" and (case.name, backend) in slow
-            run = unasked(case, group, backend) if late else attempt(case, group, backend, setting)
-            found.append(run)
-            if run.seconds >= LIMIT:
-                slow.add((case.name, backend))
-        runs[group] = found
+        with Clocked(own_defaults, LIMIT) as clocked:
+            runs[group] = [
+                attempt(case, group, backend, setting, clocked)
+                for case, backend, setting in track(jobs, description=group, transient=True)
+            ]
     return runs, problems
 
 
