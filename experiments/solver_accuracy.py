@@ -7,7 +7,7 @@ hard ones.  Each backend is asked three times: through qpsolvers with its own de
 our `solve` (no fallback) at a loose and at a tight tolerance.  A problem counts as solved where the
 judge finds primal, dual and gap at most 1e-6 relative to the problem's own scale
 (`qp_backends.accuracy` says how that is defined), whatever the solver claims.  A problem has three
-seconds; defaults, which may know no clock, are not asked where our call ran out of time.
+seconds; solvers with their own defaults, which may know no clock, run in a process that is ended.
 """
 
 from __future__ import annotations

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import qp_backends
-from minimax_cal import gates, identify, kinematics, start
+from minimax_cal import gates, identify, start
 from minimax_cal.calibration import Calibration, Parameter, Provenance
 from minimax_cal.cell import Cell
 from minimax_cal.data import Measurements, groups, read_measurements, split
 from minimax_cal.effects.table import Fitted, Term, names_of
 from minimax_cal.effects.table import terms as terms_of
-from minimax_cal.errors import DataError, OptionError
+from minimax_cal.errors import OptionError
 from minimax_cal.evidence import best_variant
 from minimax_cal.extend import extended, fitted, scene_of
 from minimax_cal.history import with_history
@@ -30,7 +30,6 @@ from minimax_cal.model import (
     Model,
     Prior,
     SumOfSquares,
-    in_base,
     model_of,
     pose_weights,
     with_poses,
@@ -38,6 +37,7 @@ from minimax_cal.model import (
 from minimax_cal.noise import linearised
 from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.robot import Robot, load_robot
+from minimax_cal.sense import POOR_FIT, check_sense
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
@@ -58,8 +58,6 @@ FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessia
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
-FEW = 30  # poses that are enough to test a slip of units or signs
-POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 
 
 @dataclass(frozen=True)
@@ -464,59 +462,6 @@ def wider(
     return found, notices
 
 
-def check_sense(robot: Robot, data: Measurements) -> None:
-    """Raise DataError for slips that show once base and targets are fitted: names, units, signs.
-
-    All rows are looked at, those held out too: they judge the fit.
-    """
-    model = model_of(robot, data)
-    frame = start.fit_frame(model, robot.mdh)
-    limit = POOR_FIT * robot.reach()
-    if len(data.targets) > 1:
-        rows = misnamed(robot, data, model, frame)
-        if len(rows):
-            lines = ", ".join(str(data.line[row]) for row in rows[:8])
-            more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
-            raise DataError(
-                f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
-                f"lines {lines}{more}; put their columns right or delete them"
-            )
-    if np.sqrt(frame.mean_square) <= limit:
-        return
-    trials = [("the measurement frame looks left-handed; reverse one of its axes", frame.mirrored)]
-    few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
-    for text, mended in gates.suspicions(robot, data.take(few)):
-        trials.append((text, start.fit_frame(model_of(robot, mended), robot.mdh).mean_square))
-    least_square = min(mean_square for _, mean_square in trials)
-    # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
-    text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
-    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < 0.04 * frame.mean_square:
-        raise DataError(
-            f"{data.source}: {text} (the nominal robot then misses by "
-            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(frame.mean_square):.3g} mm)"
-        )
-
-
-def misnamed(robot: Robot, data: Measurements, model: Model, frame: Frame) -> Array:
-    """Rows whose targets stand under each other's names.
-
-    Swapped rows pull the frame that is to find them: rename, fit again, until nothing changes.
-    """
-    names = np.arange(len(data.targets))
-    given = np.repeat(names[None], data.poses, axis=0)
-    order, fitted = given, frame
-    for _ in range(10):
-        better, _, _ = gates.best_orders(cross_errors(model, fitted.state))
-        if np.array_equal(better, order):
-            break
-        order = better
-        y = np.empty_like(data.y)
-        np.put_along_axis(y, np.repeat(order[..., None], 3, axis=2), data.y, axis=1)
-        fitted = start.fit_frame(model_of(robot, data.with_y(y)), robot.mdh)
-    good = np.sqrt(fitted.mean_square) <= 4.0 * POOR_FIT * robot.reach()
-    return gates.swapped(cross_errors(model, fitted.state)) if good else np.zeros(0, dtype=int)
-
-
 def doubts(robot: Robot, fit: Fit, nominal_error: Array) -> list[str]:
     """Notices where the result is no calibration of this robot but of another one."""
     reach, notices = robot.reach(), []
@@ -536,15 +481,6 @@ def doubts(robot: Robot, fit: Fit, nominal_error: Array) -> list[str]:
         )
         notices.append(f"implausibly large changes: {named}; is the robot file the right one?")
     return notices
-
-
-def cross_errors(model: Model, state: State) -> Array:
-    """(k, k, m) distance of measured target i from predicted target j, NaN where not measured."""
-    links = kinematics.chain(state.mdh, model.q, model.prismatic)
-    predicted = kinematics.points(links, state.targets)
-    measured = in_base(state, model.y)
-    distance = np.linalg.norm(measured[:, None] - predicted[None], axis=-2)
-    return np.where(model.seen[:, None], distance, np.nan)
 
 
 def covariance(model: Model, state: State, share: Array, weights: Array) -> Array:

@@ -12,7 +12,6 @@ import numpy as np
 
 import qp_backends
 from minimax_cal import gates, options
-from minimax_cal.calibrate import POOR_FIT
 from minimax_cal.calibrate_command import calibrate_command
 from minimax_cal.cell import evaluate, load_cell
 from minimax_cal.compensate_command import compensate_command
@@ -24,6 +23,7 @@ from minimax_cal.files import json_text
 from minimax_cal.import_command import import_command
 from minimax_cal.options import FAILED, MISUSED, show
 from minimax_cal.robot import builtin_robots, load_robot
+from minimax_cal.sense import POOR_FIT
 from minimax_cal.simulate_command import simulate_command
 from minimax_cal.tables import Table
 

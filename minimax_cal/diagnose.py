@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal import evidence, gates
-from minimax_cal.calibrate import Fit, Options, Report, check_sense, fit_cell, silent
+from minimax_cal.calibrate import Fit, Options, Report, fit_cell, silent
 from minimax_cal.calibration import Provenance
 from minimax_cal.cell import Cell
 from minimax_cal.data import Measurements, groups, read_measurements, split
@@ -29,6 +29,7 @@ from minimax_cal.model import Model, model_of
 from minimax_cal.noise import Noise, Rows, linearised
 from minimax_cal.rivals import ENOUGH, resemblances, rivals
 from minimax_cal.robot import Robot, load_robot
+from minimax_cal.sense import check_sense
 from minimax_cal.separate import Site, separate_with
 from minimax_cal.structure import Trace, rest_of, structure
 from minimax_cal.where import Where, where

@@ -25,7 +25,7 @@ LAYERS = (
     "effects.table datasets import_command faults.find where",
     "model cell faults",
     "identify start worst extend noise robust visibility iso9283 exporters.job",
-    "uncertainty relative iso9283_command curves",
+    "sense uncertainty relative iso9283_command curves",
     "calibration simulate minimize relative_command mixups spectrum structure exporters.correct"
     " exporters.dh_csv exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
     "evidence compensate exporters.urdf",
