@@ -12,8 +12,8 @@ from minimax_cal.errors import DataError
 from minimax_cal.history import numbered, visits
 from minimax_cal.kinematics import Array
 
-LABELS = ("pose", "session")  # columns of text that later steps compare
-NUMBERS = ("time", "temperature", "payload", "u95")  # in SI
+LABELS = ("pose", "session")  # columns of text; all others hold numbers, in SI
+TOLD = ("split", "order")  # columns that stand under names of their own
 
 
 def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
     """
     place = np.empty(data.poses, dtype=int)
     place[visits(data)] = np.arange(1, data.poses + 1)
-    kept = {name: data.columns[name] for name in (*LABELS, *NUMBERS) if name in data.columns}
+    kept = {name: column for name, column in data.columns.items() if name not in TOLD}
     return {
         "source": data.source,
         "line": data.line.tolist(),
