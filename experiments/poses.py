@@ -6,7 +6,6 @@ frame that the pose is given in (a spatial twist) [m, rad].
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -15,9 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.identify import RESOLUTION
+from minimax_cal.iso9283 import formulas
+from minimax_cal.iso9283.formulas import turns_of
 from minimax_cal.kinematics import Array, hat, rotation
 from minimax_cal.solvers.status import Status
-from minimax_cal.start import project
 
 X = TypeVar("X")
 CENTROID = np.zeros(3)  # the origin of a measured pose
@@ -41,9 +41,7 @@ def poses_of(shape: Array, y: Array) -> Array:
 
     shape: (k, 3) centred, its points not on a line.  y: (m, k, 3) [m].
     """
-    centre = y.mean(axis=1)
-    turn = project(np.einsum("mka,kb->mab", y - centre[:, None], shape))
-    return pose(turn, centre)
+    return pose(turns_of(shape, y), y.mean(axis=1))
 
 
 def pose(turn: Array, shift: Array) -> Array:
@@ -80,23 +78,12 @@ def position_error(measured: Array, computed: Array, tool: Array = CENTROID) -> 
 
 def orientation_error(measured: Array, computed: Array) -> Array:
     """Angle between measured and computed orientations, |log(R_m' R_c)|: (m,) [rad; M eq. 5]."""
-    back = np.swapaxes(measured[..., :3, :3], -1, -2)
-    return np.asarray(np.linalg.norm(log(back @ computed[..., :3, :3]), axis=-1))
+    return formulas.orientation_error(measured[..., :3, :3], computed[..., :3, :3])
 
 
 def euler_deviation(measured: Array, computed: Array) -> Array:
-    """Deviations |a_m - a_c|, |b_m - b_c|, |c_m - c_c| of R = Rz(c) Ry(b) Rx(a) [rad; M eq. 4].
-
-    ISO 9283 states orientation accuracy so.  Near b = +-90 degrees (gimbal lock) a and c are not
-    determined: they may differ by any amount although the orientations agree (M's 75th pose).
-    Returns (m, 3).
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # scipy's, about the gimbal lock
-        angles = [
-            Rotation.from_matrix(T[..., :3, :3]).as_euler("xyz") for T in (measured, computed)
-        ]
-    return np.abs((angles[0] - angles[1] + np.pi) % (2.0 * np.pi) - np.pi)
+    """Sizes of the deviations of the angles a, b, c: (m, 3) [rad; M eq. 4; ISO 9283]."""
+    return np.abs(formulas.euler_deviation(measured[..., :3, :3], computed[..., :3, :3]))
 
 
 def lever(shape: Array) -> float:

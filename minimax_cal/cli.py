@@ -21,6 +21,8 @@ from minimax_cal.errors import CalibrationError
 from minimax_cal.export_command import export_command
 from minimax_cal.files import json_text
 from minimax_cal.import_command import import_command
+from minimax_cal.iso9283_command import iso9283_command
+from minimax_cal.map_command import map_command
 from minimax_cal.options import FAILED, MISUSED, show
 from minimax_cal.robot import builtin_robots, load_robot
 from minimax_cal.sense import POOR_FIT
@@ -35,6 +37,8 @@ COMMANDS = (
     compensate_command,
     export_command,
     import_command,
+    iso9283_command,
+    map_command,
 )
 
 
