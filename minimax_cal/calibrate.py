@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +43,7 @@ from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_norma
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from minimax_cal.start import Frame
+from minimax_cal.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.worst import DISTANCE_FORMS, Distances, measured_distances, worst_of
 from qp_backends import BackendError, Problem
 from qp_backends import solve as solve_qp
@@ -163,7 +164,7 @@ def calibrate(
         accuracy={key: accuracy(error) for key, error in errors.items()},
         errors=errors,
         identification=fit.identification,
-        covariance=fit.covariance,
+        uncertainty=fit.uncertainty,
         worst=fit.worst,
         distances=fit.distances,
         trace=fit.trace,
@@ -256,7 +257,7 @@ class Fit:
     """What the solvers found.
 
     nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
-    covariance: (p, p) of all parameters, base in its own axes, NaN where not identified.
+    estimator: how the poses were weighed.  group: (m,) rows with one number are one pose.
     worst: the minimax answer, where there was one to find.  trace: cost at each iterate of the
     least squares [m^2].  effects: those asked for, with their values; units: of each value.
     """
@@ -265,7 +266,8 @@ class Fit:
     nominal: State
     state: State
     identification: Identification
-    covariance: Array
+    estimator: Estimator
+    group: Array
     status: Status
     iterations: int
     worst: tuple[Optimum[State], ...]
@@ -274,6 +276,11 @@ class Fit:
     notices: tuple[str, ...]
     effects: Fitted
     units: tuple[str, ...]
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Of all parameters, the base's along its own axes."""
+        return uncertainty_of(self.estimator, self.state, self.group, self.units)
 
 
 def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report) -> Fit:
@@ -359,24 +366,27 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         best = minimax.solve(minimax_problem, state, qp, Sqp(hessian=options.hessian))
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
-        share = np.maximum(best.mu, FLOOR) / model.counts if per == "target" else share
+        if per == "target":
+            share = np.maximum(best.mu, FLOOR) * model.counts.sum() / model.counts
+        else:
+            share = point_share(best.mu, model.seen)
         notices += (*said, *(f"QP: {note}" for note in best.notes))
+    scene = scene_of(robot, data, model, state)
     return Fit(
         names=model.names,
         nominal=frame.state,
         state=state,
         identification=found,
-        covariance=covariance(
-            base.only(found.active).with_prior(model.prior), state, share, weights
-        ),
+        estimator=Estimator(base.only(found.active).with_prior(model.prior), share, weights),
+        group=groups(data),
         status=status,
         iterations=iterations,
         worst=worst,
         distances=distances,
         trace=tuple(float(value) for value in squares.trace[:, 0]),
         notices=notices,
-        effects=fitted(terms, scene_of(robot, data, model, state), state.effects),
-        units=names_of(terms, scene_of(robot, data, model, state))[1],
+        effects=fitted(terms, scene, state.effects),
+        units=names_of(terms, scene)[1],
     )
 
 
@@ -483,35 +493,6 @@ def doubts(robot: Robot, fit: Fit, nominal_error: Array) -> list[str]:
     return notices
 
 
-def covariance(model: Model, state: State, share: Array, weights: Array) -> Array:
-    """Covariance (p, p) of an estimator that weighs target i by share_i; NaN where not estimated.
-
-    The sandwich H^-1 V H^-1 with H = sum share_i J_i'J_i and V = sum share_i^2 s_i^2 J_i'J_i, where
-    s_i is the residual noise of target i per coordinate, its degrees of freedom counted.  Errors
-    are taken as independent: model error that the poses share makes the true uncertainty larger.
-    With pose weights W (m, 3k, 3k) H = J'WJ and V = s^2 J'W^2 J.
-    """
-    out = np.full((model.names.count,) * 2, np.nan)
-    normal = model.normal(state, model.active)
-    coordinates = 3.0 * model.counts
-    spare = coordinates.sum() - model.active.sum() + np.count_nonzero(model.prior.weight)
-    if spare <= 0:
-        return out
-    noise = normal.cost / coordinates * coordinates.sum() / spare
-    prior = np.diag(model.prior.weight[model.active]) * share.max()
-    bread = np.einsum("k,kij->ij", share, normal.gram) + prior
-    filling = np.einsum("k,kij->ij", share**2 * noise, normal.gram)
-    if len(weights):
-        gram = with_poses(model, weights).normal(state, model.active).gram
-        bread = gram.sum(axis=0) + prior
-        squared = replace(model, mix=weights).normal(state, model.active).gram
-        filling = squared.sum(axis=0) * float(noise.mean())
-    filling = filling + prior * share.max() * float(noise.mean())
-    inverse = solve_normal(bread, np.eye(len(bread)))
-    out[np.ix_(model.active, model.active)] = inverse @ filling @ inverse
-    return out
-
-
 def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
     """Every parameter, link by link.
 
@@ -520,8 +501,7 @@ def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
     """
     names, n = fit.names, robot.joints
     known = fit.identification.active
-    variance = np.diag(fit.covariance)
-    sigma = np.where(known, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    sigma = fit.uncertainty.sigma
     axes = fit.nominal.rotation
 
     def values(x: State) -> Array:

@@ -6,6 +6,7 @@ import math
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from minimax_cal.cell import Cell
 from minimax_cal.data import Measurements
 from minimax_cal.files import json_text, write_whole
 from minimax_cal.identify import Identification
+from minimax_cal.intervals import Interval, max_interval, rms_interval
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import Accuracy
 from minimax_cal.parameters import State
@@ -25,6 +27,7 @@ from minimax_cal.solvers.minimax import Optimum
 from minimax_cal.solvers.status import Status
 from minimax_cal.tables import Cell as TableCell
 from minimax_cal.tables import Table
+from minimax_cal.uncertainty import Uncertainty
 from minimax_cal.worst import Distances
 
 SCHEMA = 1
@@ -86,9 +89,9 @@ class Calibration:
     robot: calibrated, usable wherever a robot is.  cell: with base and targets.  nominal: the
     nominal robot with its best base and targets.  accuracy: nominal and holdout on the held-out
     poses, nominal_train and train on the training poses.  errors: (k, m, 3) measured minus
-    predicted points under the same keys, NaN where not measured [m].  covariance: (p, p) of all
-    parameters, NaN where not identified [SI, base in its own axes].  worst: the minimax answer, if
-    one was asked for.  trace: cost at each iterate of the least squares [m^2].
+    predicted points under the same keys, NaN where not measured [m].  uncertainty: of all
+    parameters, base in its own axes [SI].  worst: the minimax answer, if one was asked for.
+    trace: cost at each iterate of the least squares [m^2].
     data: all poses, with their history where effects need it.  held: (m,) True where held out.
     """
 
@@ -104,7 +107,7 @@ class Calibration:
     accuracy: Mapping[str, Accuracy]
     errors: Mapping[str, Array]
     identification: Identification
-    covariance: Array
+    uncertainty: Uncertainty
     worst: tuple[Optimum[State], ...]
     distances: Distances
     trace: tuple[float, ...]
@@ -117,6 +120,20 @@ class Calibration:
     def worst_mm2(self) -> tuple[float, ...]:
         """F_i of the training poses [mm^2]."""
         return self.accuracy["train"].sse_mm2
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
+        return self.uncertainty.covariance
+
+    @cached_property
+    def intervals(self) -> Mapping[str, tuple[Interval, Interval]]:
+        """95 % intervals of RMS and largest error on poses like those held out, by key."""
+        rng = np.random.default_rng(int(str(self.provenance.settings.get("seed", 0))))
+        return {
+            key: (rms_interval(self.errors[key], rng=rng), max_interval(self.errors[key], rng=rng))
+            for key in ("nominal", "holdout")
+        }
 
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
@@ -143,6 +160,23 @@ class Calibration:
             ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
             tuple(rows),
             ("", "d", *[".4f"] * (3 + len(targets))),
+        )
+
+    def interval_rows(self) -> Table:
+        """95 % intervals of the held-out accuracy; empty where the poses are too few."""
+        rows = tuple(
+            (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
+             1e3 * largest.high)
+            for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
+            for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
+            if math.isfinite(rms.low)
+        )  # fmt: skip
+        return Table(
+            "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
+            "many new ones",
+            ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
+            rows,
+            ("", *[".4f"] * 6),
         )
 
     def parameter_rows(self) -> Table:
@@ -244,7 +278,9 @@ class Calibration:
         """Every table of the result."""
         worst = (self.minimax_table(),) if self.worst else ()
         effects = (self.effect_rows(),) if self.cell.effects.terms else ()
-        return (self.accuracy_table(), *worst, *effects, self.parameter_rows())
+        sure = self.interval_rows()
+        sure_of = (sure,) if sure.rows else ()
+        return (self.accuracy_table(), *sure_of, *worst, *effects, self.parameter_rows())
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -266,8 +302,11 @@ class Calibration:
             "iterations": self.iterations,
             "seconds": self.seconds,
             "parameters": [p.to_dict() for p in self.parameters],
-            "accuracy": {key: value.to_dict() for key, value in self.accuracy.items()},
+            "accuracy": {
+                key: value.to_dict() | self.ends(key) for key, value in self.accuracy.items()
+            },
             "condition": finite(self.identification.condition),
+            "covariance": self.uncertainty.to_dict(),
             "trace_mm2": [value * 1e6 for value in self.trace],
             "poses": pose_rows(
                 self.data,
@@ -304,6 +343,14 @@ class Calibration:
                 "trace": [vars(step) for step in best.trace],
             }
         return out
+
+    def ends(self, key: str) -> dict[str, list[float | None]]:
+        """The intervals of some poses for JSON; nothing for training poses."""
+        names = ("rms_ci95_mm", "max_ci95_mm")
+        return {
+            name: [finite(1e3 * end.low), finite(1e3 * end.high)]
+            for name, end in zip(names, self.intervals.get(key, ()), strict=False)
+        }
 
     def json(self) -> str:
         """`to_dict` as text."""
