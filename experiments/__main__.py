@@ -45,6 +45,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
     ),
+    "worst_point": (
+        "experiments.worst_point",
+        "The worst point as objective: gain, three solvers, time and its growth",
+    ),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

@@ -36,6 +36,7 @@ from minimax_cal.model import (
 )
 from minimax_cal.noise import linearised
 from minimax_cal.parameters import Names, State, links_of
+from minimax_cal.point_cones import Certificate, certify
 from minimax_cal.robot import Robot, load_robot
 from minimax_cal.sense import POOR_FIT, check_sense
 from minimax_cal.solvers import least_squares, minimax
@@ -166,6 +167,7 @@ def calibrate(
         identification=fit.identification,
         uncertainty=fit.uncertainty,
         worst=fit.worst,
+        certificates=fit.certificates,
         distances=fit.distances,
         trace=fit.trace,
         data=data,
@@ -258,8 +260,9 @@ class Fit:
 
     nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
     estimator: how the poses were weighed.  group: (m,) rows with one number are one pose.
-    worst: the minimax answer, where there was one to find.  trace: cost at each iterate of the
-    least squares [m^2].  effects: those asked for, with their values; units: of each value.
+    worst: the minimax answer, where there was one to find.  certificates: of the worst point.
+    trace: cost at each iterate of the least squares [m^2].
+    effects: those asked for, with their values; units: of each value.
     """
 
     names: Names
@@ -271,6 +274,7 @@ class Fit:
     status: Status
     iterations: int
     worst: tuple[Optimum[State], ...]
+    certificates: tuple[Certificate, ...]
     distances: Distances
     trace: tuple[float, ...]
     notices: tuple[str, ...]
@@ -357,6 +361,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     iterations = int(squares.iterations[0])
     distances = measured_distances(data, options.distance_tolerance)
     worst: tuple[Optimum[State], ...] = ()
+    proofs: tuple[Certificate, ...] = ()
     per = {"minimax": "target", "point": "point"}.get(options.objective, "")
     if per == "point" or (per == "target" and k > 1):
         report("minimax")
@@ -364,6 +369,8 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         name, said = usable(options.qp)
         qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
         best = minimax.solve(minimax_problem, state, qp, Sqp(hessian=options.hessian))
+        if per == "point" and best.status is not Status.FAILED:
+            proofs = (certify(minimax_problem, best, data.line),)
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
         if per == "target":
@@ -382,6 +389,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         status=status,
         iterations=iterations,
         worst=worst,
+        certificates=proofs,
         distances=distances,
         trace=tuple(float(value) for value in squares.trace[:, 0]),
         notices=notices,

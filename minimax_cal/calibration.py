@@ -21,6 +21,7 @@ from minimax_cal.intervals import Interval, max_interval, rms_interval
 from minimax_cal.kinematics import Array
 from minimax_cal.metrics import Accuracy
 from minimax_cal.parameters import State
+from minimax_cal.point_cones import Certificate
 from minimax_cal.poses import pose_rows
 from minimax_cal.robot import Robot
 from minimax_cal.solvers.minimax import Optimum
@@ -91,6 +92,7 @@ class Calibration:
     poses, nominal_train and train on the training poses.  errors: (k, m, 3) measured minus
     predicted points under the same keys, NaN where not measured [m].  uncertainty: of all
     parameters, base in its own axes [SI].  worst: the minimax answer, if one was asked for.
+    certificates: how far the worst point is from its optimum, where it was the objective.
     trace: cost at each iterate of the least squares [m^2].
     data: all poses, with their history where effects need it.  held: (m,) True where held out.
     """
@@ -109,6 +111,7 @@ class Calibration:
     identification: Identification
     uncertainty: Uncertainty
     worst: tuple[Optimum[State], ...]
+    certificates: tuple[Certificate, ...]
     distances: Distances
     trace: tuple[float, ...]
     data: Measurements
@@ -216,17 +219,14 @@ class Calibration:
         return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
 
     def minimax_table(self) -> Table:
-        """What the minimax found: errors, multipliers, activity; empty without one."""
+        """What the minimax of targets found: errors, multipliers, activity; empty without one."""
         rows: list[tuple[TableCell, ...]] = []
         for best in self.worst:
             for i in self.telling(best):
                 active = "yes" if self.is_active(best)[i] else ""
                 rows.append((self.labels[i], self.sizes[i], float(best.mu[i]), active))
-        if self.objective == "point":
-            title, size = "points that decide, on the training poses", "distance mm"
-        else:
-            title, size = "worst target on the training poses", "F_i mm^2"
-        header = ("point" if self.objective == "point" else "target", size, "multiplier", "active")
+        header = ("target", "F_i mm^2", "multiplier", "active")
+        title = "worst target on the training poses"
         return Table(title, header, tuple(rows), ("", ".4f", ".4f", ""))
 
     def telling(self, best: Optimum[State]) -> list[int]:
@@ -276,7 +276,8 @@ class Calibration:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        worst = (self.minimax_table(),) if self.worst else ()
+        worst = (self.minimax_table(),) if self.worst and self.objective != "point" else ()
+        worst = (*worst, *(proof.table() for proof in self.certificates))
         effects = (self.effect_rows(),) if self.cell.effects.terms else ()
         sure = self.interval_rows()
         sure_of = (sure,) if sure.rows else ()
@@ -342,6 +343,8 @@ class Calibration:
                 "iterations": best.iterations,
                 "trace": [vars(step) for step in best.trace],
             }
+        for proof in self.certificates:
+            out["certificate"] = proof.to_dict()
         return out
 
     def ends(self, key: str) -> dict[str, list[float | None]]:

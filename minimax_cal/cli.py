@@ -28,6 +28,7 @@ from minimax_cal.robot import builtin_robots, load_robot
 from minimax_cal.sense import POOR_FIT
 from minimax_cal.simulate_command import simulate_command
 from minimax_cal.tables import Table
+from minimax_cal.tradeoff_command import tradeoff_command
 
 COMMANDS = (
     calibrate_command,
@@ -39,6 +40,7 @@ COMMANDS = (
     import_command,
     iso9283_command,
     map_command,
+    tradeoff_command,
 )
 
 

@@ -25,13 +25,13 @@ LAYERS = (
     "effects.table datasets import_command faults.find where",
     "model cell faults",
     "identify start worst extend noise robust visibility exporters.job",
-    "sense uncertainty relative iso9283.formulas saved curves",
+    "sense uncertainty relative iso9283.formulas saved curves point_cones",
     "calibration iso9283.visits simulate minimize relative_command mixups"
     " spectrum structure exporters.correct"
     " exporters.dh_csv exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
     "evidence compensate exporters.urdf iso9283.result",
     "calibrate iso9283 figures diagnosis rivals compensate_command exporters.table",
-    "words pictures sheets separate export_command point_cones tradeoff bootstrap planning maps"
+    "words pictures sheets separate export_command tradeoff bootstrap planning maps"
     " iso9283_command",
     "tradeoff_command plan_command map_picture report.content",
     "map_command report.charts report.scene report.page",

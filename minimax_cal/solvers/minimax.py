@@ -79,15 +79,15 @@ class Sqp:
     """Settings of the SQP.
 
     tolerance: on stationarity, complementarity and violation (problem scaled to about one).
-    iterations: at most so many QPs.  floor: least weight of a function in the Gauss-Newton
-    Hessian, which an inactive function would otherwise leave singular.
+    iterations: at most so many QPs.  floor: least weight of the functions in the Gauss-Newton
+    Hessian, shared evenly, which inactive ones would otherwise leave singular.
     hessian: "gauss-newton" (the problem's own curvature, weighted by the multipliers) or "bfgs"
     (damped, Powell; it starts from the problem's curvature where there is one).
     """
 
     tolerance: float = 1e-8
     iterations: int = 200
-    floor: float = 1e-3
+    floor: float = 3e-3
     hessian: str = "gauss-newton"
 
 
@@ -170,7 +170,7 @@ def solve(
         if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.slope))):
             status = Status.FAILED
             break
-        hessian = here.curvature(np.maximum(mu, settings.floor)) if exact else quasi.matrix
+        hessian = here.curvature(np.maximum(mu, settings.floor / k)) if exact else quasi.matrix
         hessian = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-8))
 
         def resolve(f: Array, c: Array, here: Linear = here, hessian: Array = hessian) -> Plan:
@@ -193,9 +193,9 @@ def solve(
                 penalty *= 10.0
         else:
             penalty = max(penalty, 1.5 * float(np.abs(lam).max(initial=0.0)))
-        length, move, there = 0.0, np.zeros(p), here
+        length, move, end, there = 0.0, np.zeros(p), x, here
         if kkt.residual > settings.tolerance:
-            length, move, there = search(problem, x, here, plan, penalty, resolve)
+            length, move, end, there = search(problem, x, here, plan, penalty, resolve)
         trace.append(
             Step(iteration, float(here.f.max()), kkt.violation, kkt.residual, length, plan.backend)
         )
@@ -219,8 +219,7 @@ def solve(
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        x = problem.step(x, move)
-        before, here = here, there
+        x, before, here = end, here, there
         quasi = quasi if exact else quasi.update(move, before, here, mu, lam)
         kkt = optimality(here, mu, lam, lower, upper)
         if kkt.residual <= settings.tolerance:
@@ -334,8 +333,8 @@ def excess(c: Array, lower: Array, upper: Array) -> Array:
 
 def search(
     problem: Minimax[X], x: X, here: Linear, plan: Plan, penalty: float, resolve: Resolve
-) -> tuple[float, Array, Linear]:
-    """Length, move and end of a step that lowers max f + penalty * violation; length 0 if none.
+) -> tuple[float, Array, X, Linear]:
+    """A step that lowers max f + penalty * violation: its length (0 if none), move and end.
 
     The full step is nearly always taken, so its derivatives are computed at once.  resolve: solves
     the QP again with other values f, c, for the second-order correction.
@@ -350,27 +349,30 @@ def search(
     ahead = merit(here.f + here.slope @ plan.d, here.c + here.normal @ plan.d)
     decrease = start - ahead
     slack = ROUNDING * abs(start)
-    there = problem.linearise(problem.step(x, plan.d))
+    trial = problem.step(x, plan.d)
+    there = problem.linearise(trial)
     value = merit(there.f, there.c)
     if value <= start - 1e-4 * decrease + slack:
-        return 1.0, plan.d, there
+        return 1.0, plan.d, trial, there
     if np.isfinite(value):
         # what the linear model missed at the full step goes into the constants
         bent = resolve(there.f - here.slope @ plan.d, there.c - here.normal @ plan.d)
         if bent.usable and np.linalg.norm(bent.d) <= 2.0 * np.linalg.norm(plan.d):
-            there = problem.linearise(problem.step(x, bent.d))
+            trial = problem.step(x, bent.d)
+            there = problem.linearise(trial)
             if merit(there.f, there.c) <= start - 1e-4 * decrease + slack:
-                return 1.0, bent.d, there
+                return 1.0, bent.d, trial, there
     length = 1.0
     while length > 1e-8:
         curved = 2.0 * (value - start + length * decrease)
         fit = length**2 * decrease / curved if np.isfinite(value) and curved > 0 else 0.0
         length = min(max(fit, 0.1 * length), 0.5 * length)
-        value = merit(*problem.evaluate(problem.step(x, length * plan.d)))
+        move = length * plan.d
+        trial = problem.step(x, move)
+        value = merit(*problem.evaluate(trial))
         if value <= start - 1e-4 * length * decrease + slack:
-            move = length * plan.d
-            return length, move, problem.linearise(problem.step(x, move))
-    return 0.0, np.zeros_like(plan.d), here
+            return length, move, trial, problem.linearise(trial)
+    return 0.0, np.zeros_like(plan.d), x, here
 
 
 @dataclass(frozen=True, eq=False)
