@@ -45,6 +45,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
     ),
+    "relative": (
+        "experiments.relative",
+        "What lengths, closures and poses tell beside a tracker, and how true their positions are",
+    ),
     "worst_point": (
         "experiments.worst_point",
         "The worst point as objective: gain, three solvers, time and its growth",

@@ -13,29 +13,31 @@ LAYERS = (
     "options csv_columns urdf_file solvers.cones",
     "urdf",
     "metrics robot data importers.reading where.answer where.cuts where.residual",
-    "parameters gates history importers.rapid importers.leica importers.robodk"
+    "parameters gates history relative.data relative.closing importers.rapid"
+    " importers.leica importers.robodk"
     " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
     " importers.smr_files importers.columns importers.join importers.times importers.units"
     " faults.distances where.chance where.features where.spread",
-    "effects.scene poses relative_data relative_file importers.assemble faults.declared"
+    "effects.scene poses relative.file relative.split importers.assemble faults.declared"
     " faults.joints faults.nests faults.sessions faults.surprise faults.swaps where.joints"
     " where.mean_squares where.trends",
     "effects.compliance effects.bending effects.gears effects.time faults.outliers"
     " where.curves where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
-    "identify start worst extend noise robust visibility exporters.job",
-    "sense uncertainty relative iso9283.formulas saved curves point_cones",
-    "calibration iso9283.visits simulate minimize relative_command mixups"
-    " spectrum structure exporters.correct"
+    "identify start relative.rows worst extend noise robust visibility exporters.job",
+    "sense uncertainty relative.identify relative.options relative.start iso9283.formulas"
+    " saved curves point_cones",
+    "calibration iso9283.visits simulate minimize mixups spectrum structure"
+    " exporters.correct"
     " exporters.dh_csv exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
-    "evidence compensate exporters.urdf iso9283.result",
+    "evidence compensate exporters.urdf iso9283.result relative.fit relative.poses relative.result",
     "calibrate iso9283 figures diagnosis rivals compensate_command exporters.table",
-    "words pictures sheets separate export_command tradeoff bootstrap planning maps"
-    " iso9283_command",
-    "tradeoff_command plan_command map_picture report.content",
-    "map_command report.charts report.scene report.page",
-    "report report_command",
+    "words pictures relative.remarks sheets separate export_command tradeoff"
+    " bootstrap planning maps iso9283_command",
+    "tradeoff_command relative.kinds plan_command map_picture report.content",
+    "map_command relative report.charts report.scene report.page",
+    "report report_command relative_command",
     "diagnose calibrate_command simulate_command",
     "diagnose_command",
     "cli",
