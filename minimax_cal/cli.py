@@ -25,6 +25,7 @@ from minimax_cal.iso9283_command import iso9283_command
 from minimax_cal.map_command import map_command
 from minimax_cal.options import FAILED, MISUSED, show
 from minimax_cal.relative_command import relative_command
+from minimax_cal.report_command import report_command
 from minimax_cal.robot import builtin_robots, load_robot
 from minimax_cal.sense import POOR_FIT
 from minimax_cal.simulate_command import simulate_command
@@ -43,6 +44,7 @@ COMMANDS = (
     map_command,
     tradeoff_command,
     relative_command,
+    report_command,
 )
 
 

@@ -1,4 +1,4 @@
-"""The one way a number reaches people: a table, as text, Markdown, CSV or LaTeX."""
+"""The one way a number reaches people: a table, as text, Markdown, CSV, LaTeX or HTML."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from dataclasses import dataclass
+from html import escape
 
 from rich import box
 from rich.console import Console
@@ -68,6 +69,22 @@ class Table:
             "| " + " | ".join(c.replace("|", "\\|") for c in row) + " |" for row in lines
         )
         return f"**{self.title}**\n\n{body}\n"
+
+    def html(self) -> str:
+        """A table with its title as caption; the first cell of a row is its header."""
+        classes = [' class="right"' if right else "" for right in self.numeric()]
+
+        def row(cells: list[str], tags: list[str]) -> str:
+            whole = zip(cells, tags, classes, strict=True)
+            inner = "".join(f"<{tag}{kind}>{escape(cell)}</{tag[:2]}>" for cell, tag, kind in whole)
+            return f"<tr>{inner}</tr>"
+
+        heads, body = ['th scope="col"'] * len(self.header), ["td"] * (len(self.header) - 1)
+        rows = "\n".join(row(cells, ['th scope="row"', *body]) for cells in self.cells())
+        return (
+            f"<table><caption>{escape(self.title)}</caption>\n<thead>\n"
+            f"{row(list(self.header), heads)}\n</thead>\n<tbody>\n{rows}\n</tbody></table>"
+        )
 
     def csv(self) -> str:
         """Header and rows at full precision."""

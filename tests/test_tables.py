@@ -1,5 +1,6 @@
 import math
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -16,7 +17,7 @@ TABLE = Table(
 
 
 def test_one_number_reads_the_same_everywhere() -> None:
-    for text in (TABLE.text(), TABLE.markdown(), TABLE.latex()):
+    for text in (TABLE.text(), TABLE.markdown(), TABLE.latex(), TABLE.html()):
         assert "0.123" in text
         assert "0.1234" not in text
         assert "nan" not in text.lower()
@@ -28,6 +29,17 @@ def test_cells_are_literal_text() -> None:
     assert r"a\|b" in TABLE.markdown()
     assert r"c\_d" in TABLE.latex()
     assert r"errors \& more" in TABLE.latex()
+
+
+def test_html_is_a_table_with_headers() -> None:
+    table = Table("a < b", ("name", "size mm"), (("<script>x</script>", 1.5), ('"&', math.nan)))
+    read = ElementTree.fromstring(table.html())  # well formed, and every letter itself again
+    assert read.findtext("caption") == "a < b"
+    assert [cell.attrib for cell in read.iter("th")] == [
+        {"scope": "col"}, {"scope": "col", "class": "right"}, {"scope": "row"}, {"scope": "row"}
+    ]  # fmt: skip
+    rows = [[cell.text for cell in row] for row in read.iter("tr")]
+    assert rows == [["name", "size mm"], ["<script>x</script>", "1.5"], ['"&', "-"]]
 
 
 def test_files_are_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
