@@ -38,6 +38,7 @@ from minimax_cal.noise import linearised
 from minimax_cal.parameters import Names, State, links_of
 from minimax_cal.point_cones import Certificate, certify
 from minimax_cal.robot import Robot, load_robot
+from minimax_cal.robust import SQUARE, Robust, check_robust, flatness, robust_fit
 from minimax_cal.sense import POOR_FIT, check_sense
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
@@ -58,6 +59,7 @@ ASIDE = 1e-9
 PASSES = 2  # of a fit with effects: the second takes finite turns into account
 FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
+DOUBTED = 0.5  # a point of less weight tells no distance between targets
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 
@@ -75,6 +77,8 @@ class Options:
     distance constraints, two-sided, squared or off.  distance_tolerance: [m], NaN for the
     instrument's own accuracy.  resolution: relative singular value that counts as not measured.
     effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
+    loss: of the distances in the least squares: square, huber, cauchy or tukey.
+    trim: at most this share of the points, those that stand out, is set aside.
     """
 
     objective: str = "minimax"
@@ -91,6 +95,8 @@ class Options:
     distance_tolerance: float = np.nan
     resolution: float = identify.RESOLUTION
     effects: Sequence[str | Term] = ()
+    loss: str = SQUARE
+    trim: float = 0.0
 
 
 Report = Callable[[str], None]
@@ -173,6 +179,9 @@ def calibrate(
         data=data,
         held=np.isin(data.line, held.line),
         notices=notices,
+        loss=chosen.loss,
+        suspects=fit.robust.suspects,
+        weights=fit.robust.weights,
         provenance=Provenance.of(robot, data, settings_of(chosen)),
     )
 
@@ -226,6 +235,7 @@ def check_options(options: Options) -> None:
     ):
         if value not in choices:
             raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
+    check_robust(options.loss, options.trim)
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
     if options.lever <= 0.0 or np.isinf(options.lever):
@@ -263,6 +273,7 @@ class Fit:
     worst: the minimax answer, where there was one to find.  certificates: of the worst point.
     trace: cost at each iterate of the least squares [m^2].
     effects: those asked for, with their values; units: of each value.
+    robust: the weights of the points, and which stand out.
     """
 
     names: Names
@@ -280,11 +291,13 @@ class Fit:
     notices: tuple[str, ...]
     effects: Fitted
     units: tuple[str, ...]
+    robust: Robust
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Of all parameters, the base's along its own axes."""
-        return uncertainty_of(self.estimator, self.state, self.group, self.units)
+        found = uncertainty_of(self.estimator, self.state, self.group, self.units)
+        return found.widened(flatness(self.robust, self.state))
 
 
 def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report) -> Fit:
@@ -320,18 +333,25 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     report("least squares")
     model, squares = least(model.only(found.active), frame, sigma, options)
     squares, notices = wider(robot, model, squares, report)
+
+    def resist(model: Model, found: LeastSquares[State], sigma: Array) -> Robust:
+        def again(model: Model, state: State) -> tuple[Model, LeastSquares[State]]:
+            return least(model, replace(frame, state=state), sigma, options)
+
+        return robust_fit(again, model, found, data.line, options.loss, options.trim, share > ASIDE)
+
+    robust = resist(model, squares, sigma)
     terms: tuple[Term, ...] = ()
     if options.effects:
         report("effects")
-        here = squares.x.take(np.array(0))
+        here = robust.fit.x.take(np.array(0))
         scene = scene_of(robot, data, model, here)
-        rows = linearised(model, here, scene.slope)
+        rows = linearised(robust.model, here, scene.slope)
         terms = terms_of(scene, options.effects, partial(best_variant, scene, rows))
         known_ones = np.isfinite(sigma)
         for _ in range(PASSES):
-            model, begin = extended(
-                model.only(found.active), robot, data, squares.x.take(np.array(0)), terms
-            )
+            here = robust.fit.x.take(np.array(0))
+            model, begin = extended(robust.plain.only(found.active), robot, data, here, terms)
             more = len(model.fields)
             found = identify.identify(
                 model,
@@ -344,22 +364,25 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
             )
             told = found.active[names.count :]
             begin = replace(begin, effects=np.where(told, begin.effects, 0.0))
+            wide = np.pad(sigma, (0, more), constant_values=np.inf)
             model, squares = least(
-                model.only(found.active),
-                replace(frame, state=begin),
-                np.pad(sigma, (0, more), constant_values=np.inf),
-                options,
+                model.only(found.active), replace(frame, state=begin), wide, options
             )
+            robust = resist(model, squares, wide)
         base = replace(base, names=model.names, fields=model.fields, moved=model.moved)
+    squares, notices = robust.fit, (*notices, *robust.notices)
+    model = robust.model
     if len(weights):
+        model = robust.by_pose
         # the turn that fits the errors best vanishes for half a turn too: start near the answer
         problem = SumOfSquares(with_poses(model, weights))
         points = float(model.counts.sum())
         method = METHODS[options.method]
         squares = least_squares.solve(problem, squares.x, 1, points, method, least_squares.NEAR)
     state, status = squares.x.take(np.array(0)), squares.status[0]
-    iterations = int(squares.iterations[0])
-    distances = measured_distances(data, options.distance_tolerance)
+    iterations = int(squares.iterations[0]) + robust.rounds
+    believed = np.where(robust.weights.T[..., None] > DOUBTED, data.y, np.nan)
+    distances = measured_distances(data.with_y(believed), options.distance_tolerance)
     worst: tuple[Optimum[State], ...] = ()
     proofs: tuple[Certificate, ...] = ()
     per = {"minimax": "target", "point": "point"}.get(options.objective, "")
@@ -384,7 +407,11 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         nominal=frame.state,
         state=state,
         identification=found,
-        estimator=Estimator(base.only(found.active).with_prior(model.prior), share, weights),
+        estimator=Estimator(
+            replace(base, weight=model.weight).only(found.active).with_prior(model.prior),
+            share,
+            weights,
+        ),
         group=groups(data),
         status=status,
         iterations=iterations,
@@ -395,6 +422,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         notices=notices,
         effects=fitted(terms, scene, state.effects),
         units=names_of(terms, scene)[1],
+        robust=robust,
     )
 
 

@@ -13,6 +13,7 @@ from minimax_cal.calibrate import Options, calibrate
 from minimax_cal.errors import OptionError
 from minimax_cal.figures import PICTURES, save_errors
 from minimax_cal.kinematics import MDH_NAMES
+from minimax_cal.robust import LOSSES, SQUARE
 from minimax_cal.solvers.least_squares import METHODS
 
 DEFAULTS = Options()
@@ -69,6 +70,20 @@ def prior_of(text: str) -> tuple[str, float]:
     default=DEFAULTS.method,
     show_default=True,
     help="Least squares: " + ", ".join(METHODS) + ".",
+)
+@click.option(
+    "--loss",
+    default=DEFAULTS.loss,
+    show_default=True,
+    help="Of the distances, against outliers: " + ", ".join((SQUARE, *LOSSES)) + ".",
+)
+@click.option(
+    "--trim",
+    type=float,
+    default=DEFAULTS.trim,
+    show_default=True,
+    metavar="SHARE",
+    help="Set at most this share of the points aside: those that stand out.",
 )
 @click.option(
     "--hessian",

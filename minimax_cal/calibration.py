@@ -19,13 +19,14 @@ from minimax_cal.files import json_text, write_whole
 from minimax_cal.identify import Identification
 from minimax_cal.intervals import Interval, max_interval, rms_interval
 from minimax_cal.kinematics import Array
-from minimax_cal.metrics import Accuracy
+from minimax_cal.metrics import Accuracy, accuracy
 from minimax_cal.parameters import State
 from minimax_cal.point_cones import Certificate
 from minimax_cal.poses import pose_rows
 from minimax_cal.robot import Robot
 from minimax_cal.solvers.minimax import Optimum
 from minimax_cal.solvers.status import Status
+from minimax_cal.suspects import Suspect, table_of
 from minimax_cal.tables import Cell as TableCell
 from minimax_cal.tables import Table
 from minimax_cal.uncertainty import Uncertainty
@@ -95,6 +96,8 @@ class Calibration:
     certificates: how far the worst point is from its optimum, where it was the objective.
     trace: cost at each iterate of the least squares [m^2].
     data: all poses, with their history where effects need it.  held: (m,) True where held out.
+    loss: of the least squares.  suspects: training points that stand out from the fit.
+    weights: (k, training poses) of the points besides their u95, 0 where set aside.
     """
 
     robot: Robot
@@ -117,6 +120,9 @@ class Calibration:
     data: Measurements
     held: Array
     notices: tuple[str, ...]
+    loss: str
+    suspects: tuple[Suspect, ...]
+    weights: Array
     provenance: Provenance
 
     @property
@@ -243,19 +249,18 @@ class Calibration:
         """Names of the functions of the minimax: targets, or points by line of the file."""
         if self.objective != "point":
             return self.cell.targets
-        seen = np.isfinite(self.errors["train"][..., 0])
         return tuple(
             f"{self.cell.targets[target]} line {self.data.line[~self.held][pose]}"
-            for target, pose in np.argwhere(seen)
+            for target, pose in np.argwhere(self.weights > 0.0)
         )
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """F_i [mm^2] of the targets, or distances of the points [mm], on the training poses."""
+        """F_i [mm^2] of the targets, or distances of points [mm], of the training points kept."""
         if self.objective != "point":
-            return self.worst_mm2
+            return accuracy(np.sqrt(self.weights)[..., None] * self.errors["train"]).sse_mm2
         distance = 1e3 * np.linalg.norm(self.errors["train"], axis=-1)
-        return tuple(distance[np.isfinite(distance)].tolist())
+        return tuple(distance[self.weights > 0.0].tolist())
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -281,7 +286,10 @@ class Calibration:
         effects = (self.effect_rows(),) if self.cell.effects.terms else ()
         sure = self.interval_rows()
         sure_of = (sure,) if sure.rows else ()
-        return (self.accuracy_table(), *sure_of, *worst, *effects, self.parameter_rows())
+        suspects = (table_of(self.suspects),) if self.suspects else ()
+        return (
+            self.accuracy_table(), *sure_of, *worst, *effects, *suspects, self.parameter_rows()
+        )  # fmt: skip
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -297,6 +305,8 @@ class Calibration:
             **self.cell.to_dict(),
             "nominal_cell": self.nominal.to_dict(),
             "objective": self.objective,
+            "loss": self.loss,
+            "suspects": [suspect.to_dict() for suspect in self.suspects],
             "qp": self.qp,
             "status": str(self.status),
             "advice": self.status.advice,

@@ -32,10 +32,10 @@ from minimax_cal.solvers.least_squares import solve_normal
 
 PLENTY = 1000  # poses that tell all; of more, so many are drawn
 SPARE = 3.0  # degrees of freedom that tell two noises apart
-ALONE = 1e-3  # of what a pose tells of some direction, the others must tell as much
-# A fit of the worst point rests on some points, the others hold it only if those were different.
-# With this share of the mean multiplier as the least of any point, `by_noise` covers as it should:
-# measured for 30 to 160 poses, one and three targets (experiments.coverage).
+ALONE = 1e-3  # of what all poses tell of a direction, all but one must tell this share
+# A fit of the worst point rests on a few points: other noise would choose others.  With this share
+# of the mean multiplier as the least of any point, `by_noise` covers as it should; no theory says
+# so, but runs with 30 to 160 poses, one target and three (experiments.coverage shows some).
 LEAST_POINT = 0.3
 CHUNK = 2048  # poses whose Jacobian is kept at a time
 FRAMES = ("measurement", "base")
@@ -68,14 +68,19 @@ class Estimator:
         share = self.share if self.share.ndim == 1 else self.share[:, rows]
         return Estimator(few, share, self.mix[rows] if len(self.mix) else self.mix)
 
-    def thinned(self, most: int) -> tuple[Estimator, Array]:
-        """At most so many poses, drawn at random, with as much less of the prior; their rows."""
-        m = len(self.model.q)
+    def thinned(self, group: Array, most: int) -> tuple[Estimator, Array]:
+        """About so many rows at most, whole poses drawn at random; as much less of the prior.
+
+        group: (m,) rows with the same number are one pose.  Returns the rows too.
+        """
+        _, member = np.unique(group, return_inverse=True)
+        count, m = int(member.max()) + 1, len(member)
         if m <= most:
             return self, np.arange(m)
-        rows = np.sort(np.random.default_rng(0).permutation(m)[:most])
+        chosen = np.random.default_rng(0).permutation(count)[: max(count * most // m, 1)]
+        rows = np.flatnonzero(np.isin(member, chosen))
         few, prior = self.at(rows), self.model.prior
-        less = Prior(prior.mean, prior.weight * most / m)
+        less = Prior(prior.mean, prior.weight * len(rows) / m)
         return replace(few, model=few.model.with_prior(less)), rows
 
 
@@ -139,6 +144,13 @@ class Poses:
         """(p, p) H."""
         flat = [a.reshape(-1, a.shape[-1]) for a in (self.slope, self.pull)]
         return np.asarray(flat[0].T @ flat[1] + np.diag(self.prior))
+
+    @property
+    def mean_square(self) -> float:
+        """Of a coordinate's error, as a prior was weighed against it in the fit [m^2]."""
+        paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
+        count = 3.0 * np.count_nonzero(self.seen)
+        return float((self.error**2).sum()) / max(count - paid, 1.0)
 
     @property
     def gram(self) -> Array:
@@ -214,6 +226,10 @@ class Uncertainty:
         out[known] = sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         return out
 
+    def widened(self, factor: float) -> Uncertainty:
+        """The same with all sigmas times a factor."""
+        return replace(self, covariance=factor**2 * self.covariance)
+
     def half_width(self, level: float = 0.95) -> Array:
         """(p,) half of the interval of each parameter: Student's quantile times sigma [SI]."""
         return quantile(level, self.spare) * self.sigma
@@ -247,9 +263,12 @@ def scales(units: tuple[str, ...]) -> Array:
 
 
 def noise_of(poses: Poses) -> tuple[Noise, float]:
-    """Instrument's noise and joints' jitter by restricted maximum likelihood; degrees of freedom."""
-    rows = poses.rows()
-    spare = float(rows.count - rows.basis.shape[1])
+    """Instrument's noise and joints' jitter by `noise.restricted`, and their degrees of freedom.
+
+    None are free where the poses do not determine the parameters.
+    """
+    rows, p = poses.rows(), poses.slope.shape[-1]
+    spare = float(rows.count - p) if rows.basis.shape[1] == p else 0.0
     if spare >= SPARE:
         return restricted(rows, np.zeros((len(rows.error), 0))), spare
     left = rows.error - rows.basis @ (rows.basis.T @ rows.error)
@@ -262,10 +281,10 @@ def by_noise(poses: Poses, noise: Noise) -> Array:
     swing = np.swapaxes(poses.pull, -1, -2) @ poses.arm
     filling = noise.variance * pull.T @ pull
     filling += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
-    return sandwich(poses, filling, noise)
+    return sandwich(poses, filling)
 
 
-def by_poses(poses: Poses, group: Array, noise: Noise) -> Array:
+def by_poses(poses: Poses, group: Array) -> Array:
     """The jackknife over poses: (p, p) of the free parameters [SI].
 
     (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
@@ -282,13 +301,14 @@ def by_poses(poses: Poses, group: Array, noise: Noise) -> Array:
     except np.linalg.LinAlgError:
         return np.full((p, p), np.nan)
     change = solve_normal(poses.bread - gram, score[..., None])[..., 0]
-    prior = sandwich(poses, np.zeros((p, p)), noise)
+    prior = sandwich(poses, np.zeros((p, p)))
     return np.asarray((count - 1) / count * change.T @ change + prior)
 
 
-def sandwich(poses: Poses, filling: Array, noise: Noise) -> Array:
+def sandwich(poses: Poses, filling: Array) -> Array:
     """H^-1 F H^-1.  A prior is rows as noisy as a typical one: its weight times their variance."""
-    filling = filling + noise.variance * (1.0 + noise.ratio) * np.diag(poses.prior)
+    if poses.prior.any():
+        filling = filling + poses.mean_square * np.diag(poses.prior)
     half = solve_normal(poses.bread, filling)
     return np.asarray(solve_normal(poses.bread, half.T))
 
@@ -302,12 +322,12 @@ def uncertainty_of(
     noises are all there is, and better where they are not (experiments.coverage).  Not for a fit of
     the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
     """
-    few, rows = estimator.thinned(PLENTY)
+    few, rows = estimator.thinned(group, PLENTY)
     poses = Poses.of(few, state)
     noise, spare = noise_of(poses)
     found, source = np.full(poses.bread.shape, np.nan), "poses"
     if spare >= 1.0 and estimator.share.ndim == 1:
-        found = by_poses(poses, group[rows], noise)
+        found = by_poses(poses, group[rows])
     if spare >= 1.0 and np.isnan(found).any():
         found, source = by_noise(poses, noise), "noise"
     names, active = few.model.names, few.model.active
@@ -356,7 +376,7 @@ def position_factor(
     if frame not in FRAMES:
         raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
     model, state = model_at(cell, q)
-    names, n = model.names, model.names.joints
+    n = model.names.joints
     slope = np.swapaxes(model.jacobian(state), 0, 1)
     if frame == "measurement":
         slope = state.rotation @ slope

@@ -25,7 +25,9 @@ LAYERS = (
     " where.curves where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
-    "identify start relative.rows worst extend noise robust visibility exporters.job",
+    "identify start relative.rows worst extend noise suspects visibility exporters.job",
+    "trimmed",
+    "robust",
     "sense uncertainty relative.identify relative.options relative.start iso9283.formulas"
     " saved curves point_cones",
     "calibration iso9283.visits simulate minimize mixups spectrum structure"
