@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from minimax_cal import evidence, gates
 from minimax_cal.calibrate import Fit, Options, Report, fit_cell, silent
@@ -110,6 +111,20 @@ def diagnose(
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
     gates.check_joints(robot, given)
     gates.check_spread(given)
+    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
+        return examined(robot, given, seed, holdout, exclude, report, began)
+
+
+def examined(
+    robot: Robot,
+    given: Measurements,
+    seed: int,
+    holdout: float,
+    exclude: Sequence[str],
+    report: Report,
+    began: float,
+) -> Diagnosis:
+    """The diagnosis of checked measurements.  began: when the work did [s]."""
     report("data faults")
     raw = with_history(given)
     sound, faults, remarks, fits = cleaned(robot, raw, seed, holdout, report)
