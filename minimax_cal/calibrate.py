@@ -317,7 +317,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     report("identifiable parameters")
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
     weights = NO_MIX
-    model = base.emphasise(share)
+    aside, model = share, base.emphasise(share)
     if options.objective == "pose":
         check_poses(data)
         weights = pose_weights(data, options.lever)
@@ -408,7 +408,9 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         state=state,
         identification=found,
         estimator=Estimator(
-            replace(base, weight=model.weight).only(found.active).with_prior(model.prior),
+            replace(base, weight=model.weight / aside[:, None])
+            .only(found.active)
+            .with_prior(model.prior),
             share,
             weights,
         ),

@@ -9,9 +9,11 @@ from typing import Any
 import click
 
 from minimax_cal import options
+from minimax_cal.bootstrap import bootstrap
 from minimax_cal.calibrate import Options, calibrate
 from minimax_cal.errors import OptionError
 from minimax_cal.figures import PICTURES, save_errors
+from minimax_cal.files import json_text
 from minimax_cal.kinematics import MDH_NAMES
 from minimax_cal.robust import LOSSES, SQUARE
 from minimax_cal.solvers.least_squares import METHODS
@@ -109,6 +111,13 @@ def prior_of(text: str) -> tuple[str, float]:
     metavar="MM",
     help="How far a distance between targets may be off [default: as measured].",
 )
+@click.option(
+    "--bootstrap",
+    "replicates",
+    type=int,
+    metavar="N",
+    help="Calibrate N times more, on poses drawn anew, for intervals by percentiles (500 serve).",
+)
 @options.figure_option("the errors before and after")
 @options.JSON
 @options.output("the result (JSON)")
@@ -121,6 +130,7 @@ def calibrate_command(
     free: Sequence[str],
     effects: Sequence[str],
     lever: float | None,
+    replicates: int | None,
     distance_tolerance: float | None,
     figure: Path | None,
     as_json: bool,
@@ -145,10 +155,17 @@ def calibrate_command(
             report=report,
             **choices,
         )
+        drawn = [] if replicates is None else [bootstrap(fit, replicates, choices["seed"], report)]
     options.notify(fit.notices, quiet=quiet)
     if figure:
         save_errors(fit, figure)
-    if options.deliver(fit.json() if output or as_json else "", output, as_json=as_json):
-        options.show(*fit.tables())
+    text = ""
+    if output or as_json:
+        content = fit.to_dict()
+        for found in drawn:
+            content["bootstrap"] = found.to_dict()
+        text = json_text(content)
+    if options.deliver(text, output, as_json=as_json):
+        options.show(*fit.tables(), *(found.table() for found in drawn))
         click.echo(f"\n{fit.headline()}")
     return options.exit_code(fit.status)

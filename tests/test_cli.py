@@ -218,3 +218,17 @@ def test_evaluate_doubts_data_that_do_not_belong(
     (tmp_path / "other.json").write_text('{"schema": 1, "kind": "diagnosis"}')
     assert run("evaluate", tmp_path / "other.json", csv) == 2
     assert "is a diagnosis" in capsys.readouterr().err
+
+
+def test_a_bootstrap_is_shown_and_saved(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "fit.json"
+    arguments = ("calibrate", "irb2600", csv, "--objective", "sum", "--bootstrap")
+    assert run(*arguments, "40", "-o", out) == 0
+    assert "calibrations of poses drawn anew" in capsys.readouterr().out
+    found = json.loads(out.read_text())["bootstrap"]
+    assert found["replicates"] + found["lost"] == 40
+    assert all(row["interval"][0] < row["interval"][1] for row in found["parameters"])
+    assert run(*arguments, "1") == 2
+    assert "1 replicates" in capsys.readouterr().err
