@@ -332,7 +332,6 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     )
     report("least squares")
     model, squares = least(model.only(found.active), frame, sigma, options)
-    squares, notices = wider(robot, model, squares, report)
 
     def resist(model: Model, found: LeastSquares[State], sigma: Array) -> Robust:
         def again(model: Model, state: State) -> tuple[Model, LeastSquares[State]]:
@@ -341,6 +340,10 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         return robust_fit(again, model, found, data.line, options.loss, options.trim, share > ASIDE)
 
     robust = resist(model, squares, sigma)
+    # a few gross outliers are no reason to search: what counts is how the believed points are met
+    squares, notices = wider(robot, robust.model, robust.fit, report)
+    if squares is not robust.fit:
+        robust = resist(robust.plain, squares, sigma)
     terms: tuple[Term, ...] = ()
     if options.effects:
         report("effects")
