@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from minimax_cal.kinematics import Array
 from minimax_cal.model import Model
 from minimax_cal.parameters import State
 from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
-from minimax_cal.suspects import EXPLANATION, RIDGE, Suspect, suspects_of
+from minimax_cal.suspects import EXPLANATION, RIDGE, Scores, Spread, Suspect, suspects_of
 from minimax_cal.trimmed import Fitter, Weighted, concentrate, set_aside, soften
 
 SQUARE = "square"  # the loss of plain least squares
@@ -84,25 +85,58 @@ def distances(model: Model, state: State) -> Array:
 class Robust:
     """A fit whose points have weights.
 
-    plain: the model as given, with the prior of the last fit.  kept: the same with the points set
-    aside at weight 0.  model: weighted by the loss too; `fit` is its least squares.
-    weights: (k, m) from 0 to 1, beside those of the measurements; 0 where not measured.
-    scale: standard deviation of a coordinate of an ordinary point [m], of the typical weight.
-    loss_scale: that at which the loss was taken [m].  rounds: how many fits it took.
-    suspects: points that stand out from the fit, the least likely first.
+    at: the fit.  kept: its model with the points set aside at weight 0, not weighted by the loss.
+    loss_scale: standard deviation of a coordinate at which the loss was taken [m].
+    line: (m,) of the file.
     """
 
-    plain: Model
+    at: Weighted
     kept: Model
-    model: Model
-    fit: LeastSquares[State]
-    weights: Array
-    scale: float
     loss: str
     loss_scale: float
-    rounds: int
-    suspects: tuple[Suspect, ...]
+    line: Array
     notices: tuple[str, ...] = ()
+
+    @property
+    def plain(self) -> Model:
+        """The model as given, with the prior of the last fit."""
+        return self.at.plain
+
+    @property
+    def model(self) -> Model:
+        """The model weighted by the loss too."""
+        return self.at.model
+
+    @property
+    def fit(self) -> LeastSquares[State]:
+        """Its least squares."""
+        return self.at.found
+
+    @property
+    def weights(self) -> Array:
+        """(k, m) from 0 to 1, beside those of the measurements; 0 where not measured."""
+        return self.at.weights
+
+    @property
+    def rounds(self) -> int:
+        """How many fits it took."""
+        return self.at.rounds
+
+    @cached_property
+    def judged(self) -> tuple[Scores, Spread]:
+        """How far off each point is, and how ordinary points scatter."""
+        found = self.at.scores()
+        return found, self.at.spread(found)
+
+    @property
+    def scale(self) -> float:
+        """Standard deviation of a coordinate of an ordinary point [m], of the typical weight."""
+        return self.judged[1].scale
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """The points that stand out from the fit, the least likely first."""
+        return suspects_of(self.at.plain, self.at.state, *self.judged, self.line)
 
     @property
     def by_pose(self) -> Model:
@@ -147,28 +181,17 @@ def robust_fit(
     if loss != SQUARE:
         scale = at.spread(at.scores()).scale
         at = reweighted(at, kept, LOSSES[loss], scale)
-    last = at.scores()
-    spread = at.spread(last)
-    suspects = suspects_of(at.plain, at.state, last, spread, line)
-    return Robust(
-        plain=at.plain,
-        kept=replace(at.plain, weight=plain.weight * kept),
-        model=at.model,
-        fit=at.found,
-        weights=at.weights,
-        scale=spread.scale,
-        loss=loss,
-        loss_scale=scale,
-        rounds=at.rounds,
-        suspects=suspects,
-        notices=tuple(remarks(at, kept, suspects, trim)),
-    )
+    kept_model = replace(at.plain, weight=plain.weight * kept)
+    robust = Robust(at, kept_model, loss, scale, line)
+    if not at.rounds:
+        return robust
+    return replace(robust, notices=tuple(remarks(at, kept, robust.suspects, trim)))
 
 
 def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: float) -> Iterator[str]:
     """What the reader should know beside the list of suspects."""
     away = int((at.plain.seen & (kept == 0.0)).sum())
-    if suspects and at.rounds:
+    if suspects:
         yield f"{len(suspects)} of {at.count} points stand out from the fit: {EXPLANATION}"
     if trim:
         yield f"--trim {trim:g}: {away} of {at.count} points are set aside"
@@ -179,7 +202,7 @@ def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: floa
         yield f"{more}, but not from a fit without them; they stay in it"
     names = at.plain.names.all
     lost = ", ".join(names[i] for i in np.flatnonzero(at.plain.active)[untold(at)])
-    if at.rounds and lost:
+    if lost:
         yield f"without the points that stand out the poses hardly tell {lost}"
 
 
