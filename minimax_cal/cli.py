@@ -24,6 +24,7 @@ from minimax_cal.import_command import import_command
 from minimax_cal.iso9283_command import iso9283_command
 from minimax_cal.map_command import map_command
 from minimax_cal.options import FAILED, MISUSED, show
+from minimax_cal.plan_command import plan_command
 from minimax_cal.relative_command import relative_command
 from minimax_cal.report_command import report_command
 from minimax_cal.robot import builtin_robots, load_robot
@@ -43,6 +44,7 @@ COMMANDS = (
     iso9283_command,
     map_command,
     tradeoff_command,
+    plan_command,
     relative_command,
     report_command,
 )

@@ -8,40 +8,41 @@ import pytest
 ROOT = Path(__file__).parent.parent
 LAYERS = (
     "errors kinematics solvers.status tables",
-    "files frames gravity intervals importers.sheet solvers.least_squares solvers.minimax"
-    " faults.chance faults.fault where.gaps where.rows",
-    "options csv_columns urdf_file solvers.cones",
-    "urdf",
-    "metrics robot data importers.reading where.answer where.cuts where.residual",
-    "parameters gates history relative.data relative.closing importers.rapid"
-    " importers.leica importers.robodk"
-    " importers.tracker6d importers.contract importers.figaroh importers.joint_rows"
-    " importers.smr_files importers.columns importers.join importers.times importers.units"
-    " faults.distances where.chance where.features where.spread",
-    "effects.scene poses relative.file relative.split importers.assemble faults.declared"
-    " faults.joints faults.nests faults.sessions faults.surprise faults.swaps where.joints"
-    " where.mean_squares where.trends",
-    "effects.compliance effects.bending effects.gears effects.time faults.outliers"
-    " where.curves where.locate",
+    "files frames gravity designs.criteria plans.observability plans.tour intervals"
+    " importers.sheet solvers.least_squares solvers.minimax faults.chance faults.fault"
+    " where.gaps where.rows",
+    "options csv_columns urdf_file designs.exchange solvers.cones",
+    "urdf designs.relaxation",
+    "metrics robot data designs.search importers.reading where.answer where.cuts where.residual",
+    "parameters gates history plans.wishes visibility relative.data relative.closing"
+    " importers.rapid importers.leica importers.robodk importers.tracker6d importers.contract"
+    " importers.figaroh importers.joint_rows importers.smr_files importers.columns"
+    " importers.join importers.times importers.units faults.distances where.chance"
+    " where.features where.spread",
+    "effects.scene poses relative.file plans.candidates relative.split importers.assemble"
+    " faults.declared faults.joints faults.nests faults.sessions faults.surprise faults.swaps"
+    " where.joints where.mean_squares where.trends",
+    "effects.compliance effects.bending effects.gears effects.time faults.outliers where.curves"
+    " where.locate",
     "effects.table datasets import_command faults.find where",
     "model cell faults",
-    "identify start relative.rows worst extend noise suspects visibility exporters.job",
-    "trimmed",
+    "identify start relative.rows plans.stops worst extend noise suspects exporters.job",
+    "trimmed plans.prospect",
     "robust",
-    "sense uncertainty relative.identify relative.options relative.start iso9283.formulas"
-    " saved curves point_cones",
-    "calibration iso9283.visits simulate minimize mixups spectrum structure"
-    " exporters.correct"
+    "sense uncertainty relative.identify relative.options relative.start iso9283.formulas saved"
+    " curves point_cones",
+    "calibration iso9283.visits simulate minimize mixups spectrum structure exporters.correct"
     " exporters.dh_csv exporters.moc exporters.robot_json exporters.ros_yaml exporters.ur_yaml",
-    "evidence compensate exporters.urdf iso9283.result relative.fit relative.poses relative.result",
-    "calibrate iso9283 figures diagnosis rivals compensate_command exporters.table",
-    "words pictures relative.remarks sheets separate export_command tradeoff"
-    " bootstrap planning maps iso9283_command",
-    "tradeoff_command relative.kinds plan_command map_picture",
-    "map_command relative report.schema report.content report.projection report.pdf",
-    "relative_command report.sources report.charts",
-    "report.error_charts report.fit_tables report.gap_tables report.verdict report.page",
-    "report.more_charts report.scene",
+    "evidence compensate exporters.urdf plans.promise iso9283.result relative.fit"
+    " relative.poses relative.result",
+    "calibrate iso9283 figures plans.result diagnosis rivals compensate_command exporters.table",
+    "words pictures relative.remarks plan_picture plans.ground sheets separate export_command"
+    " tradeoff bootstrap maps iso9283_command",
+    "tradeoff_command relative.kinds map_picture plans.separating",
+    "map_command relative report.schema plans.task report.content report.projection report.pdf",
+    "relative_command report.sources report.charts plans.outlook",
+    "report.error_charts report.fit_tables report.gap_tables planning report.verdict report.page",
+    "report.more_charts report.scene plan_command",
     "report.fit_sections report.gap_sections",
     "report.document",
     "report",

@@ -1,0 +1,1 @@
+"""Designs of experiments: which of many to do, whatever they measure."""
