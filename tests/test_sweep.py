@@ -151,10 +151,12 @@ def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path: Path) -> None
 
 
 SCRIPT = """
+import signal
 import sys
 from pathlib import Path
 from experiments.sweep import sweep
 from test_sweep import Job, work
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which background jobs may ignore
 folder = Path(sys.argv[1])
 jobs = [Job(seed, str(folder / "log"), 0.15) for seed in range(20)]
 sweep(work, jobs, name="interrupted", jobs_in_parallel=2, folder=folder)
