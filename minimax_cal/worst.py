@@ -125,7 +125,8 @@ class Worst:
 
         def curvature(weights: Array) -> Array:
             both = at.curvature(weights) + 2.0 * weights.sum() * np.diag(weight) / total
-            return np.asarray(both / self.size / self.scale[:, None] / self.scale)
+            # one divisor an entry: the quotient is as symmetric as what it came from
+            return np.asarray(both / (self.size * np.outer(self.scale, self.scale)))
 
         return Linear(
             f=(at.f + prior_of(model, x)) / self.size,
@@ -153,6 +154,8 @@ class Sensitivity:
 
 def prior_of(model: Model, x: State) -> float:
     """The prior's part of every f_i: the share it has in a mean square [m^2]."""
+    if not model.prior.weight.any():
+        return 0.0
     off = model.prior.mean - model.values(x)
     return float((model.prior.weight * off**2).sum() / model.counts.sum())
 

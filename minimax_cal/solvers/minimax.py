@@ -158,8 +158,8 @@ def solve(
     here = problem.linearise(x)
     k, p = here.slope.shape
     mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
-    quasi = Bfgs.start(here, p)
     exact = settings.hessian == "gauss-newton"
+    quasi = Bfgs(np.eye(0), fresh=True) if exact else Bfgs.start(here, p)
     penalty, damping = 0.0, 0.0
     status = Status.ITERATION_LIMIT
     trace: list[Step] = []
