@@ -479,6 +479,18 @@ def test_predicted_sigmas_are_those_of_the_information(planned: Plan, robot: mc.
     assert_allclose(planned.sigma, sigma, rtol=1e-6)
 
 
+def test_a_plan_of_as_few_poses_as_can_be(robot: mc.Robot) -> None:
+    """Nine poses of one target are 27 coordinates for 27 unknowns."""
+    found = plan(robot, 9, targets=1, candidates=9, acceptance=np.pi)
+    assert len(found.names) == 27
+    assert found.candidates.drawn == 9  # random choices are all of them
+    assert found.here.mean[0] < np.inf
+    assert [row.poses for row in found.growth] == [9]  # fewer tell nothing, more were not drawn
+    assert "more than" not in found.headline()
+    with pytest.raises(mc.OptionError, match="8 poses do not tell the 27 parameters apart; plan"):
+        plan(robot, 8, targets=1, candidates=100, acceptance=np.pi)
+
+
 def test_a_plan_tells_itself(planned: Plan, tmp_path: Path) -> None:
     content = json.loads(planned.json())
     assert content["schema"] == 1

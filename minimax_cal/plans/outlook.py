@@ -52,7 +52,10 @@ def grown(
             own = quick_design(*aim, count, best.likely)
         designs = [own, *(rng.choice(drawn, count, replace=False) for _ in range(DRAWS))]
         sizes = sizes_of(aim[1], np.array([aim[0].of(one) for one in designs]))
-        columns = (*sigmas(menu, designs, squares).T, sizes)
+        both = sigmas(menu, designs, squares)
+        if not np.isfinite(both[0]).all() and count != poses:
+            continue  # so few tell not everything
+        columns = (*both.T, sizes)
         pairs = [(float(column[0]), float(np.median(column[1:]))) for column in columns]
         out.append(Growth(count, *pairs))
     return tuple(out)

@@ -107,7 +107,7 @@ class Plan:
         ]
         if np.isfinite(self.equal):
             out.append(f"By the criterion they are worth {self.equal:.0f} random poses.")
-        elif 4 * self.poses <= len(self.candidates.q):
+        elif 4 * self.poses <= self.candidates.drawn:
             out.append(f"By the criterion they are worth more than {4 * self.poses} random poses.")
         out += [separation.headline() for separation in self.separation]
         return " ".join(out)
