@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 
 # %%
 # Two arms are simulated, both half a millimetre and a milliradian off their drawing. The first is

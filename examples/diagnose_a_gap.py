@@ -12,9 +12,9 @@ import textwrap
 import matplotlib.pyplot as plt
 
 import minimax_cal as mc
-from minimax_cal.curves import residual_curve
-from minimax_cal.pictures import draw_curve, draw_ladder
-from minimax_cal.simulate import Truth, simulate
+from minimax_cal.diagnosing.curves import residual_curve
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting.plots.diagnosis import draw_curve, draw_ladder
 
 # %%
 # The arm is a simulated UR10 whose joints give way under gravity by 2 µrad per N m. The diagnosis

@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 import minimax_cal as mc
-from minimax_cal.figures import save_errors
-from minimax_cal.simulate import simulate
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.reporting.plots.figures import save_errors
 
 
 def make(folder: Path) -> None:

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal.effects import Columns, Effect, Scene, Term, register
-from minimax_cal.effects.scene import Choice, one_joint
-from minimax_cal.effects.table import Fitted
-from minimax_cal.simulate import Truth, simulate
+from minimax_cal.modelling.effects import Columns, Effect, Scene, Term, register
+from minimax_cal.modelling.effects.scene import Choice, one_joint
+from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.simulate import Truth, simulate
 
 
 def pull(scene: Scene, place: str, choice: Choice) -> Columns:

@@ -20,7 +20,7 @@ import click
 from experiments.index import Outcome, write_index
 from experiments.record import environment, save_json
 from experiments.sweep import Study, look_for, needed, study_options
-from minimax_cal.errors import OptionError
+from minimax_cal.ground.errors import OptionError
 
 STUDIES = {  # name: (module with the command `main`, what it tells)
     "convergence": (

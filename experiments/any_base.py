@@ -21,13 +21,13 @@ from experiments import sweep
 from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
 from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal import kinematics
-from minimax_cal.model import Model, SumOfSquares
-from minimax_cal.robot import Robot
+from minimax_cal.fitting.start import fit_frame, search
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.model import Model, SumOfSquares
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, Limits
-from minimax_cal.start import fit_frame, search
-from minimax_cal.tables import Cell, Table
 
 GOOD = 5e-3  # share of the reach: what the calibration command takes for a gross miss
 LARGEST = 3.1  # deviation of theta_2 and alpha_3 [rad]

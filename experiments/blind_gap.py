@@ -43,10 +43,10 @@ from experiments.gap_cases import (
 )
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.diagnose import resemblance
-from minimax_cal.errors import OptionError
-from minimax_cal.kinematics import Array
-from minimax_cal.tables import Cell, Table
+from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

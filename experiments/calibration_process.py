@@ -22,13 +22,13 @@ from experiments.conditions import ROBOTS, SHARED, shared
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
-from minimax_cal.data import split
-from minimax_cal.model import SumOfSquares, model_of
-from minimax_cal.parameters import State
+from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import split
+from minimax_cal.modelling.model import SumOfSquares, model_of
+from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS
-from minimax_cal.tables import Cell, Table
-from minimax_cal.worst import measured_distances, worst_of
 from qp_backends import available
 from qp_backends import solve as solve_qp
 

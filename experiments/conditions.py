@@ -22,13 +22,13 @@ from experiments import sweep
 from experiments.poses import euler_deviation, orientation_error, poses_of, triangle
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.cell import Cell
-from minimax_cal.data import Measurements, split
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import Truth, simulate
-from minimax_cal.tables import Cell as TableCell
-from minimax_cal.tables import Table
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.measurements import Measurements, split
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,18 +26,18 @@ from experiments import pseudo_inverse, sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
-from minimax_cal import kinematics
-from minimax_cal.data import Measurements, measurements
-from minimax_cal.kinematics import Array
-from minimax_cal.model import Model, SumOfSquares
-from minimax_cal.parameters import State
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import Truth, simulate
+from minimax_cal.fitting.start import search
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.modelling.model import Model, SumOfSquares
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, Limits
 from minimax_cal.solvers.status import Status
-from minimax_cal.start import search
-from minimax_cal.tables import Cell, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,23 +23,23 @@ import minimax_cal as mc
 from experiments import sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.bootstrap import bootstrap
-from minimax_cal.calibrate import Fit, Options, fit_cell, silent
-from minimax_cal.cell import Cell
-from minimax_cal.data import Measurements, measurements
-from minimax_cal.intervals import chance_of_larger, max_interval, rms_interval
-from minimax_cal.kinematics import Array
-from minimax_cal.parameters import State, links_of
-from minimax_cal.simulate import Truth, gravity, random_poses, simulate
-from minimax_cal.tables import Cell as TableCell
-from minimax_cal.tables import Table
-from minimax_cal.uncertainty import (
+from minimax_cal.fitting.calibrate import Fit, Options, fit_cell, silent
+from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
+from minimax_cal.fitting.uncertainty import (
     Poses,
     Uncertainty,
     by_noise,
     position_covariance,
     quantile,
 )
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.bootstrap import bootstrap
+from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.simulate import Truth, gravity, random_poses, simulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

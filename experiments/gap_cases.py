@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.data import Measurements, measurements, write_measurements
-from minimax_cal.files import json_text, write_whole
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import Robot, load_robot
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.measuring.measurements import Measurements, measurements, write_measurements
+from minimax_cal.robots.robot import Robot, load_robot
 
 G = 9.80665  # [m/s^2]
 HELD_OUT, REVISITS = 80, 15

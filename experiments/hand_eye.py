@@ -31,10 +31,11 @@ from experiments.poses import (
     poses_of,
     triangle,
 )
-from minimax_cal import kinematics
-from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array, Chain
-from minimax_cal.robot import Robot
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import Chain
+from minimax_cal.robots.robot import Robot
 
 
 def left_product(p: Array) -> Array:

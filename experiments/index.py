@@ -9,8 +9,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from experiments.sweep import needed
-from minimax_cal.files import write_whole
-from minimax_cal.tables import Table
+from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.tables import Table
 
 TEMPLATE = "index.html.jinja"
 BAR = re.compile(r"(?<!\\)\|")  # between cells; a bar within one is escaped

@@ -37,13 +37,13 @@ from experiments.poses import (
 )
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, start, study_options
-from minimax_cal.calibrate import calibrate
-from minimax_cal.data import Measurements, read_measurements
-from minimax_cal.figures import AFTER, BEFORE
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import simulate
-from minimax_cal.tables import Cell, Table
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE
+from minimax_cal.robots.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -24,11 +24,11 @@ import minimax_cal as mc
 from experiments import sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import load_robot
-from minimax_cal.simulate import Truth, simulate
-from minimax_cal.tables import Cell, Table
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots.robot import load_robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

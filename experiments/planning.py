@@ -28,25 +28,25 @@ import numpy as np
 from experiments import sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.calibrate import calibrate
-from minimax_cal.cell import Cell, evaluate
-from minimax_cal.data import Measurements, read_measurements
-from minimax_cal.designs.criteria import Largest, Trace, size_of
-from minimax_cal.designs.exchange import Menu
-from minimax_cal.designs.search import best_design, first_design, worth
-from minimax_cal.figures import AFTER, BEFORE
-from minimax_cal.kinematics import Array
-from minimax_cal.planning import refined
-from minimax_cal.plans.candidates import Poses, candidates, free_poses
-from minimax_cal.plans.ground import ground_of, surroundings
-from minimax_cal.plans.outlook import sigmas
-from minimax_cal.plans.prospect import Instrument, prospect, with_effects
-from minimax_cal.plans.task import CRITERIA, Task, task_of
-from minimax_cal.plans.wishes import Wishes
-from minimax_cal.robot import load_robot
-from minimax_cal.simulate import Truth, gravity
-from minimax_cal.tables import Cell as TableCell
-from minimax_cal.tables import Table
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.cell import Cell, evaluate
+from minimax_cal.modelling.simulate import Truth, gravity
+from minimax_cal.planning.candidates import Poses, candidates, free_poses
+from minimax_cal.planning.designs.criteria import Largest, Trace, size_of
+from minimax_cal.planning.designs.exchange import Menu
+from minimax_cal.planning.designs.search import best_design, first_design, worth
+from minimax_cal.planning.options import Wishes
+from minimax_cal.planning.outlook import sigmas
+from minimax_cal.planning.plan import refined
+from minimax_cal.planning.prospect import Instrument, prospect, with_effects
+from minimax_cal.planning.setting import ground_of, surroundings
+from minimax_cal.planning.task import CRITERIA, Task, task_of
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE
+from minimax_cal.robots.robot import load_robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

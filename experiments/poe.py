@@ -29,10 +29,10 @@ from experiments.poses import (
     pose_residual,
     pose_slope,
 )
-from minimax_cal import kinematics
-from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import Robot
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,10 +13,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.identify import RESOLUTION
-from minimax_cal.iso9283 import formulas
-from minimax_cal.iso9283.formulas import turns_of
-from minimax_cal.kinematics import Array, hat, rotation
+from minimax_cal.fitting.identify import RESOLUTION
+from minimax_cal.ground.arrays import Array
+from minimax_cal.judging.iso9283 import formulas
+from minimax_cal.judging.iso9283.formulas import turns_of
+from minimax_cal.robots.kinematics import hat, rotation
 from minimax_cal.solvers.status import Status
 
 X = TypeVar("X")

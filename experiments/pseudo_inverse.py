@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.kinematics import Array
-from minimax_cal.model import Model
-from minimax_cal.parameters import State
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import Method
 
 CUT = 1e-10  # singular values below this, relative to the largest, are zero

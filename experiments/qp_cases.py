@@ -10,11 +10,11 @@ import numpy as np
 from scipy import sparse
 from scipy.io import loadmat
 
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import load_robot
-from minimax_cal.simulate import simulate
+from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
-from minimax_cal.worst import measured_distances, worst_of
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from minimax_cal.figures import save
-from minimax_cal.files import json_text, write_whole
-from minimax_cal.tables import Table
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.tables import Table
+from minimax_cal.reporting.plots.figures import save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,12 +25,8 @@ from experiments import sweep
 from experiments.conditions import SHARED
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.calibrate import calibrate
-from minimax_cal.data import Measurements, measurements, read_measurements, split
-from minimax_cal.kinematics import Array
-from minimax_cal.model import model_of
-from minimax_cal.parameters import State
-from minimax_cal.relative import (
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.instruments import (
     RelativeCalibration,
     RelativeData,
     closures,
@@ -38,13 +34,17 @@ from minimax_cal.relative import (
     flange_poses,
     relative,
 )
-from minimax_cal.relative.closing import CLOSED, reach
-from minimax_cal.relative.data import wire_names
-from minimax_cal.relative.identify import position_sigma
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import gravity, random_poses
-from minimax_cal.start import project
-from minimax_cal.tables import Cell, Table
+from minimax_cal.fitting.instruments.closing import CLOSED, reach
+from minimax_cal.fitting.instruments.data import wire_names
+from minimax_cal.fitting.instruments.identify import position_sigma
+from minimax_cal.fitting.start import project
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements, split
+from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import gravity, random_poses
+from minimax_cal.robots.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -32,12 +32,12 @@ from experiments.qp_cases import SETS, Case
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
-from minimax_cal.kinematics import Array
-from minimax_cal.robot import load_robot
-from minimax_cal.simulate import simulate
+from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots.robot import load_robot
 from minimax_cal.solvers import minimax
-from minimax_cal.tables import Cell, Table
-from minimax_cal.worst import measured_distances, worst_of
 from qp_backends import Accuracy, Problem, Solution, Status, accuracy, available
 from qp_backends import solve as solve_qp
 

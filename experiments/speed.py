@@ -22,16 +22,17 @@ from scipy import optimize
 from experiments import sweep
 from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal import identify, kinematics, start
-from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array
-from minimax_cal.model import Model, SumOfSquares, model_of
-from minimax_cal.parameters import State
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import simulate
+from minimax_cal.fitting import identify, start
+from minimax_cal.fitting.minimax_problem import Worst, measured_distances, worst_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares, minimax
-from minimax_cal.tables import Table
-from minimax_cal.worst import Worst, measured_distances, worst_of
 from qp_backends import solve as solve_qp
 
 

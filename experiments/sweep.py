@@ -36,8 +36,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import minimax_cal
 import qp_backends
-from minimax_cal.errors import CalibrationError, OptionError
-from minimax_cal.files import write_whole
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import write_whole
 
 J = TypeVar("J")
 R = TypeVar("R")

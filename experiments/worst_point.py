@@ -27,16 +27,16 @@ from experiments import sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
-from minimax_cal.data import Measurements
-from minimax_cal.kinematics import Array
-from minimax_cal.parameters import State
-from minimax_cal.point_cones import PointCones, certify
-from minimax_cal.robot import Robot, load_robot
-from minimax_cal.simulate import simulate
+from minimax_cal.fitting.certificate import PointCones, certify
+from minimax_cal.fitting.minimax_problem import Worst, measured_distances, worst_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import cones, minimax
 from minimax_cal.solvers.cones import Rows
-from minimax_cal.tables import Cell, Table
-from minimax_cal.worst import Worst, measured_distances, worst_of
 from qp_backends import solve as solve_qp
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import minimax_cal as mc
-from minimax_cal.simulate import Simulation, Truth, simulate
+from minimax_cal.cli import main
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 ROOT = Path(__file__).parent.parent
 SHARED = ROOT.parent / "shared" / "data"
@@ -42,3 +43,11 @@ def shared(name: str) -> tuple[str, str]:
     if not folder.is_dir():
         pytest.skip(f"real measurements {folder} are not on this machine")
     return str(folder / "robot.json"), str(folder / "measurements.csv")
+
+
+def run(*arguments: object) -> int:
+    """A command line in this process; its exit code."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in arguments])
+    code = ended.value.code
+    return code if isinstance(code, int) else 0

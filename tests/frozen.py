@@ -122,7 +122,7 @@ def prepare(data: Path) -> None:
     import numpy as np
 
     from experiments import blind_gap, gap_cases, relative
-    from minimax_cal.relative import write_relative
+    from minimax_cal.fitting.instruments import write_relative
 
     if (data / "done").exists():
         return

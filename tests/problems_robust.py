@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal import identify, start
-from minimax_cal.cell import Cell
-from minimax_cal.kinematics import Array
-from minimax_cal.model import Model, SumOfSquares, model_of
-from minimax_cal.parameters import State
-from minimax_cal.robust import Robust, robust_fit
-from minimax_cal.simulate import Simulation, Truth, simulate
+from minimax_cal.fitting import identify, start
+from minimax_cal.fitting.robust import Robust, robust_fit
+from minimax_cal.fitting.trimmed import Fitter
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares
-from minimax_cal.trimmed import Fitter
 
 NOISE = 20e-6  # of a coordinate, the same for all points [m]
 EVEN = Truth(compliance=0.0, noise=NOISE, noise_per_metre=0.0)

@@ -5,8 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
-from test_cli import run
+from conftest import ROOT, run
 
 import minimax_cal as mc
 

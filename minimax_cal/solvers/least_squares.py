@@ -13,7 +13,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from minimax_cal.kinematics import Array
+from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 
 

@@ -1,0 +1,5 @@
+"""`python -m minimax_cal.cli`."""
+
+from minimax_cal.cli import main
+
+main()

@@ -1,0 +1,98 @@
+"""The command `import`: files as they are, into the measurements that `calibrate` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli import options
+from minimax_cal.ground.files import json_text
+from minimax_cal.measuring.importers import Imported, import_files, save
+from minimax_cal.measuring.measurements import read_measurements
+
+PATH = click.Path(path_type=Path)
+
+
+@click.command(name="import")
+@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
+@click.option("--joints", type=PATH, help="File of joint values, where FILE holds points only.")
+@click.option(
+    "--columns",
+    default="",
+    metavar="MAPPING",
+    help="What the columns are, in order: smr1_mm,smr2_mm,smr3_mm,q_deg (skip*2 leaves two out), "
+    "or by place: 1-3=smr1_mm,4-9=q_deg,Temp=temperature_C.",
+)
+@click.option(
+    "--units",
+    multiple=True,
+    metavar="WHAT=UNIT",
+    help="Units that the files do not tell, as q=deg, smr=mm, u95=mm, time=dmy.",
+)
+@click.option(
+    "--layout",
+    type=click.Choice(["pose", "target"]),
+    help="Of a file with several points a pose: which of them follow each other.",
+)
+@click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@options.JSON
+@options.QUIET
+@options.output("the measurements (CSV)")
+def import_command(
+    files: Sequence[Path],
+    joints: Path | None,
+    columns: str,
+    units: Sequence[str],
+    layout: str | None,
+    decimal: str | None,
+    as_json: bool,
+    quiet: bool,
+    output: Path | None,
+) -> int:
+    """Read FILEs of a tracker or controller as they are, show what was understood, write CSV.
+
+    Without -o nothing is written.
+    """
+    options.writable(output)
+    found = import_files(
+        files,
+        joints,
+        columns=columns,
+        units=units,
+        layout=layout or "",
+        decimal=decimal or "",
+    )
+    if output:
+        save(output, found)
+        read_measurements(output)  # what was written can be read
+    options.notify(found.data.notices, quiet=quiet)
+    if as_json:
+        click.echo(json_text(content(found, output)), nl=False)
+        return 0
+    options.show(found.files(), *found.columns())
+    wrote = f"wrote {output}" if output else "nothing written; add -o FILE"
+    click.echo(f"{found.headline()}\n{wrote}")
+    return 0
+
+
+def content(found: Imported, output: Path | None) -> dict[str, object]:
+    """The JSON of the command."""
+    files = found.files()
+    columns = found.columns()
+    return {
+        "schema": 1,
+        "output": str(output) if output else None,
+        "poses": found.data.poses,
+        "joints": found.data.q.shape[1],
+        "targets": list(found.data.targets),
+        "files": [
+            {
+                **dict(zip(files.header, row, strict=True)),
+                "columns": [dict(zip(table.header, r, strict=True)) for r in table.rows],
+            }
+            for row, table in zip(files.rows, columns, strict=True)
+        ],
+        "notices": list(found.data.notices),
+    }

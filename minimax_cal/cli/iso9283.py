@@ -1,0 +1,68 @@
+"""The command `iso9283`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli.options import JSON, QUIET, deliver, notify, output, show, writable
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import json_text
+from minimax_cal.judging.iso9283 import iso9283
+from minimax_cal.judging.saved import open_fit
+
+
+def point_of(text: str) -> str | Sequence[float]:
+    """The TCP: a name as it is, or X,Y,Z in mm [m].  Raises OptionError."""
+    if "," not in text:
+        return text
+    try:
+        return [1e-3 * float(part) for part in text.split(",")]
+    except ValueError:
+        raise OptionError(f"--tcp {text!r}: give centroid, a target, or X,Y,Z in mm") from None
+
+
+@click.command(name="iso9283")
+@click.argument("fit", type=click.Path(path_type=Path))
+@click.argument("data", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--nominal", default="", help="Robot before calibration, file or name [default: of the fit]."
+)
+@click.option(
+    "--tcp",
+    default="centroid",
+    show_default=True,
+    metavar="POINT",
+    help="centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+)
+@click.option("--poses", is_flag=True, help="A row for every pose, too.")
+@JSON
+@output("the values (JSON)")
+@QUIET
+def iso9283_command(
+    fit: Path,
+    data: Path | None,
+    nominal: str,
+    tcp: str,
+    poses: bool,
+    as_json: bool,
+    output: Path | None,
+    quiet: bool,
+) -> int:
+    """Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.
+
+    FIT is what `calibrate -o` wrote, DATA the measurements [default: those of the fit].  Held-out
+    poses stand apart from training poses.  Poses that were visited again give repeatability.
+    """
+    writable(output)
+    point = point_of(tcp)
+    saved = open_fit(fit, data or "", nominal)
+    found = iso9283(saved.cells, saved.data, saved.held, point)
+    found = replace(found, notices=(*saved.notices, *found.notices))
+    notify(found.notices, quiet=quiet)
+    if deliver(json_text(found.to_dict()), output, as_json=as_json):
+        show(*found.tables(poses=poses))
+    return 0

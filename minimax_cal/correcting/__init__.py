@@ -1,0 +1,1 @@
+"""What goes back to the cell: corrected targets, files for controllers and simulators."""

@@ -1,0 +1,651 @@
+"""Corrected joint targets, for controllers that take no parameters.
+
+The goal of a target is the flange pose of the nominal arm at the commanded joints.  Corrected
+joints bring the calibrated arm, effects included, to that pose [docs/compensate.md].
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
+from minimax_cal.ground.files import read_text
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, load_cell, still
+from minimax_cal.modelling.effects.compliance import WHOLE
+from minimax_cal.modelling.effects.scene import unmasked
+from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.simulate import random_poses
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import cross
+from minimax_cal.robots.robot import Robot, robot_from_dict
+
+FRAMES = ("best-fit", "flange", "own")
+# What moves the reflectors or the instrument, and not the flange of the arm.
+SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "target_shift", "target_offset"})
+TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+CORNERS = tuple(f"corner{i + 1}" for i in range(4))
+LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
+SLIDE = 0.5  # metres a slide may change by where a turning joint may by a radian [m/rad]
+STEPS, PASSES, PATIENCE = (
+    40,
+    12,
+    6,
+)  # Newton steps; passes over effects; passes until sides are kept
+SETTLED = 1e-10  # change of a joint that no pass need follow [rad, m]
+SAMPLE = 200  # poses that place a nominal base where no calibration did
+SOFT = 0.01  # of the lever: what a radian of change costs where the goal is out of reach anyway
+
+
+class Outcome(StrEnum):
+    """How a target ended."""
+
+    REACHED = "reached"
+    CLOSEST = "closest"
+    LIMIT = "limit"
+    CHANGE = "change"
+    SINGULAR = "singular"
+    STALLED = "stalled"
+
+    @property
+    def failed(self) -> bool:
+        """Whether the target is missed though the arm has the joints for it."""
+        return self not in (Outcome.REACHED, Outcome.CLOSEST)
+
+    @property
+    def advice(self) -> str:
+        """What it means, and what to try."""
+        return ADVICE[self]
+
+
+ADVICE = {
+    Outcome.REACHED: "within the tolerance",
+    Outcome.CLOSEST: "the arm has fewer than six joints: what remains no joint can correct",
+    Outcome.LIMIT: "a joint limit is in the way: move the target inwards, or check lower and upper "
+    "in the robot file",
+    Outcome.CHANGE: "a joint would have to change by more than allowed: raise --max-change, or "
+    "move the target away from a singular pose",
+    Outcome.SINGULAR: "a singular pose or the edge of the workspace: move the target a little",
+    Outcome.STALLED: "no joints were found that hold for this path: play in the gears may pull "
+    "both ways (go there by a point before it, or give columns approach1 ...)",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """Corrected joint targets.
+
+    q: (m, n) corrected, commanded: (m, n) as given [rad, m].  distance, angle: (m,) what remains
+    of the flange pose by the calibrated model [m, rad]; distance_before, angle_before: without
+    correction.  outcome: m words.  sliding: (n,).  line: (m,) line of the file.
+    frame: how the nominal arm was placed.  notices: what the reader should know.
+    """
+
+    q: Array
+    commanded: Array
+    distance: Array
+    angle: Array
+    distance_before: Array
+    angle_before: Array
+    outcome: tuple[Outcome, ...]
+    sliding: Array
+    line: Array
+    name: str
+    frame: str
+    notices: tuple[str, ...]
+
+    @property
+    def failed(self) -> Array:
+        """(m,) True where a target is missed."""
+        return np.array([outcome.failed for outcome in self.outcome], dtype=bool)
+
+    def tables(self) -> tuple[Table, ...]:
+        """What the correction does, how targets ended, and by how much each joint changes."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, distance, angle in (
+            ("as commanded", self.distance_before, self.angle_before),
+            ("corrected", self.distance, self.angle),
+        ):
+            sizes = [f(1e3 * part) for part in (distance, angle) for f in (rms, np.max)]
+            rows.append((title, len(self.q), *map(float, sizes)))
+        header = ("joints", "targets", "RMS mm", "max mm", "RMS mrad", "max mrad")
+        formats = ("", "d", *[".4f"] * 4)
+        title = f"{self.name}: error of the flange ({self.frame})"
+        pose = Table(title, header, tuple(rows), formats)
+        found = [(o, self.outcome.count(o)) for o in Outcome if o in self.outcome]
+        ends = tuple((str(o), count, o.advice) for o, count in found)
+        outcome = Table("targets", ("status", "targets", "meaning"), ends, ("", "d", ""))
+        change = 1e3 * (self.q - self.commanded)
+        joints = tuple(
+            (f"J{j + 1}", "mm" if self.sliding[j] else "mrad", rms(change[:, j]),
+             float(np.abs(change[:, j]).max()))
+            for j in range(self.q.shape[1])
+        )  # fmt: skip
+        each = Table("change of the joints", ("joint", "unit", "RMS", "max"), joints,
+                     ("", "", ".4f", ".4f"))  # fmt: skip
+        return pose, outcome, each
+
+    def headline(self) -> str:
+        """The result in a sentence."""
+        return (
+            f"{len(self.q) - int(self.failed.sum())} of {len(self.q)} targets: largest error "
+            f"{1e3 * self.distance_before.max():.3f} mm, {1e3 * self.angle_before.max():.3f} mrad "
+            f"-> {1e3 * self.distance.max():.3f} mm, {1e3 * self.angle.max():.3f} mrad, as the "
+            "calibrated model sees it."
+        )
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+
+    def complaint(self) -> str:
+        """Which targets are missed and what to try; '' if none is."""
+        parts = []
+        for kind in Outcome:
+            lines = [int(n) for n, o in zip(self.line, self.outcome, strict=True) if o == kind]
+            if lines and kind.failed:
+                more = f" and {len(lines) - 8} more" if len(lines) > 8 else ""
+                where = ", ".join(map(str, lines[:8]))
+                parts.append(f"{kind} at line {where}{more}: {kind.advice}")
+        count = int(self.failed.sum())
+        return f"{count} of {len(self.q)} targets are missed: " + "; ".join(parts) if count else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, joints in SI."""
+        return {
+            "schema": 1,
+            "kind": "compensation",
+            "robot": self.name,
+            "frame": self.frame,
+            "missed": int(self.failed.sum()),
+            "targets": [
+                {
+                    "line": int(self.line[i]),
+                    "status": str(self.outcome[i]),
+                    "q": self.q[i].tolist(),
+                    "residual_mm": 1e3 * float(self.distance[i]),
+                    "residual_mrad": 1e3 * float(self.angle[i]),
+                    "before_mm": 1e3 * float(self.distance_before[i]),
+                    "before_mrad": 1e3 * float(self.angle_before[i]),
+                }
+                for i in range(len(self.q))
+            ],
+            "notices": list(self.notices),
+        }
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def compensate(
+    fit: Calibration | Cell | Path | str,
+    targets: Measurements | Array | Sequence[Sequence[float]],
+    nominal: Robot | None = None,
+    *,
+    frame: str = "best-fit",
+    tolerance: float = 1e-5,
+    most_change: float = np.pi / 36.0,
+    lever: float = np.nan,
+    clock: float = 0.0,
+) -> Compensation:
+    """Joints that bring the calibrated arm to where the nominal one would stand.
+
+    fit: a calibration, its cell, or its file.  targets: (m, n) commanded joints in the order of the
+    path [rad, m], or measurements, whose columns (payload, approach ...) then count.
+    nominal: the arm the controller believes in; that of the fit unless given.
+    frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of the
+    orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
+    lever: what a radian counts as [m], NaN for the targets' own.  clock: moment of the
+    calibration's session, 0 to 1, that effects of time are taken at.  Raises CalibrationError for
+    wrong input.
+    """
+    if frame not in FRAMES:
+        raise OptionError(f"no frame {frame!r}; choose {', '.join(FRAMES)}")
+    for name, value in (("tolerance", tolerance), ("largest change", most_change)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise OptionError(f"{name} {value:g}: must be positive and finite")
+    if lever <= 0.0 or np.isinf(lever):
+        raise OptionError(f"lever {lever:g} m: must be positive and finite")
+    if not 0.0 <= clock <= 1.0:
+        raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
+    cell, robots, drawn = cells_of(fit)
+    if nominal is not None and not any(same(nominal, robot) for robot in robots):
+        robots, drawn = (nominal,), ()
+    if not robots:
+        raise CalibrationError("the fit does not tell its nominal robot; give it (--robot)")
+    check_like(robots[0], cell.robot)
+    arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
+    base, tool, said = placed(cell, arm, robots[0], drawn, frame)
+    goal = base @ robots[0].pose(data.q) @ tool
+    if np.isnan(lever):
+        own = rms(np.linalg.norm(cell.spots, axis=1)) if len(cell.spots) else 0.0
+        lever = own if own > LEAST_LEVER else USUAL_LEVER
+    reach = Reach(arm, data, goal, lever, tolerance, most_change)
+    q, outcome = reach.best()
+    distance, angle = reach.error(q)
+    before, turned = reach.error(data.q)
+    return Compensation(
+        q=q,
+        commanded=data.q,
+        distance=distance,
+        angle=angle,
+        distance_before=before,
+        angle_before=turned,
+        outcome=outcome,
+        sliding=cell.robot.prismatic,
+        line=data.line,
+        name=cell.robot.name,
+        frame=frame,
+        notices=(*data.notices, *said, *remarks(cell, arm, data)),
+    )
+
+
+def cells_of(
+    fit: Calibration | Cell | Path | str,
+) -> tuple[Cell, tuple[Robot, ...], tuple[Cell, ...]]:
+    """The calibrated cell; the nominal robot and its cell, where the fit tells them."""
+    if isinstance(fit, Calibration):
+        return fit.cell, (fit.nominal.robot,), (fit.nominal,)
+    if isinstance(fit, Cell):
+        return fit, (), ()
+    cell = load_cell(fit)
+    content = json.loads(read_text(fit))
+    if "nominal_robot" not in content:
+        return cell, (), ()
+    robot = robot_from_dict(content["nominal_robot"], f"{fit}: nominal_robot")
+    return cell, (robot,), nominal_cell(cell, robot, content)
+
+
+def nominal_cell(cell: Cell, robot: Robot, content: Mapping[str, Any]) -> tuple[Cell, ...]:
+    """The nominal cell of a saved calibration, from its parameters; empty if they do not tell it.
+
+    Base entries are told along the nominal base's axes (`calibrate.parameter_table`).
+    """
+    try:
+        told = {p["name"]: p for p in content["parameters"]}
+        at, was = (np.array([told[f"base_{a}"][k] for a in "xyz"], dtype=float) * 1e-3
+                   for k in ("value", "nominal"))  # fmt: skip
+        turn = np.array([told[f"base_r{a}"]["value"] for a in "xyz"], dtype=float)
+        spots = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.targets]
+        base = np.eye(4)
+        base[:3, :3] = cell.base[:3, :3] @ kinematics.rotation(-turn)
+        base[:3, 3] = base[:3, :3] @ was
+        apart = np.abs(base[:3, :3] @ at - cell.base[:3, 3]).max()
+        if not apart < 1e-5:
+            return ()
+        return (Cell(robot, base, cell.targets, np.array(spots, dtype=float) * 1e-3),)
+    except (KeyError, TypeError, ValueError):
+        return ()
+
+
+def same(one: Robot, other: Robot) -> bool:
+    """Whether two robots have the same geometry."""
+    if one.joints != other.joints:
+        return False
+    equal = np.allclose(one.mdh, other.mdh, rtol=0.0, atol=1e-9)
+    return bool(
+        equal and np.all(one.sign == other.sign) and np.all(one.prismatic == other.prismatic)
+    )
+
+
+def check_like(nominal: Robot, robot: Robot) -> None:
+    """Raise OptionError if the joints of the nominal robot are not those of the calibrated one."""
+    if nominal.joints != robot.joints:
+        raise OptionError(
+            f"{nominal.name} has {nominal.joints} joints, the calibrated {robot.name} "
+            f"{robot.joints}; give the nominal robot of this fit (--robot)"
+        )
+    odd = (nominal.prismatic != robot.prismatic) | (nominal.sign != robot.sign)
+    if odd.any():
+        raise OptionError(
+            f"joint {int(np.argmax(odd)) + 1} of {nominal.name} has another type or sign than the "
+            "calibrated one's; give the nominal robot of this fit (--robot)"
+        )
+
+
+def path_of(
+    targets: Measurements | Array | Sequence[Sequence[float]], robot: Robot, clock: float
+) -> Measurements:
+    """The commanded joints as measurements without targets.  Raises DataError."""
+    if isinstance(targets, Measurements):
+        data = targets
+    else:
+        try:
+            q = np.atleast_2d(np.array(targets, dtype=float))
+        except (TypeError, ValueError) as error:
+            raise DataError(f"targets: must be numbers, one row of joints each ({error})") from None
+        if q.ndim != 2 or not np.all(np.isfinite(q)):
+            raise DataError("targets: must be finite numbers, one row of joints each")
+        rows = np.arange(len(q)) + 1
+        nowhere = np.zeros((len(q), 0, 3))
+        sliding = robot.prismatic if q.shape[1] == robot.joints else np.zeros(q.shape[1], bool)
+        data = Measurements(q, nowhere, (), sliding, rows, {}, source="targets")
+    if not data.poses:
+        raise DataError(f"{data.source}: holds no targets")
+    check_joints(robot, data)
+    return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
+
+
+def arm_of(cell: Cell) -> Cell:
+    """The calibrated arm in its own base, seen by four points about its targets' centre.
+
+    They tell the flange's pose.  Of the effects those that move the flange.
+    """
+    middle = cell.spots.mean(axis=0) if len(cell.spots) else np.zeros(3)
+    kept = [
+        (term, value)
+        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
+        if term.effect not in SEEN_ONLY and term.place not in cell.targets
+    ]
+    effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
+    return replace(cell, targets=CORNERS, spots=middle + USUAL_LEVER * TETRAHEDRON, effects=effects)
+
+
+def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
+    """What the reader should know about effects and limits."""
+    out = limit_notices(cell.robot, data)
+    left = [term.label for term in cell.effects.terms if term not in arm.effects.terms]
+    if left:
+        out.append(
+            f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"
+        )
+    terms = arm.effects.terms
+    timed = [term.label for term in terms if "constant" in term.choice or "since" in term.choice]
+    if timed:
+        out.append(
+            f"{', '.join(timed)} depends on the time in the calibration's session: taken at "
+            f"{data.columns['clock'][0]:g} of it (--clock 0 is its start, 1 its end)"
+        )
+    scene = arm.scene(data.take(np.arange(1)))
+    whole = any(
+        part % 4 == WHOLE
+        for term in terms
+        if term.effect == "joint_compliance"
+        for part in unmasked(term.choice["parts"])
+    )
+    if whole and not (scene.known_masses or scene.measured_torques):
+        out.append(
+            "the compliance was fitted to measured torques, and these targets have none (tau1_Nm "
+            "...): torques of assumed masses are used"
+        )
+    if any("temperature" in term.choice for term in terms) and "temperature" not in data.columns:
+        out.append("thermal growth: no column temperature_C, taken at 20 C")
+    return out
+
+
+def placed(
+    cell: Cell, arm: Cell, nominal: Robot, drawn: tuple[Cell, ...], frame: str
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Where the nominal arm stands: its base in the calibrated base, its flange's own offset.
+
+    (4, 4) each: the goal of the calibrated flange is base @ nominal pose @ tool.  And notices.
+    """
+    if frame == "own":
+        return np.eye(4), np.eye(4), ()
+    if drawn:
+        base = np.linalg.inv(cell.base) @ drawn[0].base
+        return base, motion(cell.spots, drawn[0].spots) if frame == "best-fit" else np.eye(4), ()
+    q = random_poses(nominal, SAMPLE, np.random.default_rng(0))
+    turn, moved = bent(arm, still(q, arm.targets, arm.robot))
+    flange = moved @ kinematics.forward(
+        arm.robot.mdh, q * arm.robot.sign + turn, arm.robot.prismatic
+    )
+    pose, tool = nominal.pose(q), np.eye(4)
+    for _ in range(1 if frame == "flange" else 50):
+        base = motion(
+            seen(pose @ tool, arm.spots).reshape(-1, 3), seen(flange, arm.spots).reshape(-1, 3)
+        )
+        if frame == "best-fit":
+            wanted = seen(np.linalg.inv(base @ pose) @ flange, arm.spots).mean(axis=0)
+            tool = motion(arm.spots, wanted)
+    said = (
+        f"the nominal base was placed by {SAMPLE} poses of the two models, not by the measurements"
+    )
+    return base, tool, (said,)
+
+
+def seen(pose: Array, spots: Array) -> Array:
+    """Points of the flange: (m, k, 3).  pose: (m, 4, 4).  spots: (k, 3) [m]."""
+    turned = np.einsum("mij,kj->mki", pose[:, :3, :3], spots)
+    return np.asarray(turned + pose[:, None, :3, 3])
+
+
+def motion(before: Array, after: Array) -> Array:
+    """The rigid motion that takes points nearest to others: (..., 4, 4), by the least turn.
+
+    before, after: (..., k, 3) [m].  Newton on the turn: what a line or a point does not tell is 0.
+    """
+    centre, end = before.mean(axis=-2, keepdims=True), after.mean(axis=-2, keepdims=True)
+    arm, aim = before - centre, after - end
+    out = np.zeros((*before.shape[:-2], 4, 4))
+    out[..., 3, 3] = 1.0
+    out[..., :3, :3] = np.eye(3)
+    for _ in range(6):
+        here = arm @ np.swapaxes(out[..., :3, :3], -1, -2)
+        inertia = np.eye(3) * np.square(here).sum((-1, -2))[..., None, None]
+        inertia = inertia - np.swapaxes(here, -1, -2) @ here
+        torque = np.cross(here, aim).sum(axis=-2)
+        inverse = np.linalg.pinv(inertia, rcond=1e-3, hermitian=True)
+        turn = (inverse @ torque[..., None])[..., 0]
+        out[..., :3, :3] = kinematics.rotation(turn) @ out[..., :3, :3]
+        if np.abs(turn).max(initial=0.0) < 1e-14:
+            break
+    shift = end - centre @ np.swapaxes(out[..., :3, :3], -1, -2)
+    out[..., :3, 3] = shift[..., 0, :]
+    return out
+
+
+def bent(arm: Cell, data: Measurements) -> tuple[Array, Array]:
+    """What effects do at commanded joints: turns of the joints, and motion of the flange besides.
+
+    Returns (m, n), signs applied [rad, m], and (m, 4, 4) in the base, from the left [m].
+    """
+    turn = np.zeros((data.poses, arm.robot.joints))
+    still_there = np.broadcast_to(np.eye(4), (data.poses, 4, 4))
+    if not arm.effects.terms:
+        return turn, still_there
+    scene = arm.scene(data)
+    shift = np.zeros(scene.points.shape)
+    for term, value in zip(arm.effects.terms, arm.effects.values, strict=True):
+        columns = term.columns(scene)
+        if columns.turn.size:
+            turn += np.einsum("d,dnm->mn", value, columns.turn)
+        if columns.shift.size:
+            shift += np.einsum("d,dkcm->kcm", value, columns.shift)
+    if not shift.any():
+        return turn, still_there
+    mdh, prismatic = arm.robot.mdh, arm.robot.prismatic
+    before = seen(kinematics.forward(mdh, scene.q.T + turn, prismatic), arm.spots)
+    return turn, motion(before, before + np.moveaxis(shift, -1, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """The search for joints of an arm at goals along a path.
+
+    data: commanded joints (m, n) and columns.  goal: (m, 4, 4) of the flange in the base [m].
+    """
+
+    arm: Cell
+    data: Measurements
+    goal: Array
+    lever: float
+    tolerance: float
+    most_change: float
+
+    @property
+    def start(self) -> Array:
+        """(m, n) the commanded joints, within the limits."""
+        return np.clip(self.data.q, self.arm.robot.lower, self.arm.robot.upper)
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Least and largest joints that are allowed: (m, n) each."""
+        robot = self.arm.robot
+        room = self.most_change * np.where(robot.prismatic, SLIDE, 1.0)
+        return np.maximum(robot.lower, self.start - room), np.minimum(
+            robot.upper, self.start + room
+        )
+
+    def at(self, q: Array) -> Measurements:
+        """The path through other joints: history follows from them, given columns stay."""
+        return replace(self.data, q=q)
+
+    def error(self, q: Array) -> tuple[Array, Array]:
+        """How far the flange is from its goal: (m,) [m] and (m,) [rad], the way there counted."""
+        turn, moved = bent(self.arm, self.at(q))
+        robot = self.arm.robot
+        pose = moved @ kinematics.forward(robot.mdh, q * robot.sign + turn, robot.prismatic)
+        apart = np.swapaxes(pose[:, :3, :3], -1, -2) @ self.goal[:, :3, :3]
+        angle = np.linalg.norm(Rotation.from_matrix(apart).as_rotvec(), axis=1)
+        return np.linalg.norm(pose[:, :3, 3] - self.goal[:, :3, 3], axis=1), angle
+
+    def good(self, q: Array) -> Array:
+        """(m,) True where the goal is reached."""
+        distance, angle = self.error(q)
+        return (distance <= self.tolerance) & (self.lever * angle <= self.tolerance)
+
+    def best(self) -> tuple[Array, tuple[Outcome, ...]]:
+        """Corrected joints, and how each target ended.
+
+        Goals that cannot be reached are sought again with a price on change: the arm then does
+        not swing far for next to nothing.
+        """
+        q, settled = self.settle(self.start, np.zeros(len(self.goal)))
+        good = self.good(q)
+        if not good.all():
+            begin = np.where(good[:, None], q, self.start)
+            q, settled = self.settle(begin, np.where(good, 0.0, SOFT))
+            good = self.good(q)
+        return q, self.outcomes(q, good, settled)
+
+    def settle(self, q: Array, soft: Array) -> tuple[Array, Array]:
+        """Joints that agree with the effects they cause, and (m,) True where they do.
+
+        Effects are taken from the joints before and kept while Newton reaches the goals.
+        """
+        data = self.at(q)
+        for count in range(PASSES):
+            turn, moved = bent(self.arm, data)
+            goal = np.linalg.inv(moved) @ self.goal
+            new = newton(self, q, goal, turn, soft)
+            change = np.abs(new - q).max(axis=1)
+            q = new
+            if not self.arm.effects.terms:
+                return q, np.ones(len(q), dtype=bool)
+            kept = data.columns if count >= PATIENCE else self.data.columns
+            data = replace(self.at(q), columns=kept)
+            if count + 1 == PATIENCE:  # play that pulls both ways: decide on a side
+                history = with_history(data).columns
+                sides = {name: c for name, c in history.items() if name.startswith("approach")}
+                data = replace(data, columns={**data.columns, **sides})
+            if change.max() < SETTLED:
+                break
+        walked, _ = bent(self.arm, self.at(q))
+        agree = np.abs(walked - turn).max(axis=1) < 1e4 * SETTLED
+        return q, agree & (change < 1e4 * SETTLED)
+
+    def outcomes(self, q: Array, good: Array, settled: Array) -> tuple[Outcome, ...]:
+        """How each target ended."""
+        turn, moved = bent(self.arm, self.at(q))
+        residual, slope = examine(self, q, np.linalg.inv(moved) @ self.goal, turn)
+        robot, (lower, upper) = self.arm.robot, self.box
+        force = np.einsum("mij,mi->mj", slope, residual)
+        size = np.linalg.norm(slope, axis=1) * np.linalg.norm(residual, axis=1)[:, None]
+        down, up = force < -1e-2 * size, force > 1e-2 * size
+        limit = ((q <= robot.lower) & down) | ((q >= robot.upper) & up)
+        bound = ((q <= lower) & down) | ((q >= upper) & up)
+        singular = np.linalg.svd(slope, compute_uv=False)
+        whole = singular[:, -1] > 1e-2 * singular[:, 0]
+        out = []
+        for i in range(len(q)):
+            if good[i]:
+                out.append(Outcome.REACHED)
+            elif limit[i].any():
+                out.append(Outcome.LIMIT)
+            elif bound[i].any():
+                out.append(Outcome.CHANGE)
+            elif not settled[i]:
+                out.append(Outcome.STALLED)
+            elif robot.joints < 6 and whole[i]:
+                out.append(Outcome.CLOSEST)
+            else:
+                out.append(Outcome.SINGULAR)
+        return tuple(out)
+
+
+def examine(reach: Reach, q: Array, goal: Array, turn: Array) -> tuple[Array, Array]:
+    """What is missing of the goals (m, 6) [m], turns times the lever, and its slope (m, 6, n)."""
+    robot, lever = reach.arm.robot, reach.lever
+    links = kinematics.chain(robot.mdh, q * robot.sign + turn, robot.prismatic)
+    missing = goal[:, :3, 3] - links.origin.T
+    pose = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
+    away = Rotation.from_matrix(goal[:, :3, :3] @ np.swapaxes(pose, -1, -2)).as_rotvec()
+    slides = robot.prismatic[:, None, None]
+    moves = np.where(slides, links.z, cross(links.z, links.origin - links.before))
+    turns = np.where(slides, 0.0, lever * links.z)
+    slope = np.concatenate([moves, turns], axis=1) * robot.sign[:, None, None]
+    return np.concatenate([missing, lever * away], axis=1), np.moveaxis(slope, -1, 0).swapaxes(1, 2)
+
+
+def newton(reach: Reach, begin: Array, goal: Array, turn: Array, soft: Array) -> Array:
+    """Joints (m, n) nearest to their goals within the box: damped Gauss-Newton on all at once.
+
+    Minimises |missing|^2 + soft^2 |change from the start|^2.  A joint at a bound that would leave
+    is held; steps are cut to the box, and damped until they lower the cost.  turn: (m, n) that
+    effects add.  soft: (m,) price of change, relative to the lever.
+    """
+    lower, upper = reach.box
+    q, rest = np.clip(begin, lower, upper), reach.start
+    price = (soft * reach.lever) ** 2
+    damping, eye = np.full(len(q), 1e-6), np.eye(q.shape[1])
+    todo = np.arange(len(q))
+
+    def look(rows: Array, at: Array) -> tuple[Array, Array, Array]:
+        residual, slope = examine(reach, at, goal[rows], turn[rows])
+        cost = (residual**2).sum(1) + price[rows] * ((at - rest[rows]) ** 2).sum(1)
+        return residual, slope, cost
+
+    residual, slope, cost = look(todo, q)
+    for _ in range(STEPS):
+        here, weight = q[todo], price[todo]
+        force = np.einsum("mij,mi->mj", slope, residual) - weight[:, None] * (here - rest[todo])
+        free = ~(((here <= lower[todo]) & (force < 0)) | ((here >= upper[todo]) & (force > 0)))
+        gram = np.swapaxes(slope, 1, 2) @ slope + weight[:, None, None] * eye
+        scale = np.maximum(np.trace(gram, axis1=1, axis2=2) / len(eye), 1e-12)
+        gram = np.where(free[:, :, None] & free[:, None, :], gram, 0.0)
+        force = np.where(free, force, 0.0)
+        matrix = gram + (damping[todo] * scale)[:, None, None] * eye
+        step = np.linalg.solve(matrix, force[..., None])[..., 0]
+        trial = np.clip(here + step, lower[todo], upper[todo])
+        step = trial - here
+        gain = 2.0 * (force * step).sum(1) - np.einsum("mi,mij,mj->m", step, gram, step)
+        done = (np.abs(step).max(1) < 1e-13) | (np.abs(gain) <= 1e-12 * cost + 1e-28)
+        new_residual, new_slope, new_cost = look(todo, trial)
+        better = new_cost < cost
+        q[todo[better]] = trial[better]
+        pick = better[:, None]
+        residual = np.where(pick, new_residual, residual)
+        slope = np.where(pick[..., None], new_slope, slope)
+        cost = np.where(better, new_cost, cost)
+        damping[todo] = np.clip(damping[todo] * np.where(better, 0.1, 10.0), 1e-12, 1e9)
+        todo, residual, slope, cost = (part[~done] for part in (todo, residual, slope, cost))
+        if not len(todo):
+            break
+    return q

@@ -1,0 +1,126 @@
+"""What is to be exported, and what an exporter gives back; the joint origins most formats share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import read_text
+from minimax_cal.modelling.cell import Cell, cell_from_dict, still
+from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict
+from minimax_cal.robots.transforms import SAME, head, tail
+from minimax_cal.robots.urdf import is_urdf, load_urdf
+from minimax_cal.robots.urdf_file import Urdf
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A robot on its way to a file.
+
+    robot: calibrated.  nominal: before the calibration, the same where there was none.
+    effects: labels of what the fit holds beyond geometry.
+    compliance: (n,) turn per torque that was fitted, NaN where none [rad/(N m)].
+    originals: the URDF to correct, or none.  tip: its last link, empty for the only end.
+    experimental: whether the user agreed to what no maker documents.
+    fitted: whether nominal is known.  notices: what of the source is not in the robot.
+    """
+
+    robot: Robot
+    nominal: Robot
+    source: str
+    effects: tuple[str, ...]
+    compliance: Array
+    originals: tuple[Urdf, ...] = ()
+    tip: str = ""
+    experimental: bool = False
+    fitted: bool = False
+    notices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Export:
+    """A file's content, and what people should know about it."""
+
+    content: bytes
+    notices: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(text: str, *notices: str) -> Export:
+        """From text."""
+        return Export(text.encode("utf-8"), notices)
+
+
+def read_job(source: Path | str) -> Job:
+    """A saved calibration, or any robot that `load_robot` takes.  Raises CalibrationError."""
+    path = Path(source)
+    if path.suffix.lower() == ".json" and path.is_file():
+        try:
+            content = json.loads(read_text(path))
+        except (json.JSONDecodeError, RecursionError):
+            content = None  # load_robot says what is wrong with it
+        if isinstance(content, Mapping) and "targets_mm" in content:
+            cell, before = cell_from_dict(content, str(path)), content.get("nominal_robot")
+            labels = tuple(term.label for term in cell.effects.terms)
+            known = isinstance(before, Mapping)
+            where = f"{path}: nominal_robot"
+            before = robot_from_dict(before, where) if isinstance(before, Mapping) else cell.robot
+            return Job(cell.robot, before, str(path), labels, compliance_of(cell), fitted=known)
+    robot = load_robot(source)
+    notices = load_urdf(source).notices if is_urdf(source) else ()
+    nothing = np.full(robot.joints, np.nan)
+    return Job(robot, robot, str(source), (), nothing, notices=notices)
+
+
+def compliance_of(cell: Cell) -> Array:
+    """(n,) turn per torque of each joint's whole load, NaN where none was fitted [rad/(N m)]."""
+    out = np.full(cell.robot.joints, np.nan)
+    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.targets, cell.robot))
+    for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
+        if term.effect == "joint_compliance":
+            for name, value in zip(term.columns(scene).names, values, strict=True):
+                if name[1:].isdigit():
+                    out[int(name[1:]) - 1] = value
+    return out
+
+
+def origins(robot: Robot) -> Array:
+    """Where each joint lies in the link before it, at joint values 0: (n + 1, 4, 4) [m].
+
+    Joint i turns or slides along z of origin i (backwards where its sign is -1); the last one is
+    the flange.  Parallel axes stay near: beta is part of the rotation.
+    """
+    tails = [np.eye(4), *map(tail, robot.mdh)]
+    heads = [*map(head, robot.mdh), np.eye(4)]
+    return np.array([before @ after for before, after in zip(tails, heads, strict=True)])
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """joint_1 ... joint_n."""
+    return tuple(f"joint_{i + 1}" for i in range(robot.joints))
+
+
+def is_identity(pose: Array) -> bool:
+    """Whether a transform does nothing, to rounding."""
+    return bool(np.abs(pose - np.eye(4)).max() <= SAME)
+
+
+def number(value: float) -> str:
+    """A number that reads back as the same one."""
+    return repr(float(value) + 0.0)
+
+
+def triple(values: Array) -> str:
+    """Three numbers for XML."""
+    return " ".join(map(number, values))
+
+
+def mark_up(text: str) -> str:
+    """Text as a value in XML."""
+    for letter, name in (("&", "amp"), ("<", "lt"), (">", "gt"), ('"', "quot")):
+        text = text.replace(letter, f"&{name};")
+    return "".join(letter for letter in text if letter.isprintable())

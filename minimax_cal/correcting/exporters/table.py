@@ -1,0 +1,47 @@
+"""Every format that a robot can be written in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from minimax_cal.correcting.exporters import dh_csv, moc, robot_json, ros_yaml, ur_yaml, urdf
+from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.ground.errors import OptionError
+
+EXPORTERS: dict[str, Callable[[Job], Export]] = {
+    "urdf": urdf.write,
+    "ur-yaml": ur_yaml.write,
+    "ros-yaml": ros_yaml.write,
+    "dh-csv": dh_csv.write,
+    "json": robot_json.write,
+    "moc": moc.write,
+}
+
+
+def export(job: Job, to: str) -> Export:
+    """The file in a format, with notices.  Raises OptionError."""
+    if to not in EXPORTERS:
+        raise OptionError(f"--to {to}: no such format; choose one of {', '.join(EXPORTERS)}")
+    if job.originals and to != "urdf":
+        raise OptionError(f"--urdf goes with --to urdf, not with --to {to}")
+    if job.tip and not job.originals:
+        raise OptionError("--tip names a link of the file given with --urdf")
+    found = EXPORTERS[to](job)
+    if not job.originals:  # a given URDF keeps its own constants
+        found = replace(found, notices=(*job.notices, *found.notices))
+    lost = [label for label in job.effects if not (to == "moc" and is_written(job, label))]
+    if not lost:
+        return found
+    said = (
+        f"{', '.join(lost)}: effects beyond geometry are not in this file, which then does not "
+        "reach the accuracy of the fit; minimax-cal compensate takes them into account"
+    )
+    return replace(found, notices=(*found.notices, said))
+
+
+def is_written(job: Job, label: str) -> bool:
+    """Whether MOC.cfg holds an effect: the compliance of joints, where each has one number."""
+    name, _, place = label.partition(":")
+    numbers = job.compliance if place == "all" else job.compliance[int(place[1:]) - 1 :][:1]
+    return name == "joint_compliance" and bool((numbers == numbers).any())

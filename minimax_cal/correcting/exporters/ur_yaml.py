@@ -1,0 +1,51 @@
+"""Universal Robots kinematics YAML, as `ur_description` takes it (`kinematics_params`)."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import yaml
+
+from minimax_cal.correcting.exporters.job import Export, Job, is_identity, origins
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.transforms import to_rpy, turn
+
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+HEADER = (
+    "# Written by minimax-cal.  Joint origins in metres and radians, from the controller's base\n"
+    "# frame; each joint turns about its own z.  The hash is of these numbers.\n"
+)
+
+
+def write(job: Job) -> Export:
+    """Six turning joints; a joint of sign -1 is turned over exactly.  Raises OptionError."""
+    robot = job.robot
+    if robot.joints != len(LINKS) or robot.prismatic.any():
+        raise OptionError("--to ur-yaml: the format is for arms with six turning joints")
+    over = [turn(0, 0.0 if sign > 0 else np.pi) for sign in robot.sign]
+    poses = origins(robot)
+    for i, flip in enumerate(over):  # Rz(-q) = Rx(pi) Rz(q) Rx(pi)
+        poses[i], poses[i + 1] = poses[i] @ flip, flip.T @ poses[i + 1]
+    if not is_identity(poses[-1]):
+        raise OptionError(
+            "--to ur-yaml: the format ends at the last joint's own frame and has no place for a, "
+            "alpha, beta (or a sign of -1) of the last link; use --to urdf or ros-yaml"
+        )
+    table = {
+        name: dict(zip(KEYS, (float(v) + 0.0 for v in (*pose[:3, 3], *to_rpy(pose))), strict=True))
+        for name, pose in zip(LINKS, poses, strict=False)
+    }
+    text = yaml.safe_dump({"kinematics": table | {"hash": hash_of(table)}}, sort_keys=False)
+    return Export.of(
+        HEADER + text,
+        "the hash is of these numbers and is not the controller's checksum: the driver will warn "
+        "that the two differ",
+    )
+
+
+def hash_of(table: dict[str, dict[str, float]]) -> str:
+    """calib_<n>, a function of the numbers alone."""
+    text = ";".join(f"{name}:{key}={v!r}" for name, row in table.items() for key, v in row.items())
+    return f"calib_{int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], 'big')}"

@@ -1,0 +1,1 @@
+"""What is still wrong, and why."""

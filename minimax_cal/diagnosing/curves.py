@@ -1,0 +1,248 @@
+"""What a diagnosis leaves, drawn against its cause and by visit order: numbers, no picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.diagnosing.where import joint_equivalent
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.history import numbered, visits, with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.pose_rows import plain
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import Fitted, Term
+
+BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
+LINEAR = ("encoder_gain", "joint_coupling")
+BY_MOVE = {"backlash": "approach", "settling": "move"}
+BY_TIME = ("thermal_growth", "frame_drift", "target_shift")
+VIEWS = ("geometry alone", "with effects", "the first effect taken out")
+FLAT = 1e-6  # of its size: what varies less does not vary
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Something against something.
+
+    x: (m,) or (k, m).  y: of each of VIEWS, or of the first ones, the shape of x.
+    """
+
+    title: str
+    xlabel: str
+    ylabel: str
+    x: Array
+    y: tuple[Array, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; null where not measured."""
+        return {
+            "title": self.title,
+            "x": {"label": self.xlabel, "values": plain(self.x)},
+            "y": {"label": self.ylabel},
+            "views": [
+                {"name": name, "values": plain(y)} for name, y in zip(VIEWS, self.y, strict=False)
+            ],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """What geometry leaves, then what the effects leave.
+
+    data: with its history.  held: (m,) True where held out.  noise: of a coordinate [m].
+    effects: as fitted.
+    errors: (k, m, 3) of the first views in base axes, NaN where not measured [m].
+    law: as errors, of the fit with effects once the first effect is taken out; none without one.
+    points: (k, m, 3) measured, in base axes [m].  term: the first effect that was fitted, if any.
+    """
+
+    data: Measurements
+    held: Array
+    noise: float
+    effects: Fitted
+    scene: Scene
+    errors: tuple[Array, ...]
+    law: tuple[Array, ...]
+    points: Array
+    term: tuple[Term, ...]
+
+    @staticmethod
+    def of(
+        data: Measurements, held: Array, noise: float, cells: Sequence[Cell], found: Sequence[Term]
+    ) -> Leftover:
+        """From the first and the last of the cells.  found: effects, the largest first."""
+        data = with_history(data)
+        first, last = cells[0], cells[-1]
+        cells = (first, last) if last.effects.terms else (first,)
+        axes, origin = first.base[:3, :3], first.base[:3, 3]
+        known = {term.label for term in last.effects.terms}
+        term = tuple(term for term in found if term.label in known)[:1]
+        law = tuple(replace(last, effects=without(last.effects, one)) for one in term)
+        return Leftover(
+            data=data,
+            held=held,
+            noise=noise,
+            effects=last.effects,
+            scene=first.scene(data),
+            errors=tuple(cell.error(data) @ axes for cell in cells),
+            law=tuple(cell.error(data) @ axes for cell in law),
+            points=np.moveaxis((data.y - origin) @ axes, 1, 0),
+            term=term,
+        )
+
+    def distances(self) -> list[Array]:
+        """(k, m) sizes of the errors of each view [mm]."""
+        return [1e3 * np.linalg.norm(error, axis=-1) for error in self.errors]
+
+
+def without(effects: Fitted, term: Term) -> Fitted:
+    """Fitted effects less one, all its lines."""
+    kept = [i for i, other in enumerate(effects.terms) if other.label != term.label]
+    return Fitted(tuple(effects.terms[i] for i in kept), tuple(effects.values[i] for i in kept))
+
+
+# ---- the residual map --------------------------------------------------------------------------
+
+
+def turns(left: Leftover) -> list[Array]:
+    """(m, n) what each joint would have to turn to explain the errors of each view [rad, m].
+
+    Of all views at once, so that one ridge serves them all and they compare.
+    """
+    views = (*left.errors, *left.law)
+    slope = np.concatenate([left.scene.slope] * len(views), axis=-1)
+    together = np.concatenate(views, axis=1)
+    return np.split(joint_equivalent(together, slope, left.noise), len(views), axis=0)
+
+
+def guilty(left: Leftover, turn: list[Array]) -> int:
+    """Index of the joint to show: the effect's own, else the one whose part shrinks most.
+
+    Without an effect, the one that moves the targets most.
+    """
+    place = left.term[0].place if left.term else ""
+    if place[:1] == "J":
+        return int(place[1:]) - 1
+    lever = np.sqrt(np.nanmean((left.scene.slope**2).sum(axis=2), axis=(1, 2)))
+    fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
+    size = fell * lever**2
+    effect = left.term[0].effect if left.term else ""
+    if effect in BY_WEIGHT:
+        torque = left.scene.gravity
+        size = np.where(np.ptp(torque, axis=1) > FLAT * np.abs(torque).max(), size, -np.inf)
+    elif effect in BY_MOVE:
+        moved = [left.scene.has(f"{BY_MOVE[effect]}{j + 1}") for j in range(left.scene.joints)]
+        size = np.where(moved, size, -np.inf)
+    return int(np.argmax(size))
+
+
+def value_of(scene: Scene, joint: int) -> tuple[str, Array]:
+    """A joint's own value, as people read it."""
+    if scene.robot.prismatic[joint]:
+        return f"joint {joint + 1} (mm)", 1e3 * scene.data.q[:, joint]
+    return f"joint {joint + 1} (deg)", np.degrees(scene.data.q[:, joint])
+
+
+def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
+    """(m,) what the law of an effect looks at, for people, with its unit."""
+    name, stem = term.effect, BY_MOVE.get(term.effect, "")
+    if name == "gear_ripple":
+        period = 360.0 / term.choice["turns"]
+        return f"joint {joint + 1} within a wave of {period:.3g}° (deg)", np.mod(
+            np.degrees(scene.q[joint]), period
+        )
+    if name == "joint_coupling":
+        return value_of(scene, int(term.choice["source"]) - 1)
+    if name in BY_WEIGHT:
+        return f"static torque of joint {joint + 1} (N m)", scene.gravity[joint]
+    if stem and scene.has(f"move{joint + 1}"):
+        sliding = bool(scene.robot.prismatic[joint])
+        move = scene.column(f"move{joint + 1}")
+        unit, scale = ("mm", 1e3) if sliding else ("deg", 180.0 / np.pi)
+        return f"last move of joint {joint + 1} ({unit})", scale * move
+    if stem:
+        return f"side that joint {joint + 1} came from (-1 or 1)", scene.column(
+            f"{stem}{joint + 1}"
+        )
+    if name == "tool_flex":
+        tilt = np.clip((scene.links.axes[2] * scene.robot.up[:, None]).sum(axis=0), -1.0, 1.0)
+        return "flange axis from the vertical (deg)", np.degrees(np.arccos(tilt))
+    if name in BY_TIME and "temperature" in term.choice:
+        return "temperature (°C)", scene.data.columns["temperature"].astype(float)
+    if name in BY_TIME:
+        return "time in the session (0 first, 1 last)", scene.column("clock")
+    return value_of(scene, joint)
+
+
+def along_motion(left: Leftover, term: Term) -> Curve:
+    """What is left of the targets along the motion that an effect gives them."""
+    scene, names = left.scene, left.scene.data.targets
+    chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
+    sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
+    if term.effect == "target_offset":
+        motion, words = sight, "along the line of sight"
+        xlabel, x = "distance from the instrument (m)", np.linalg.norm(sight, axis=1)
+    else:
+        motion, words = motion_of(left, term), f"along its {term.effect.partition('_')[2]}"
+        xlabel, time = against(scene, term, 0)
+        x = np.broadcast_to(time, (len(names), len(time)))
+    along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
+    views = (*left.errors, *left.law)
+    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in views)
+    whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
+    title = f"error of {whose}, for {term.effect} {term.place}"
+    return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
+
+
+def motion_of(left: Leftover, term: Term) -> Array:
+    """(k, 3, m) how an effect moves the targets, as fitted; a nest as if it had always sat so."""
+    fitted = left.effects
+    value = fitted.values[[other.label for other in fitted.terms].index(term.label)]
+    always = {"since": -1.0} if "since" in term.choice else {}
+    columns = replace(term, choice={**term.choice, **always}).columns(left.scene)
+    return np.asarray(np.tensordot(value, columns.displacement(left.scene), 1))
+
+
+def residual_curve(left: Leftover) -> Curve:
+    """The errors as turns of the guilty joint, against what its effect depends on."""
+    if left.term and left.term[0].effect in ("target_offset", *BY_TIME):
+        return along_motion(left, left.term[0])
+    turn = turns(left)
+    joint = guilty(left, turn)
+    xlabel, x = (
+        against(left.scene, left.term[0], joint) if left.term else value_of(left.scene, joint)
+    )
+    unit = "mm" if left.scene.robot.prismatic[joint] else "mrad"
+    what = "travel" if unit == "mm" else "turn"
+    title = f"errors as a {what} of joint {joint + 1}"
+    if left.term:
+        title += f", for {left.term[0].effect} {left.term[0].place}"
+    if left.term and left.term[0].effect in LINEAR:  # a constant turn is geometry: leave it out
+        turn[-1] = turn[-1] - turn[-1].mean(axis=0)
+    return Curve(
+        title,
+        xlabel,
+        f"equivalent {what} of joint {joint + 1} ({unit})",
+        x,
+        tuple(1e3 * part[:, joint] for part in turn),
+    )
+
+
+def order_curve(left: Leftover) -> Curve:
+    """The error of each pose as it was visited."""
+    data = left.data
+    place = np.empty(data.poses)
+    place[visits(data)] = np.arange(1, data.poses + 1)
+    told = numbered(data)
+    rms = tuple(
+        np.sqrt(np.nansum(d**2, axis=0) / np.maximum(np.isfinite(d).sum(axis=0), 1))
+        for d in left.distances()
+    )
+    title = "error by visit order" if told else "error by row (the file tells no order)"
+    label = "visit (first to last)" if told else "row of the data"
+    return Curve(title, label, "error of a pose, RMS of its targets (mm)", place, rms)

@@ -1,0 +1,263 @@
+"""Is anything left?  Tests of what remains against poses, moves, loads, time, by no named law.
+
+Each test asks whether some motion (of a joint, the base, a target) still follows some functions of
+the poses.  Under the null hypothesis what is left after weighing and projection is white, so that
+its share in the span of motion times functions has an F distribution, exactly.  Few motions and
+few functions a test: a small unknown effect of one joint is not to drown among all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import groups
+from minimax_cal.modelling.effects.scene import Scene, turning
+from minimax_cal.modelling.effects.time import ROOM
+from minimax_cal.robots.kinematics import cross
+
+SHARE = 0.3  # of the degrees of freedom that a test may take at most
+FASTEST = 6  # waves a turn, of two joints together, that are looked for
+STEPS = 5  # joint values at which a joint may jump
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """What might still move: motions (d, k, 3, m) [m], each by any of the functions (f, m)."""
+
+    name: str
+    motion: Array
+    feature: Array
+
+
+def probes(scene: Scene) -> Iterator[Probe]:
+    """Every question that is asked of the rest."""
+    angles, circle = turning(scene), around(scene)
+    pairs = summed(scene, angles)
+    bare = [unit(q - q.mean()) for q in scene.q]
+    powers = [*bare, *(u * u for u in bare), *(u * v for u, v in combinations(bare, 2))]
+    load, move, side = scene.gravity, scene.each("move"), scene.each("approach")
+    for j in range(scene.joints):
+        motion, name = scene.slope[j : j + 1], f"J{j + 1}"
+        yield Probe(f"{name} with its own angle", motion, by_itself(scene.q[j]))
+        others = [row for i, rows in circle.items() if i != j for row in rows]
+        if others:
+            yield Probe(f"{name} with other angles", motion, np.array(others))
+        if pairs:
+            yield Probe(f"{name} with two angles together", motion, np.array(pairs))
+        yield Probe(f"{name} with products of angles", motion, np.array(powers))
+        u, v = unit(load[j]), unit(move[j])
+        carried = [u, u**2, u**3] if u.any() else []
+        led = [side[j], v, np.abs(v), v * np.abs(v)] if side[j].any() else []
+        if carried or led:
+            yield Probe(f"{name} with its load or last move", motion, np.array([*carried, *led]))
+    first = angles[:3]
+    wide = [row for i in first for row in circle[i]] + summed(scene, first)
+    for axis, letter in enumerate("xyz"):
+        motion = np.zeros((1, *scene.points.shape))
+        motion[0, :, axis] = 1.0
+        if wide:
+            yield Probe(f"the whole arm along {letter} with the first angles", motion,
+                        np.array(wide))  # fmt: skip
+    clock = scene.column("clock")
+    course = [np.cos(np.pi * k * clock) for k in (1, 2, 3, 4)] if np.ptp(clock) > 0.0 else []
+    if scene.has("temperature"):
+        course.append(unit(scene.column("temperature") - ROOM))
+    if course:
+        eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
+        twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
+        yield Probe("the base with time", np.concatenate(twist), np.array(course))
+        yield Probe("the joints with time", scene.slope, np.array(course))
+    yield from at_targets(scene, np.array(course))
+
+
+def at_targets(scene: Scene, course: Array) -> Iterator[Probe]:
+    """Each target on the flange and along the line of sight."""
+    axes = scene.links.axes
+    g = (axes * -scene.robot.up[:, None]).sum(axis=1)
+    attitude = [*g, g[0] * g[1], g[1] * g[2], g[2] * g[0], g[0] ** 2 - g[1] ** 2]
+    seen = scene.points - scene.instrument[:, None]
+    away = np.linalg.norm(seen, axis=1, keepdims=True)
+    ray = seen / away
+    for i, name in enumerate(scene.data.targets):
+        alone = np.zeros((3, *scene.points.shape))
+        alone[:, i] = axes
+        yield Probe(f"{name} with the tool's attitude", alone, np.array([*attitude, *course]))
+        sight = np.zeros((1, *scene.points.shape))
+        sight[0, i] = ray[i]
+        d, direction = unit(away[i, 0] - away[i].mean()), ray[i] - ray[i].mean(axis=1)[:, None]
+        u, v, w = direction
+        feature = np.array([np.ones_like(d), d, u, v, w, d * d, d * u, d * v, d * w])
+        yield Probe(f"{name} along the line of sight", sight, feature)
+
+
+def summed(scene: Scene, angles: Sequence[int]) -> list[Array]:
+    """Cosines and sines of the sums and differences of two joint angles."""
+    return [
+        row
+        for i, j in combinations(angles, 2)
+        for sign in (1, -1)
+        for row in wave(scene.q[i] + sign * scene.q[j], 1)
+    ]
+
+
+def around(scene: Scene) -> dict[int, list[Array]]:
+    """Cosines and sines of up to three waves a turn of every joint that turns."""
+    return {j: [row for k in (1, 2, 3) for row in wave(scene.q[j], k)] for j in turning(scene)}
+
+
+def by_itself(q: Array) -> Array:
+    """Functions of one joint's value (m,): waves, powers, jumps: (f, m)."""
+    u = unit(q - q.mean())
+    jumps = [np.sign(q - at) for at in np.quantile(q, np.arange(1, STEPS + 1) / (STEPS + 1))]
+    return np.array([*(row for k in (1, 2, 3, 4, 5) for row in wave(q, k)), u, u**2, u**3, *jumps])
+
+
+def wave(q: Array, k: int) -> Array:
+    """(2, m) cos and sin of k waves a turn."""
+    return np.stack([np.cos(k * q), np.sin(k * q)])
+
+
+def unit(x: Array) -> Array:
+    """Values scaled to a largest size of 1; zeros stay."""
+    return np.asarray(x / max(float(np.abs(x).max()), 1e-300))
+
+
+@dataclass(frozen=True)
+class Trace:
+    """p: probability that the rest has nothing of it.  excess: weighed square beyond chance."""
+
+    name: str
+    p: float
+    excess: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What is left, white under the null hypothesis.
+
+    rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
+    the weights.  spare: degrees of freedom.
+    """
+
+    rows: Array
+    basis: Array
+    root: Array
+    spare: int
+
+    @property
+    def total(self) -> float:
+        """Its square."""
+        return float(self.rows @ self.rows)
+
+
+def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
+    """Weighted rows with the span of geometry and known columns (N, q) taken out."""
+    root = np.sqrt(noise.weights(rows))
+    columns = np.concatenate([rows.basis, known], axis=1) * root[:, None]
+    norm = np.linalg.norm(columns, axis=0)
+    basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
+    rest = rows.error * root
+    rest = rest - basis @ (basis.T @ rest)
+    return Rest(rest, basis, root, rows.count - basis.shape[1])
+
+
+def structure(scene: Scene, rows: Rows, noise: Noise, known: Array) -> tuple[Trace, ...]:
+    """What is left, question by question.
+
+    known: (N, q) columns fitted beside the geometry.
+    """
+    rest = rest_of(rows, noise, known)
+    found = []
+    r = rows.weight.shape[1]
+    for probe in probes(scene):
+        moved = rows.of(probe.motion) * rest.root[:, None]
+        spread = np.repeat(probe.feature.T, r, axis=0)
+        features = (moved[:, :, None] * spread[:, None, :]).reshape(len(moved), -1)
+        found.append(Trace(probe.name, *share(features, rest)))
+    found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
+    found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
+    return tuple(found)
+
+
+def share(features: Array, rest: Rest) -> tuple[float, float]:
+    """F test that the rest has no more than its share in the span of features (N, D)."""
+    before = np.linalg.norm(features, axis=0)
+    features = features[:, before > 0.0] / before[before > 0.0]
+    features = features - rest.basis @ (rest.basis.T @ features)
+    if not features.shape[1]:
+        return 1.0, 0.0
+    values, vectors = np.linalg.eigh(features.T @ features)
+    most = max(int(SHARE * rest.spare), 1)
+    kept = np.flatnonzero(values > 1e-6 * max(float(values[-1]), 1e-4))[::-1][:most]
+    pull = (vectors[:, kept].T @ (features.T @ rest.rows)) / np.sqrt(values[kept])
+    inside, d = float(pull @ pull), len(kept)
+    outside = max(rest.total - inside, 1e-300)
+    if d == 0 or rest.spare - d < 5:
+        return 1.0, 0.0
+    p = stats.f.sf((inside / d) / (outside / (rest.spare - d)), d, rest.spare - d)
+    return float(p), inside - d
+
+
+def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
+    """The strongest wave cos(a q_i + b q_j) of any joint, all waves tried."""
+    angles = turning(scene)
+    r = rows.weight.shape[1]
+    arms = rows.of(scene.slope) * rest.root[:, None]
+    score = (arms * rest.rows[:, None]).reshape(-1, r, scene.joints).sum(axis=1)
+    size = (arms**2).reshape(-1, r, scene.joints).sum(axis=1)
+    harmonic = np.exp(1j * np.arange(FASTEST + 1)[:, None, None] * scene.q[angles])  # (f, a, m)
+    if not angles:
+        return 1.0, 0.0
+    whole = size.sum(axis=0)
+
+    def gain(waves: Array) -> Array:
+        pull, square = waves @ score, (waves**2) @ size
+        cc, ss, cs = 0.5 * (whole + square.real), 0.5 * (whole - square.real), 0.5 * square.imag
+        det = cc * ss - cs**2
+        good = det > 1e-3 * whole**2
+        top = ss * pull.real**2 - 2.0 * cs * pull.real * pull.imag + cc * pull.imag**2
+        return np.where(good, top / np.where(good, det, 1.0), 0.0)
+
+    alone = gain(harmonic[1:].reshape(-1, scene.poses))
+    found = [(float(alone.max()), 2, alone.size)]
+    sums: list[Array] = []
+    for i, j in combinations(range(len(angles)), 2):
+        sums += [
+            (harmonic[1:, None, i] * other[None]).reshape(-1, scene.poses)
+            for other in (harmonic[1:, j], harmonic[1:, j].conj())
+        ]
+    if sums:
+        each = gain(np.concatenate(sums)).reshape(len(sums) // 2, 2, -1, scene.joints)
+        both = each.sum(axis=1)  # a product of waves is a sum wave and a difference wave
+        found += [(float(each.max()), 2, each.size), (float(both.max()), 4, both.size)]
+    best = (1.0, 0.0)
+    for most, d, tries in found:
+        free = max(rest.spare - d, 1)
+        ratio = (most / d) / (max(rest.total - most, 1e-300) / free)
+        p = float(min(1.0, stats.f.sf(ratio, d, free) * tries * len(found)))
+        best = min(best, (p, most - d))
+    return best
+
+
+def repeats(scene: Scene, rest: Rest) -> tuple[float, float]:
+    """F test of lack of fit: scatter between poses against scatter at the same pose."""
+    group = groups(scene.data)
+    names, count = np.unique(group, return_counts=True)
+    block = rest.rows.reshape(scene.poses, -1)
+    pure, freedom = 0.0, 0
+    for name in names[count > 1]:
+        mine = block[group == name]
+        pure += float(((mine - mine.mean(axis=0)) ** 2).sum())
+        freedom += (len(mine) - 1) * int(np.count_nonzero(np.ptp(mine, axis=0) > 0.0))
+    spare = rest.spare - freedom
+    if freedom < 20 or spare < 20:
+        return 1.0, 0.0
+    ratio = ((rest.total - pure) / spare) / (pure / freedom)
+    return float(stats.f.sf(ratio, spare, freedom)), (rest.total - pure) * (1.0 - 1.0 / ratio)

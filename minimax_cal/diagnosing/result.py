@@ -1,0 +1,274 @@
+"""The result of a diagnosis: what is still wrong, why, and how far it shrinks once known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.diagnosing.curves import Leftover, order_curve, residual_curve
+from minimax_cal.fitting.calibration import Provenance, finite
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.pose_rows import pose_rows
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.solvers.status import Status
+
+SCHEMA = 1
+SHOWN = 4  # parameters of an effect in a table
+VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another effect that these data cannot tell from the one named.
+
+    rho2: how much of the named effect's motion it imitates.  power: lambda (1 - rho2), about 25 is
+    enough to tell them apart.  loss: by how much worse it fits, in -2 log likelihood.
+    separate_with: the cheapest further measurement that would tell them apart.
+    """
+
+    effect: str
+    place: str
+    rho2: float
+    power: float
+    loss: float
+    separate_with: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One effect found, or a fault of the data.
+
+    terms: what is fitted; several lines of one gear are one effect.  values, sigmas, names, units:
+    of its parameters, SI.  size: lambda, the weighed square of its projected motion.  chance:
+    probability of so much by accident, the whole library tried.  share: of the gap that it closes
+    on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
+    known [mm].  rows: of a data fault.
+    """
+
+    terms: tuple[Term, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    size: float
+    chance: float
+    alternatives: tuple[Alternative, ...] = ()
+    share: float = float("nan")
+    before: float = float("nan")
+    after: float = float("nan")
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    rows: tuple[int, ...] = ()
+
+    @property
+    def term(self) -> Term:
+        """The effect and its place; of several lines the strongest."""
+        return self.terms[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: lengths in millimetres."""
+        scale = [1e3 if unit == "m" else 1.0 for unit in self.units]
+        return {
+            "effect": self.term.effect,
+            "place": self.term.place,
+            "share": finite(self.share),
+            "lambda": finite(self.size),
+            "chance": finite(self.chance),
+            "parameters": [
+                {
+                    "name": name,
+                    "value": value * factor,
+                    "sigma": finite(sigma * factor),
+                    "unit": "mm" if unit == "m" else unit,
+                }
+                for name, unit, value, sigma, factor in zip(
+                    self.names, self.units, self.values, self.sigmas, scale, strict=True
+                )
+            ],
+            "fixed": {key: finite(value) for key, value in self.fixed.items()},
+            "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
+            "alternatives": [other.to_dict() for other in self.alternatives],
+            "lines": list(self.rows),
+        }
+
+
+@dataclass(frozen=True)
+class Step:
+    """One rung of the gap ladder: accuracy on the training and on the held-out poses."""
+
+    name: str
+    train: Accuracy
+    holdout: Accuracy
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What is still wrong with a calibrated robot.
+
+    status: of the geometric fit.  verdict: one of VERDICTS.  reasons: one sentence each, why.
+    findings: by share of the gap.
+    ladder: nominal, geometric, then with each effect.  blocked: held-out RMS where the last part
+    of the session is held out instead [mm].  floor: RMS that noise alone would leave [mm].
+    closed: share of the gap closed, with its interval.
+    noise: of a coordinate [m].  jitter: of a joint [rad].
+    structure: probability that what remains is unrelated to pose and time.
+    where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
+    held out.  cells: geometric, then with each effect.  maps: (training poses, n) what each joint
+    would have to turn to explain the geometric errors [rad].
+    """
+
+    robot: str
+    status: Status
+    verdict: str
+    reasons: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    ladder: tuple[Step, ...]
+    floor: float
+    floor_from: str
+    closed: float
+    closed_ci: tuple[float, float]
+    blocked: Mapping[str, float | None]
+    noise: float
+    jitter: float
+    structure: float
+    structure_in: str
+    where: Mapping[str, Any]
+    not_testable: tuple[tuple[str, str], ...]
+    notices: tuple[str, ...]
+    provenance: Provenance
+    seconds: float
+    data: Measurements
+    held: Array
+    cells: tuple[Cell, ...]
+    maps: Array
+
+    def leftover(self) -> Leftover:
+        """What geometry leaves and what the effects leave, pose by pose."""
+        found = [finding.term for finding in self.findings]
+        return Leftover.of(self.data, self.held, self.noise, self.cells, found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more."""
+        left, told = self.leftover(), with_history(self.data)
+
+        def held(kind: str) -> dict[str, float | None]:
+            chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
+                      "final": self.ladder[-1]}  # fmt: skip
+            return {k: finite(getattr(step.holdout, kind)) for k, step in chosen.items()}
+
+        return {
+            "schema": SCHEMA,
+            "kind": "diagnosis",
+            "robot": self.robot,
+            "status": str(self.status),
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "effects": [finding.to_dict() for finding in self.findings],
+            "gap": {
+                "holdout_rms_mm": held("rms_mm"),
+                "holdout_max_mm": held("max_mm"),
+                "noise_floor_mm": finite(self.floor),
+                "noise_floor_from": self.floor_from,
+                "closed": finite(self.closed),
+                "closed_ci95": [finite(value) for value in self.closed_ci],
+                "ladder": [
+                    {
+                        "step": step.name,
+                        "train": step.train.to_dict(),
+                        "holdout": step.holdout.to_dict(),
+                    }
+                    for step in self.ladder
+                ],
+                "blocked": dict(self.blocked),
+            },
+            "noise": {
+                "instrument_mm": finite(1e3 * self.noise),
+                "joint_jitter_mrad": finite(1e3 * self.jitter),
+            },
+            "structure": {"p": finite(self.structure), "in": self.structure_in},
+            "where": dict(self.where),
+            "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
+            "curves": {
+                "residual": residual_curve(left).to_dict(),
+                "order": order_curve(left).to_dict(),
+            },
+            "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
+            "poses": pose_rows(
+                self.data,
+                self.held,
+                {"geometric": self.cells[0].error(told), "final": self.cells[-1].error(told)},
+            ),
+            "notices": list(self.notices),
+            "seconds": self.seconds,
+            "provenance": vars(self.provenance),
+        }
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())
+
+    def ladder_table(self) -> Table:
+        """The gap, rung by rung."""
+        rows: list[tuple[TableCell, ...]] = [
+            (step.name, step.train.rms_mm, step.train.max_mm, step.holdout.rms_mm,
+             step.holdout.max_mm)
+            for step in self.ladder
+        ]  # fmt: skip
+        rows.append((f"noise floor ({self.floor_from})", self.floor, "", self.floor, ""))
+        return Table(
+            f"{self.robot}: the gap, step by step",
+            ("model", "train RMS mm", "train max mm", "held-out RMS mm", "held-out max mm"),
+            tuple(rows),
+            ("", ".4f", ".4f", ".4f", ".4f"),
+        )
+
+    def effects_table(self) -> Table:
+        """The effects found, with their parameters and rivals."""
+        rows: list[tuple[TableCell, ...]] = []
+        for finding in self.findings:
+            others = ", ".join(f"{a.effect} {a.place}" for a in finding.alternatives)
+            each = [
+                f"{name} = {value:.3g}"
+                + (f" ± {sigma:.1g} {unit}" if sigma == sigma else f" {unit}")
+                for name, value, sigma, unit in zip(
+                    finding.names, finding.values, finding.sigmas, finding.units, strict=True
+                )
+            ]
+            more = [f"and {len(each) - SHOWN} more"] if len(each) > SHOWN else []
+            values = ", ".join([*each[:SHOWN], *more])
+            rows.append((finding.term.effect, finding.term.place, 100.0 * finding.share + 0.0,
+                         values, others))  # fmt: skip
+        return Table(
+            "effects found",
+            ("effect", "place", "share of gap %", "parameters", "these data cannot tell it from"),
+            tuple(rows),
+            ("", "", ".0f", "", ""),
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        return (self.ladder_table(), *((self.effects_table(),) if self.findings else ()))
+
+    def headline(self) -> str:
+        """The verdict in words."""
+        return " ".join(self.reasons)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])

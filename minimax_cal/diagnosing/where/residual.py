@@ -1,0 +1,119 @@
+"""What a fit leaves over, and what it could not have taken."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import qr
+
+from minimax_cal.diagnosing.where.rows import blocks, flat_of, joint_rows
+from minimax_cal.ground.arrays import Array
+
+NO_FIT: Array = np.zeros((0, 0, 0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """What a fit leaves over, in blocks of rows.
+
+    rows: (m, 3k) residual with what the fit could still take removed, 0 where not measured [m].
+    even: the same, made larger where the fit has followed a pose: covariance as before the fit.
+    basis: (m, 3k, p) orthonormal columns that span what was fitted.  seen: (m, 3k).
+    group: (m,) number of the pose, shared by revisits.
+    """
+
+    rows: Array
+    even: Array
+    basis: Array
+    seen: Array
+    group: Array
+
+    @property
+    def fitted(self) -> int:
+        """Number of directions that the fit has taken."""
+        return int(self.basis.shape[2])
+
+    def without_fit(self, features: Array) -> Array:
+        """Features (m, 3k, r) with what the fit spans removed."""
+        flat, basis = features.reshape(-1, features.shape[2]), flat_of(self.basis)
+        return np.asarray((flat - basis @ (basis.T @ flat)).reshape(features.shape))
+
+
+def residual_of(
+    error: Array, fitted: Array, group: Array, slope: Array = NO_FIT, noise: float = math.nan
+) -> Residual:
+    """Errors (k, m, 3) of a fit with derivatives (k, m, 3, p), NaN where not measured.
+
+    slope, noise: as `where`; they tell how a jitter of the joints would spread, for `evened`.
+    """
+    rows, seen = blocks(error)
+    m, wide = rows.shape
+    if not fitted.size:
+        return Residual(rows, rows, np.zeros((m, wide, 0)), seen, group)
+    columns, _ = blocks(np.nan_to_num(fitted))
+    basis = orthonormal(flat_of(np.where(seen[..., None], columns, 0.0))).reshape(m, wide, -1)
+    bare = Residual(rows, rows, basis, seen, group)
+    rows = bare.without_fit(rows[..., None])[..., 0]
+    spread = np.broadcast_to(np.eye(wide), (m, wide, wide))
+    if slope.size and math.isfinite(noise):
+        motion = joint_rows(slope, seen)
+        energy, free = float((rows**2).sum()), float(seen.sum() - basis.shape[2])
+        level = max(noise**2, 1e-4 * energy / max(free, 1.0))
+        jitter = max(0.0, energy / max(level, 1e-300) - free) / max(
+            float((motion**2).sum()), 1e-300
+        )
+        spread = spread + jitter * motion @ np.swapaxes(motion, 1, 2)
+    return replace(bare, rows=rows, even=evened(rows, basis, spread, group))
+
+
+def evened(rows: Array, basis: Array, spread: Array, group: Array) -> Array:
+    """Residuals (m, 3k) with the covariance they had before the fit [Bell & McCaffrey 2002].
+
+    Rows of covariance V_g = `spread` (m, 3k, 3k), up to a factor, leave residuals of covariance
+    V_g - H_gg V_g - V_g H_gg + sum_h H_gh V_h H_hg with H = QQ', Q = `basis` (m, 3k, p).  All
+    visits to a pose are one block g: the fit ties them together.
+    """
+    middle = (np.swapaxes(basis, 1, 2) @ spread @ basis).sum(axis=0)
+    _, place, count = np.unique(group, return_inverse=True, return_counts=True)
+    out = np.empty_like(rows)
+    for visits in np.unique(count):
+        alike = np.flatnonzero(count[place] == visits)
+        chosen = alike[np.argsort(place[alike], kind="stable")].reshape(-1, visits)
+        wide = visits * rows.shape[1]
+        block = np.zeros((len(chosen), visits, rows.shape[1], visits, rows.shape[1]))
+        for visit in range(visits):
+            block[:, visit, :, visit] = spread[chosen[:, visit]]
+        even = unfollowed(
+            rows[chosen].reshape(-1, wide),
+            basis[chosen].reshape(-1, wide, basis.shape[2]),
+            block.reshape(-1, wide, wide),
+            middle,
+        )
+        out[chosen] = even.reshape(rows[chosen].shape)
+    return out
+
+
+def unfollowed(rows: Array, basis: Array, spread: Array, middle: Array) -> Array:
+    """`evened` for blocks of one size.  middle: (p, p) sum of Q_g' V_g Q_g over all blocks."""
+    back = np.swapaxes(basis, 1, 2)
+    followed = basis @ (back @ spread)
+    left = spread - followed - np.swapaxes(followed, 1, 2) + basis @ middle @ back
+    factor = np.linalg.cholesky(spread)
+    white = np.linalg.solve(factor, np.swapaxes(np.linalg.solve(factor, left), 1, 2))
+    value, vector = np.linalg.eigh(0.5 * (white + np.swapaxes(white, 1, 2)))
+    turned = np.swapaxes(vector, 1, 2) @ np.linalg.solve(factor, rows[..., None])
+    stretch = 1.0 / np.sqrt(np.maximum(value, 0.1))  # a pose the fit has all but taken tells little
+    return np.asarray((factor @ vector @ (stretch[..., None] * turned))[..., 0])
+
+
+def orthonormal(columns: Array, least: float = 1e-9) -> Array:
+    """Orthonormal basis of the columns (N, p): (N, rank)."""
+    length = np.linalg.norm(columns, axis=0)
+    columns = columns[:, length > 0.0] / length[length > 0.0]
+    if not columns.shape[1]:
+        return columns
+    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
+    size = np.abs(np.diag(triangle))
+    return np.asarray(basis[:, : len(size)][:, size > least * size[0]])

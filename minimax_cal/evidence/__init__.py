@@ -1,0 +1,1 @@
+"""Which columns explain what a fit leaves: candidates, alternatives, noise."""

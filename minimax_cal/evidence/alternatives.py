@@ -1,0 +1,72 @@
+"""What else it could be: candidates that the data cannot tell from the one that is named."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from minimax_cal.evidence.noise import restricted
+from minimax_cal.evidence.selection import LEVEL, Added, Bench, Library
+from minimax_cal.ground.arrays import Array
+
+LIGHT = 4.0  # of fit, in the same sense
+ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
+BAND = 12.0  # of evidence: what fits worse by less may be the truth
+
+
+def rivals(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
+    """Other effects or places that may be the truth, with rho^2 and the power to tell them apart.
+
+    Those that do nearly as well; and those that do worse by some luck, the data having too little
+    power to tell them apart.
+    """
+    out, seen = [], {one.candidate.key, *(c.key for c in table.chosen)}
+    for other in table.everyone:
+        if other.candidate.key in seen or other.evidence <= 0.0 or table.chance(other) > LEVEL:
+            continue
+        close = near(one, other)
+        alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one
+        if not close and (alike or other.evidence < one.evidence - LUCK):
+            continue
+        size, rho2 = table.setting(one).likeness(one, other.candidate)
+        power = size * (1.0 - rho2)
+        if close or power < ENOUGH:
+            seen.add(other.candidate.key)
+            out.append((other, rho2, power))
+    return out
+
+
+def near(one: Added, other: Added) -> bool:
+    """Whether another effect does nearly as well.
+
+    By evidence; or, if it is another effect, by fit alone, its parameters charged lightly: many
+    parameters are unlikely, but not impossible.
+    """
+    if other.evidence > one.evidence - BAND:
+        return True
+    if other.candidate.term.effect == one.candidate.term.effect:
+        return False
+    fit, rival = (x.gain - 2.0 * len(x.candidate.main) for x in (one, other))
+    return rival > fit - LIGHT
+
+
+def resemblances(lib: Library, displacement: Array) -> dict[tuple[str, str], float]:
+    """rho^2 of every candidate with a displacement (k, 3, m) in base axes [m]: the best variant.
+
+    Projected on what geometry cannot imitate and weighed by the noise that the data show with it.
+    """
+    column = lib.rows.of(displacement[None])
+    noise = restricted(lib.rows, column)
+    root = np.sqrt(noise.weights(lib.rows))[:, None]
+    basis = np.linalg.qr(lib.rows.basis * root)[0]
+    field = column * root
+    field = (field - basis @ (basis.T @ field))[:, 0]
+    whole = lib.columns * root
+    whole = whole - basis @ (basis.T @ whole)
+    out: dict[tuple[str, str], float] = {}
+    for c in lib.candidates:
+        part = whole[:, c.main]
+        scale = np.maximum(np.linalg.norm(part, axis=0), 1e-300)
+        found = np.linalg.lstsq(part / scale, field, rcond=1e-6)[0]
+        share = 1.0 - float(((field - part / scale @ found) ** 2).sum() / (field @ field))
+        out[c.key] = max(out.get(c.key, 0.0), share)
+    return out

@@ -1,0 +1,139 @@
+"""The linearised fit with two kinds of noise: of the instrument, and of the joints at every pose.
+
+A pose's errors have the covariance s^2 I + t^2 S S', with S the motion of its points per radian of
+each joint: the joints do not stop exactly where they are told.  In the eigenvectors of S S' that
+matrix is diagonal for any s and t, so that one rotation of the rows makes every later step plain
+weighted least squares.  s and t are estimated by restricted maximum likelihood [Patterson and
+Thompson 1971].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
+
+RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
+RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 17)])
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of a linear fit, poses rotated so that both noises are diagonal.
+
+    error: (N,) what the geometry leaves [m].  basis: (N, p) orthonormal span of the geometry.
+    stretch: (N,) variance of a row per variance of the joints, relative to its mean.
+    size: the mean [m^2/rad^2].  count: rows that were measured.
+    turn: (m, r, r) the rotations, r = 3k.  weight: (m, r) square roots of the points' weights.
+    """
+
+    error: Array
+    basis: Array
+    stretch: Array
+    size: float
+    count: int
+    turn: Array
+    weight: Array
+
+    def of(self, fields: Array) -> Array:
+        """(N, D) displacement fields (D, k, 3, m) as rows."""
+        d, k, _, m = fields.shape
+        flat = np.moveaxis(fields.reshape(d, 3 * k, m), -1, 0) * self.weight[:, None, :]
+        return np.asarray((flat @ self.turn).swapaxes(1, 2).reshape(3 * k * m, d))
+
+    def back(self, rows: Array) -> Array:
+        """(k, 3, m) rows (N,) as points again; what was not measured is 0."""
+        m, r = self.weight.shape
+        flat = (self.turn @ rows.reshape(m, r, 1))[..., 0]
+        plain = np.where(self.weight > 0, flat / np.where(self.weight > 0, self.weight, 1.0), 0.0)
+        return np.asarray(plain.T.reshape(r // 3, 3, m))
+
+
+def rows_of(error: Array, jacobian: Array, slope: Array, weight: Array) -> Rows:
+    """Rows from an error (k, 3, m), geometry's Jacobian (k, p, 3, m), slope (n, k, 3, m).
+
+    weight: (k, m) of each point, 0 where not measured.
+    """
+    k, _, m = error.shape
+    root = np.repeat(np.sqrt(weight)[:, None], 3, axis=1).reshape(3 * k, m).T
+    arm = np.moveaxis(slope.reshape(len(slope), 3 * k, m), -1, 0) * root[:, None, :]
+    spread, turn = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)
+    spread = np.maximum(spread, 0.0).reshape(-1)
+    count = 3 * int(np.count_nonzero(weight))
+    size = float(spread.sum() / count)
+    bare = Rows(np.zeros(0), np.zeros((0, 0)), spread / size, size, count, turn, root)
+    matrix = bare.of(np.moveaxis(jacobian, 1, 0))
+    rest = bare.of(np.where(weight[:, None] > 0, error, 0.0)[None])[:, 0]
+    return Rows(rest, orthonormal(matrix), spread / size, size, count, turn, root)
+
+
+def linearised(model: Model, state: State, slope: Array) -> Rows:
+    """The rows of a model at a fitted state.  slope: (n, k, 3, m) as `effects.scene.Scene`."""
+    error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
+    jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
+    return rows_of(error, jacobian, slope, model.weight)
+
+
+def orthonormal(matrix: Array, rank: float = RANK) -> Array:
+    """Orthonormal columns with the span of a matrix (N, p) whose columns are first scaled."""
+    norm = np.linalg.norm(matrix, axis=0)
+    scaled = matrix[:, norm > 0] / norm[norm > 0]
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    kept = values > rank**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
+    rough = scaled @ (vectors[:, kept] / np.sqrt(values[kept]))
+    return np.asarray(np.linalg.qr(rough)[0])
+
+
+@dataclass(frozen=True)
+class Noise:
+    """ratio: variance that the joints add to a mean row over that of the instrument.
+
+    variance: of the instrument per coordinate [m^2].  jitter: standard deviation of a joint [rad].
+    """
+
+    ratio: float
+    variance: float
+    jitter: float
+
+    def weights(self, rows: Rows) -> Array:
+        """(N,) inverse variances [1/m^2]."""
+        return np.asarray(1.0 / (self.variance * (1.0 + self.ratio * rows.stretch)))
+
+
+def restricted(rows: Rows, known: Array) -> Noise:
+    """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
+    columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
+    p = columns.shape[1] - 1
+    spare = rows.count - p
+    if spare < 3:
+        return Noise(0.0, float(rows.error @ rows.error) / max(rows.count, 1) + 1e-18, 0.0)
+
+    def parts(ratio: float) -> tuple[float, float]:
+        spread = 1.0 + ratio * rows.stretch
+        gram = columns.T @ (columns / spread[:, None])
+        gram[-1, -1] += 1e-300
+        scale = np.sqrt(np.diag(gram))
+        factor = np.linalg.cholesky(gram / np.outer(scale, scale) + 1e-13 * np.eye(p + 1))
+        logs = np.log(np.diag(factor)) + np.log(scale)
+        squares = float(np.exp(2.0 * logs[-1]))
+        cost = spare * np.log(squares) + np.log(spread).sum() + 2.0 * logs[:-1].sum()
+        return float(cost), squares
+
+    costs = [parts(ratio)[0] for ratio in RATIOS]
+    best = int(np.argmin(costs))
+    ratio = float(RATIOS[best])
+    if best:
+        low, high = np.log(RATIOS[max(best - 1, 1)]), np.log(RATIOS[min(best + 1, len(RATIOS) - 1)])
+        if high > low:
+            found = minimize_scalar(
+                lambda x: parts(float(np.exp(x)))[0], bounds=(low, high), method="bounded",
+                options={"xatol": 0.05},
+            )  # fmt: skip
+            ratio = float(np.exp(found.x))
+    variance = parts(ratio)[1] / spare
+    return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))

@@ -1,0 +1,1 @@
+"""Calibration: start, identification, fit, weights, uncertainty."""

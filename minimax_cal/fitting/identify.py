@@ -1,0 +1,183 @@
+"""Which parameters the data can tell, and why the others not.
+
+Positions move in the same way under several parameters (d1 and the base's z).  Of each such family
+one member is left at its nominal value.  Which one is a matter of taste: predictions are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.least_squares import solve_normal
+
+PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count as parallel
+# Singular values of the column-scaled Jacobian, relative to the largest: below RANK a direction is
+# redundant whatever the poses; below RESOLUTION these poses show it a thousand times weaker than
+# others, and its estimate would be noise (a target 0.1 mm off the last axis "measures" the wrist).
+RANK = 1e-6
+RESOLUTION = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """active: (p,) True where a parameter is identified.
+
+    reasons: why each other parameter keeps its nominal value, by name.
+    singular: singular values of the scaled Jacobian of the kept parameters, largest first.
+    scale: (p,) root mean square motion of a point per unit of each parameter [m per unit].
+    """
+
+    active: Array
+    reasons: Mapping[str, str]
+    singular: Array
+    scale: Array
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled Jacobian of the kept parameters (1/O2 of the field)."""
+        return float(self.singular[0] / self.singular[-1])
+
+
+def drop_order(robot: Robot, names: Names) -> Array:
+    """Parameters in the order in which redundant ones are given up.
+
+    First beta where the next axis is not parallel and d where it is (Hayati: a common normal of
+    parallel axes is nowhere), then what repeats the base (d1, theta1) and the tool (the last
+    link), then other link parameters from the wrist to the base, the base, and targets last.
+    """
+    n = robot.joints
+    links = np.arange(5 * n).reshape(5, n)
+    alpha, beta = robot.mdh[:, kinematics.ALPHA], robot.mdh[:, kinematics.BETA]
+    parallel = np.hypot(np.sin(alpha), np.sin(beta)) < PARALLEL
+    parallel[-1] = False
+    a, d, theta, _, b = links
+    first = [*b[~parallel], *d[parallel], d[0], theta[0], *links[[1, 2, 3, 0], -1]]
+    rest = [*theta[::-1], *d[::-1], *a[::-1], *links[3][::-1], *b[parallel]]
+    order = [*first, *rest, *range(5 * n, names.geometric)]
+    return np.array(list(dict.fromkeys(int(i) for i in order)))
+
+
+def identify(
+    model: Model,
+    state: State,
+    order: Array,
+    *,
+    allowed: Array,
+    reference: Model,
+    known: Array,
+    resolution: float = RESOLUTION,
+) -> Identification:
+    """The largest set of allowed parameters that the poses of the model determine.
+
+    order: the parameters, those to give up first at the front.  allowed: (p,) False for parameters
+    the user fixed.  reference: a model with plenty of poses, to tell what no pose could show from
+    what these poses do not.  known: (p,) True where a prior stands in for poses.  resolution:
+    relative singular value that counts as not measured.
+    """
+    gram = gram_of(model, state)
+    points = max(int(model.counts.sum()), 1)
+    scale = np.sqrt(np.diag(gram) / points)
+    active, fixed = allowed.copy(), ~allowed
+    reasons = {model.names.all[i]: "fixed by the user" for i in np.flatnonzero(fixed)}
+    dead = active & (scale <= 1e-12)
+    active &= ~dead
+    reasons |= {model.names.all[i]: "moves no measured point" for i in np.flatnonzero(dead)}
+    geometric = np.arange(len(active)) < model.names.geometric
+    plain = gram_of(reference, replace(state, effects=np.zeros(0)))
+    for i in redundant(
+        np.pad(plain, (0, len(active) - len(plain))), active & geometric, order, RANK
+    ):
+        active[i] = False
+        reasons[model.names.all[i]] = "same motion as {}"
+    told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
+    for i in redundant(told, active, order, resolution):
+        active[i] = False
+        reasons[model.names.all[i]] = "these poses do not tell it from {}"
+    for i, name in enumerate(model.names.all):
+        if "{}" in reasons.get(name, ""):
+            reasons[name] = reasons[name].format(partners(gram, scale, active, i, model.names))
+    scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
+    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
+    return Identification(active, reasons, singular, scale)
+
+
+def gram_of(model: Model, state: State) -> Array:
+    """The Gram matrix J'WJ of all parameters at a state: (p, p)."""
+    every = np.ones(model.names.count, dtype=bool)
+    return np.asarray(model.normal(state, every).gram.sum(axis=0))
+
+
+def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) -> int:
+    """How many of the allowed parameters plenty of poses would determine, for targets anywhere."""
+    k = reference.y.shape[0]
+    spots = 0.1 * robot.reach() * np.random.default_rng(0).normal(size=(k, 3))
+    state = State(robot.mdh, np.eye(3), np.zeros(3), spots)
+    gone = redundant(gram_of(reference, state), allowed, order, RANK)
+    return int(allowed.sum()) - len(gone)
+
+
+def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:
+    """The parameters to give up so that the Gram matrix of the others has full rank.
+
+    Null vectors of the scaled Jacobian are eliminated one by one: the first parameter in order
+    with a clear share in what is left of the null space goes, and takes one null vector along.
+    """
+    chosen = np.flatnonzero(active)
+    if not len(chosen):
+        return []
+    scale = np.sqrt(np.diag(gram)[chosen])
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(gram[np.ix_(chosen, chosen)] / np.outer(scale, scale))
+    null = vectors[:, values <= (rank**2) * values[-1]]
+    gone: list[int] = []
+    place = {int(p): row for row, p in enumerate(chosen)}
+    for share in (0.05, 1e-3, 0.0):
+        for p in order:
+            if null.shape[1] and int(p) in place and int(p) not in gone:
+                row = null[place[int(p)]]
+                if np.linalg.norm(row) > share:
+                    # turn the null space so that one vector alone holds p; drop that vector
+                    reflect, _ = np.linalg.qr(row[:, None], mode="complete")
+                    null = null @ reflect[:, 1:]
+                    gone.append(int(p))
+    return gone
+
+
+def partners(gram: Array, scale: Array, active: Array, i: int, names: Names) -> str:
+    """The kept parameters that together move the points as parameter i does, largest first."""
+    chosen = np.flatnonzero(active)
+    mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
+    share = np.abs(mix) * scale[chosen] / scale[i]
+    shown = [names.all[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
+    spots = [name for name in shown if name.rsplit("_", 1)[0] in names.targets]
+    if len({name.rsplit("_", 1)[0] for name in spots}) > 1:  # one thing to the reader
+        shown = [name for name in shown if name not in spots] + ["all targets moved together"]
+    more = len(shown) - 4
+    return ", ".join(shown[:4]) + (f" and {more} more" if more > 0 else "")
+
+
+def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
+    """A model of the same cell at random poses over the joints' whole range."""
+    rng = np.random.default_rng(0)
+    span = np.where(model.prismatic, 0.5, np.pi)
+    lower = np.maximum(robot.lower, -span)
+    upper = np.minimum(robot.upper, span)
+    k = model.y.shape[0]
+    q = rng.uniform(lower, upper, (poses, robot.joints)) * robot.sign
+    return Model(
+        q=q,
+        prismatic=model.prismatic,
+        y=np.zeros((k, 3, poses)),
+        weight=np.ones((k, poses)),
+        names=model.names,
+        active=model.active,
+        prior=model.prior,
+    )

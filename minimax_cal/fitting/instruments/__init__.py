@@ -1,0 +1,25 @@
+"""Calibration without coordinates: lengths of wires, sockets visited again, whole flange poses.
+
+Lengths and closures know no base frame, closures no length either: what that leaves open is said
+with the parameters, by name and reason.
+"""
+
+from minimax_cal.fitting.instruments.data import RelativeData, closures, distances, flange_poses
+from minimax_cal.fitting.instruments.file import read_relative, write_relative
+from minimax_cal.fitting.instruments.kinds import relative
+from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.poses import poses_as_targets
+from minimax_cal.fitting.instruments.result import RelativeCalibration
+
+__all__ = [
+    "RelativeCalibration",
+    "RelativeData",
+    "RelativeOptions",
+    "closures",
+    "distances",
+    "flange_poses",
+    "poses_as_targets",
+    "read_relative",
+    "relative",
+    "write_relative",
+]

@@ -1,0 +1,229 @@
+"""The fit of lengths and of closures: start, identifiable parameters, least squares, sigmas."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.calibration import Parameter
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
+from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified
+from minimax_cal.fitting.instruments.options import RelativeOptions, Report, wishes
+from minimax_cal.fitting.instruments.rows import (
+    Closures,
+    Instrument,
+    Squares,
+    Wires,
+    arm_at,
+    places,
+)
+from minimax_cal.fitting.instruments.split import free_numbers, misclosures
+from minimax_cal.fitting.instruments.start import ball_start, wire_start
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.measurements import groups
+from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentFit:
+    """What the solver found.
+
+    nominal: the arm as drawn with the instrument fitted to it.  state: the calibrated one.
+    numbers: independent numbers fitted.  covariance: (p, p) [SI], NaN where not identified.
+    """
+
+    instrument: Instrument
+    nominal: State
+    state: State
+    identification: Identification
+    found: LeastSquares[State]
+    numbers: int
+    covariance: Array
+
+
+def instrument_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Instrument:
+    """The training measurements as a least-squares problem."""
+    if train.kind == "distances":
+        return Wires.of(robot, train.at.q, train.wires, train.length)
+    labels, number = np.unique(train.socket, return_inverse=True)
+    place = {str(label): i for i, label in enumerate(labels)}
+    known = options.known_distances
+    pairs = np.array([(place[a], place[b]) for a, b, _ in known], dtype=int).reshape(-1, 2)
+    distance = np.array([length for _, _, length in known])
+    return Closures.of(robot, train.at.q, number, pairs, distance)
+
+
+def allowed_of(
+    robot: Robot, instrument: Instrument, options: RelativeOptions
+) -> tuple[Array, Array]:
+    """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
+    names = instrument.names
+    allowed, wanted = wishes(names, options)
+    allowed[5 * robot.joints : 5 * robot.joints + 6] = False
+    offsets = np.array([name.startswith("offset") for name in names.all])
+    return allowed & (options.offset | ~offsets), wanted
+
+
+def start_of(robot: Robot, instrument: Instrument, q: Array, allowed: Array) -> State:
+    """The arm as drawn, and what fits it best."""
+    if isinstance(instrument, Closures):
+        return ball_start(robot, instrument)
+    return wire_start(robot, q, instrument, allowed)
+
+
+def fit_instrument(
+    robot: Robot, train: RelativeData, options: RelativeOptions, report: Report
+) -> InstrumentFit:
+    """Fit the identifiable parameters to the training measurements.  Raises DataError."""
+    report("start")
+    instrument = instrument_of(robot, train, options)
+    allowed, wanted = allowed_of(robot, instrument, options)
+    nominal = start_of(robot, instrument, train.at.q, allowed)
+    report("identifiable parameters")
+    unknowns = generic_count(robot, instrument, nominal, allowed)
+    numbers = check_count(train, unknowns, len(options.known_distances))
+    known = identified(robot, instrument, nominal, allowed, wanted, resolution=options.resolution)
+    report("least squares")
+    found = least_squares.solve(
+        Squares(instrument, known.active),
+        nominal.batch(),
+        1,
+        float(instrument.points),
+        METHODS[options.method],
+        least_squares.NEAR,
+    )
+    state = found.x.take(np.array(0))
+    covariance = covariance_of(instrument, state, known.active, float(found.cost[0]), numbers)
+    return InstrumentFit(instrument, nominal, state, known, found, numbers, covariance)
+
+
+def covariance_of(
+    instrument: Instrument, x: State, active: Array, cost: float, numbers: int
+) -> Array:
+    """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
+
+    s^2 H^-1 F H^-1 with H = sum w j j' and F = sum w^2 j j' over the rows j of weight w: a known
+    distance weighs much and is no surer than a coordinate.  s^2: cost over spare numbers.
+    """
+    _, slopes = instrument.rows(x, active)
+    weight = instrument.weights
+    bread = solve_normal(slopes @ slopes.T, np.eye(len(slopes)))
+    filling = (slopes * weight) @ slopes.T
+    variance = cost / max(numbers - len(slopes), 1)
+    covariance = np.full((len(active),) * 2, np.nan)
+    covariance[np.ix_(active, active)] = variance * bread @ filling @ bread
+    return covariance
+
+
+def numbers_of(train: RelativeData) -> tuple[int, int]:
+    """How many independent numbers were measured, and how many at different poses."""
+    pose = groups(train.at)
+    if train.kind == "distances":
+        seen = np.isfinite(train.length)
+        return int(seen.sum()), sum(len(np.unique(pose[wire])) for wire in seen.T)
+    labels = np.unique(train.socket)
+    different = [len(np.unique(pose[train.socket == label])) for label in labels]
+    return 3 * (train.poses - len(labels)), 3 * (sum(different) - len(labels))
+
+
+def check_count(train: RelativeData, unknowns: int, known: int) -> int:
+    """The numbers measured in training, known distances among them.
+
+    Raises DataError if they cannot determine the unknowns.
+    """
+    where = train.at.source
+    for name, count in zip(train.wires, np.isfinite(train.length).sum(axis=0), strict=True):
+        if count < LEAST_LENGTHS:
+            raise DataError(
+                f"{where}: {name} has {count} lengths in training, and needs {LEAST_LENGTHS}; "
+                "measure more or hold out fewer"
+            )
+    numbers, different = numbers_of(train)
+    if different + known <= unknowns:
+        what = "lengths" if train.kind == "distances" else "coordinates of visits"
+        raise DataError(
+            f"{where}: {different + known} independent {what} in training, but {unknowns} unknown "
+            "parameters need more; measure at more poses, hold out fewer or fix parameters (--fix)"
+        )
+    return numbers + known
+
+
+def errors_at(
+    robot: Robot, fit: InstrumentFit, x: State, data: RelativeData, held: Array
+) -> tuple[Array, Array]:
+    """Errors of training and of held-out rows: (parts, m, 3) each [m], NaN where not measured.
+
+    The error of a length stands first of three; that of a visit is about its socket.
+    """
+    if isinstance(fit.instrument, Wires):
+        wires = replace(fit.instrument, model=arm_at(robot, data.at.q), length=data.length)
+        error = wires.errors(x)
+        rows = np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
+    else:
+        place = places(arm_at(robot, data.at.q), x).T
+        rows = misclosures(place, data.socket, held)[None]
+    return rows[:, ~held], rows[:, held]
+
+
+def count_numbers(data: RelativeData, held: Array) -> tuple[int, int]:
+    """Independent numbers behind the errors of training and of held-out rows."""
+    if data.kind == "distances":
+        seen = np.isfinite(data.length)
+        return int(seen[~held].sum()), int(seen[held].sum())
+    return free_numbers(data.socket, held)
+
+
+def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
+    """Every parameter, link by link; then target, anchors and, where fitted, offsets."""
+    names, n = fit.instrument.names, robot.joints
+
+    def values(x: State) -> Array:
+        return np.concatenate([links_of(x.mdh), np.zeros(6), x.targets.reshape(-1), x.effects])
+
+    before, after = values(fit.nominal), values(fit.state)
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    order = [kind * n + joint for joint in range(n) for kind in range(5)]
+    order += range(5 * n + 6, names.count)
+    active = fit.identification.active
+    return tuple(
+        Parameter(
+            name=names.all[i],
+            value=float(after[i]),
+            nominal=float(before[i]),
+            sigma=float(sigma[i]),
+            unit="m" if names.linear[i] else "rad",
+            identifiable=bool(active[i]),
+            reason=fit.identification.reasons.get(names.all[i], ""),
+        )
+        for i in order
+        if offset or not names.all[i].startswith("offset")
+    )
+
+
+def placed(fit: InstrumentFit, data: RelativeData, options: RelativeOptions) -> dict[str, Any]:
+    """For JSON: what was fitted besides the robot, in the robot's base and last frame."""
+
+    def millimetres(values: Array) -> list[float]:
+        return [1e3 * float(value) for value in values]
+
+    out: dict[str, Any] = {"target_mm": millimetres(fit.state.targets[0])}
+    if isinstance(fit.instrument, Wires):
+        anchors, offsets = fit.instrument.split(fit.state.effects)
+        wires = data.wires
+        out["anchors_mm"] = {w: millimetres(a) for w, a in zip(wires, anchors, strict=True)}
+        if options.offset:
+            out["offsets_mm"] = dict(zip(wires, millimetres(offsets), strict=True))
+    else:
+        centre = fit.instrument.barycentres(places(fit.instrument.model, fit.state))
+        labels = [str(label) for label in np.unique(data.socket)]
+        out["sockets_mm"] = {s: millimetres(c) for s, c in zip(labels, centre.T, strict=True)}
+        out["known_distances"] = [[a, b, 1e3 * length] for a, b, length in options.known_distances]
+        out["scale"] = "known distance" if has_scale(fit.instrument) else "as drawn"
+    return out

@@ -1,0 +1,95 @@
+"""What can be chosen of a calibration without coordinates, and which choice suits which kind."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.fitting.identify import RESOLUTION
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import FARTHEST
+from minimax_cal.modelling.parameters import Names
+from minimax_cal.solvers.least_squares import METHODS
+
+Report = Callable[[str], None]
+Known = tuple[str, str, float]
+
+
+def silent(message: str) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True)
+class RelativeOptions:
+    """How to calibrate.
+
+    holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
+    ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
+    distance of their centres [m].  lever: of poses, metres that a radian counts as; NaN for the
+    file's own.  method: of the least squares.  resolution: relative singular value that counts as
+    not measured.
+    """
+
+    holdout: float = 0.2
+    seed: int = 0
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    offset: bool = False
+    known_distances: Sequence[Known] = ()
+    lever: float = np.nan
+    method: str = "snllm"
+    resolution: float = RESOLUTION
+
+    def settings(self) -> dict[str, object]:
+        """For the record."""
+        return {**vars(self), "known_distances": [list(known) for known in self.known_distances]}
+
+
+def known_of(text: str) -> Known:
+    """A,B,MM of --known-distance.  Raises OptionError."""
+    parts = [part.strip() for part in text.split(",")]
+    number = parts[-1].removesuffix("mm").strip()
+    if len(parts) == 3 and parts[0] and parts[1] and re.fullmatch(r"[-+.\deE]+", number):
+        try:
+            return parts[0], parts[1], 1e-3 * float(number)
+        except ValueError:
+            pass
+    raise OptionError(f"--known-distance {text!r}: write two sockets and a length, as A,B,500.02")
+
+
+def check_options(data: RelativeData, options: RelativeOptions) -> None:
+    """Raise OptionError for a choice that does not exist or does not suit the data."""
+    if options.method not in METHODS:
+        raise OptionError(f"no method {options.method!r}; choose {', '.join(METHODS)}")
+    if not 0.0 <= options.resolution < 1.0:
+        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    for kind, option, chosen in (
+        ("distances", "--offset", options.offset),
+        ("closures", "--known-distance", bool(options.known_distances)),
+        ("poses", "--lever", not np.isnan(options.lever)),
+    ):
+        if chosen and data.kind != kind:
+            raise OptionError(
+                f"{option} is for {kind}; {data.at.source} holds {data.kind}: leave it out"
+            )
+    for first, second, distance in options.known_distances:
+        said = f"--known-distance {first},{second},{1e3 * distance:g}"
+        for label in (first, second):
+            if label not in data.sockets:
+                raise OptionError(f"{said}: {data.at.source} has no socket {label!r}")
+        if first == second or not 0.0 < distance < FARTHEST:
+            raise OptionError(f"{said}: needs two different sockets and a positive length")
+
+
+def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:
+    """(p,) False for what the user fixed, and (p,) True for what is to be given up last."""
+    fixed, wanted = names.match(options.fix, "--fix"), names.match(options.free, "--free")
+    if (fixed & wanted).any():
+        name = names.all[int(np.argmax(fixed & wanted))]
+        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+    return ~fixed, wanted

@@ -1,0 +1,194 @@
+"""Whole flange poses as virtual reflectors, and the calibration from them.
+
+Four reflectors at the corners of a regular tetrahedron say exactly what a pose says: their sum of
+squared errors is 4 (|e|^2 + lever^2 |w|^2) for an error e of its position and a small turn w.  The
+lever is the ratio of the instrument's linear and angular noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.fitting import identify
+from minimax_cal.fitting.calibration import Calibration, Parameter
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.start import project
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kinematics import hat
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.least_squares import solve_normal
+
+LEVER = 0.1  # where nothing tells the ratio of the noises [m]
+TOOL = ("tool_x", "tool_y", "tool_z", "tool_rx", "tool_ry", "tool_rz")
+CORNERS = {  # of unit distance from their centre
+    3: np.stack([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi * np.arange(3) / 3.0]),
+    4: np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0),
+}
+
+
+def spots_of(lever: float, count: int = 4) -> Array:
+    """Virtual reflectors in the frame of the pose: (count, 3) [m]; their centre is its origin.
+
+    Their RMS distance from it is sqrt(3/2) lever.  Three lie in the plane z = 0 and weigh a turn
+    about its normal twice as much as one in the plane; four weigh all turns alike.
+    """
+    if count not in CORNERS:
+        raise OptionError(f"{count} virtual reflectors: choose 3 or 4")
+    if not (np.isfinite(lever) and lever > 0.0):
+        raise OptionError(f"lever {lever:g} m: must be positive and finite")
+    return np.asarray(np.sqrt(1.5) * lever * CORNERS[count])
+
+
+def poses_as_targets(data: RelativeData, lever: float = LEVER, count: int = 4) -> Measurements:
+    """The poses as virtual reflectors smr1 ..., for `calibrate`.  lever: [m].  count: 3 or 4."""
+    turned = np.einsum("mij,kj->mki", data.pose[:, :3, :3], spots_of(lever, count))
+    names = tuple(f"smr{i + 1}" for i in range(count))
+    return replace(data.at, y=turned + data.pose[:, None, :3, 3], targets=names)
+
+
+def lever_of(data: RelativeData, lever: float) -> tuple[float, str]:
+    """The lever and where it comes from.  lever: asked for [m], NaN where not."""
+    if not np.isnan(lever):
+        return lever, "as given"
+    columns = data.at.columns
+    if {"u95", "rotation_u95"} <= set(columns):
+        ratio = np.nanmedian(columns["u95"] / columns["rotation_u95"])
+        if np.isfinite(ratio) and ratio > 0.0:
+            return float(ratio), "typical u95_mm over rotation_u95_rad"
+    return LEVER, "by default; give --lever MM, the ratio of linear and angular noise"
+
+
+def tool_of(cell: Cell, spots: Array) -> Array:
+    """Pose (4, 4) of the measured frame in the flange that fits the reflectors best [m]."""
+    centre = cell.spots.mean(axis=0)
+    tool = np.eye(4)
+    tool[:3, :3], tool[:3, 3] = project((cell.spots - centre).T @ spots), centre
+    return tool
+
+
+def pose_errors(cell: Cell, tool: Array, data: RelativeData) -> tuple[Array, Array]:
+    """Measured minus predicted positions (m, 3) [m], and angles between orientations (m,) [rad]."""
+    pose = cell.base @ cell.robot.pose(data.at.q) @ tool
+    turn = np.swapaxes(pose[:, :3, :3], 1, 2) @ data.pose[:, :3, :3]
+    angle = Rotation.from_matrix(turn).magnitude() if len(turn) else np.zeros(0)
+    return data.pose[:, :3, 3] - pose[:, :3, 3], np.asarray(angle)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """A calibration from virtual reflectors, as one from poses.
+
+    fit: what `calibrate` found.  model, state: at its solution.  tool: (4, 4).
+    covariance: (p, p) of the model's parameters, NaN where not identified [SI].
+    """
+
+    fit: Calibration
+    model: Model
+    state: State
+    tool: Array
+    covariance: Array
+
+    @property
+    def shape(self) -> int:
+        """How many numbers only tell how the reflectors lie to each other, which was given."""
+        return max(3 * len(self.fit.cell.targets) - 6, 0)
+
+
+def pose_fit(fit: Calibration, train: Measurements, spots: Array) -> PoseFit:
+    """The covariance of a fit to poses, and the tool.
+
+    The reflectors' errors are those of six numbers a pose, not of 3k: with k = 4 their covariance
+    is 4 s^2 times the projector on rigid motions, s^2 being the variance of a coordinate of the
+    pose.  No other motion is in the fit's slopes, so that its covariance is that of 4 s^2 I.
+    """
+    cell, k = fit.cell, len(spots)
+    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    model = model_of(fit.nominal.robot, train).only(fit.identification.active)
+    normal = model.normal(state, model.active)
+    spare = max(6 * train.poses - (int(model.active.sum()) - (3 * k - 6)), 1)
+    variance = float(normal.cost.sum()) / spare
+    covariance = np.full((model.names.count,) * 2, np.nan)
+    gram = normal.gram.sum(axis=0)
+    inverse = solve_normal(gram, np.eye(len(gram)))
+    covariance[np.ix_(model.active, model.active)] = variance * inverse
+    return PoseFit(fit, model, state, tool_of(cell, spots), covariance)
+
+
+def pose_parameters(found: PoseFit, nominal_tool: Array, spots: Array) -> tuple[Parameter, ...]:
+    """Links and base as `calibrate` tells them, and the tool instead of its reflectors."""
+    names, k = found.model.names, len(spots)
+    sigma = dict(zip(names.all, np.sqrt(np.diag(found.covariance)), strict=True))
+    whole = "all targets moved together", "the tool"
+    links = tuple(
+        replace(p, sigma=float(sigma[p.name]), reason=p.reason.replace(*whole))
+        for p in found.fit.parameters
+        if p.name.rpartition("_")[0] not in names.targets
+    )
+    axes = nominal_tool[:3, :3]
+    arm = spots @ found.tool[:3, :3].T  # in the flange's axes
+    rigid = np.concatenate([np.tile(np.eye(3), (k, 1)), -hat(arm).reshape(3 * k, 3)], axis=1)
+    back = np.linalg.pinv(rigid)
+    spread = back @ found.covariance[-3 * k :, -3 * k :] @ back.T
+    turn = Rotation.from_matrix(found.tool[:3, :3] @ axes.T).as_rotvec()
+    before = np.concatenate([nominal_tool[:3, 3], np.zeros(3)])
+    after = np.concatenate([found.tool[:3, 3], turn])
+    told = bool(found.model.active[-3 * k :].all())
+    return links + tuple(
+        Parameter(
+            name=name,
+            value=float(after[i]),
+            nominal=float(before[i]),
+            sigma=float(np.sqrt(spread[i, i])) if told else np.nan,
+            unit="m" if i < 3 else "rad",
+            identifiable=told,
+            reason="" if told else "same motion as links and base",
+        )
+        for i, name in enumerate(TOOL)
+    )
+
+
+def beyond_one(
+    found: PoseFit, robot: Robot, train: Measurements, allowed: Array
+) -> tuple[str, ...]:
+    """Parameters that these poses tell, and one reflector at the pose's origin would not.
+
+    train: the virtual reflectors.  allowed: (p,) of the model's parameters.
+    """
+    one = replace(train, y=train.y.mean(axis=1, keepdims=True), targets=("smr1",))
+    model = model_of(robot, one)
+    rows = model.names.count - 3
+    state = replace(found.state, targets=found.tool[None, :3, 3])
+    order = identify.drop_order(robot, model.names)
+    alone = identify.identify(
+        model,
+        state,
+        order,
+        allowed=np.append(allowed[:rows], [True] * 3),
+        reference=identify.plenty_of_poses(robot, model),
+        known=np.zeros(model.names.count, dtype=bool),
+    )
+    more = found.model.active[:rows] & ~alone.active[:rows]
+    place = [name for name, told in zip(TOOL[:3], alone.active[rows:], strict=True) if not told]
+    return (*(model.names.all[i] for i in np.flatnonzero(more)), *place, *TOOL[3:])
+
+
+def pose_place(cell: Cell, tool: Array, lever: float) -> dict[str, Any]:
+    """For JSON: base in the measurement frame, measured frame in the flange, and the lever."""
+    turn = Rotation.from_matrix(tool[:3, :3]).as_rotvec()
+    return {
+        "base": cell.to_dict()["base"],
+        "tool": {
+            "translation_mm": [1e3 * float(v) for v in tool[:3, 3]],
+            "rotation_vector_rad": [float(v) for v in turn],
+        },
+        "lever_mm": 1e3 * lever,
+    }

@@ -1,0 +1,113 @@
+"""What the reader of a calibration without coordinates should know besides its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.fitting.calibrate import WILD_ANGLE
+from minimax_cal.fitting.calibration import Parameter
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.fit import InstrumentFit
+from minimax_cal.fitting.instruments.identify import has_scale
+from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.instruments.rows import TARGET
+from minimax_cal.fitting.plausibility import POOR_FIT
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring import checks
+from minimax_cal.robots.kinematics import MDH_NAMES
+
+WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
+WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
+
+
+def scale_notices(fit: InstrumentFit) -> tuple[str, ...]:
+    """What stands for the length standard that closures lack."""
+    kept = [
+        name
+        for name, reason in fit.identification.reasons.items()
+        if reason.startswith("all lengths together")
+    ]
+    if has_scale(fit.instrument) or not kept:
+        return ()
+    return (
+        f"the scale is not identifiable from closures: {kept[0]} is kept as drawn, and if that is "
+        "wrong by a part in a thousand, so is every length; sigmas leave this out; "
+        "--known-distance A,B,MM gives the scale",
+    )
+
+
+def offset_notices(
+    fit: InstrumentFit, parameters: tuple[Parameter, ...], options: RelativeOptions
+) -> tuple[str, ...]:
+    """How weakly the offsets of wires are determined."""
+    if not options.offset:
+        return ()
+    spare = max(fit.numbers - int(fit.identification.active.sum()), 1)
+    noise_mm = 1e3 * float(np.sqrt(fit.found.cost[0] / spare))
+    told = [p for p in parameters if p.name.startswith("offset")]
+    each = ", ".join(
+        f"{p.name} {1e3 * p.value:+.3f} +- {1e3 * p.sigma:.3f} mm"
+        if p.identifiable
+        else f"{p.name} not identifiable"
+        for p in told
+    )
+    return (
+        f"offsets are weakly determined (a length is known to {noise_mm:.3f} mm): {each}; only how "
+        "the wires' directions vary tells an offset from the anchor's place",
+    )
+
+
+def remarks(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
+    """What the reader should know: nothing held out, measurements that stand out."""
+    notices = []
+    if not held.any():
+        notices.append("no pose is held out: nothing here says how the fit does on new poses")
+    elif not result.accuracy["holdout"].poses:
+        notices.append("the held-out rows close with nothing: no held-out accuracy")
+    distance = np.full((len(result.parts), len(held)), np.nan)
+    distance[:, ~held] = np.linalg.norm(result.errors["train"], axis=-1)
+    distance[:, held] = np.linalg.norm(result.errors["holdout"], axis=-1)
+    return (*notices, *checks.outliers(replace(data.at, targets=result.parts), distance))
+
+
+def weak(result: RelativeCalibration) -> tuple[str, ...]:
+    """A notice where positions are told far worse than what was measured."""
+    rms_mm, expected_mm = result.accuracy["train"].rms_mm, 1e3 * result.position_sigma
+    untold = [
+        p.name
+        for p in result.parameters
+        if not p.identifiable and p.name.startswith(TARGET) and "these poses" in p.reason
+    ]
+    if expected_mm <= WEAK * rms_mm and not untold:
+        return ()
+    where = f" ({', '.join(untold)} not told at all)" if untold else ""
+    more = "more sockets, farther apart" if result.kind == "closures" else "more anchors, around it"
+    return (
+        f"positions are told weakly{where}: by the sigmas they are good to {expected_mm:.3g} mm, "
+        f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
+        f"turn the flange more from pose to pose, and measure with {more}",
+    )
+
+
+def unlikely(result: RelativeCalibration) -> tuple[str, ...]:
+    """Notices where the result is no calibration of this robot but of another one."""
+    notices, reach = [], result.nominal.reach()
+    for key, what in (("nominal_train", "the nominal robot"), ("train", "the best fit")):
+        miss_mm = result.accuracy[key].rms_mm
+        if miss_mm > 1e3 * POOR_FIT * reach:
+            notices.append(
+                f"{what} misses by {miss_mm:.3g} mm: check that it is the robot of these "
+                "measurements, with its joint signs, zero positions and units"
+            )
+    limits = {"m": WILD_LENGTH * reach, "rad": WILD_ANGLE}
+    links = [p for p in result.parameters if p.name.rstrip("0123456789") in MDH_NAMES]
+    wild = [p for p in links if abs(p.value - p.nominal) > limits[p.unit]]
+    if wild:
+        named = ", ".join(f"{p.name} by {1e3 * (p.value - p.nominal):+.4g}" for p in wild[:5])
+        notices.append(
+            f"implausibly large changes (mm, mrad): {named}; is the robot file the right one?"
+        )
+    return tuple(notices)

@@ -1,0 +1,181 @@
+"""The result of a calibration without coordinates: what was found, how well, and what it is not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.fitting.calibration import SCHEMA, Parameter, Provenance, finite
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.status import Status
+
+KIND = "relative calibration"
+QUANTITY = {
+    "distances": "length of a wire",
+    "closures": "ball about its socket",
+    "poses": "position of the flange",
+}
+CAUTION = {
+    "distances": "An error of lengths is no error of position: what lies across the wires does "
+    "not show in it. ",
+    "closures": "A misclosure is no error of position: what moves all visits of a socket alike "
+    "does not show in it. ",
+    "poses": "",
+}
+ROWS = (
+    ("training, nominal", "nominal_train"),
+    ("training, calibrated", "train"),
+    ("held out, nominal", "nominal"),
+    ("held out, calibrated", "holdout"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeCalibration:
+    """A robot calibrated from lengths, closures or poses.
+
+    kind: one of `data.KINDS`.  robot: calibrated; nominal: as drawn.
+    parts: what each row of the errors is, as wire1.  accuracy, errors: by key nominal, holdout,
+    nominal_train, train; errors are (parts, m, 3) of the measured quantity, NaN where not measured
+    [m]; a length's error stands first of three.  numbers: independent numbers behind each
+    accuracy.  turns: RMS and largest error of orientation by key [rad], empty but for poses.
+    instrument: what was fitted besides the robot, for JSON.  position_sigma: expected error of a
+    position over the joints' range, by the parameters' sigmas alone, the base fitted [m].
+    beyond: parameters that whole poses tell and one reflector does not.
+    """
+
+    kind: str
+    robot: Robot
+    nominal: Robot
+    parts: tuple[str, ...]
+    status: Status
+    iterations: int
+    seconds: float
+    parameters: tuple[Parameter, ...]
+    accuracy: Mapping[str, Accuracy]
+    errors: Mapping[str, Array]
+    numbers: Mapping[str, int]
+    turns: Mapping[str, tuple[float, float]]
+    instrument: Mapping[str, Any]
+    identification: Identification
+    position_sigma: float
+    beyond: tuple[str, ...]
+    notices: tuple[str, ...]
+    provenance: Provenance
+
+    @property
+    def identified(self) -> int:
+        """Number of identified parameters."""
+        return sum(p.identifiable for p in self.parameters)
+
+    def accuracy_table(self) -> Table:
+        """Accuracy of what was measured, before and after, training and held out."""
+        rows: list[tuple[Cell, ...]] = []
+        for title, key in ROWS:
+            a, turned = self.accuracy[key], [1e3 * value for value in self.turns.get(key, ())]
+            rows.append((title, a.poses, self.numbers[key], a.rms_mm, a.mean_mm, a.max_mm, *turned))
+        turns = ("RMS mrad", "max mrad") if self.turns else ()
+        return Table(
+            f"{self.robot.name}: {QUANTITY[self.kind]}",
+            ("poses", "count", "numbers", "RMS mm", "mean mm", "max mm", *turns),
+            tuple(rows),
+            ("", "d", "d", *[".4f"] * (3 + len(turns))),
+        )
+
+    def parts_table(self) -> Table:
+        """RMS errors wire by wire."""
+        rows: list[tuple[Cell, ...]] = []
+        for i, part in enumerate(self.parts):
+            found = [self.accuracy[key] for _, key in ROWS]
+            each = [(a.sse_mm2[i], a.counts[i]) for a in found]
+            rows.append((part, *(math.sqrt(f / m) if m else math.nan for f, m in each)))
+        header = ("RMS mm", *(title for title, _ in ROWS))
+        return Table("by wire", header, tuple(rows), ("", *[".4f"] * len(ROWS)))
+
+    def parameter_rows(self) -> Table:
+        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
+        rows = tuple(
+            (
+                p.name,
+                "mm" if p.unit == "m" else "mrad",
+                p.nominal * 1e3,
+                (p.value - p.nominal) * 1e3,
+                p.sigma * 1e3,
+                "" if p.identifiable else p.reason,
+            )
+            for p in self.parameters
+        )
+        header = ("name", "unit", "nominal", "change", "sigma", "not identified because")
+        return Table("parameters", header, rows, ("", "", ".4f", "+.4f", ".4f", ""))
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        parts = (self.parts_table(),) if len(self.parts) > 1 else ()
+        return (self.accuracy_table(), *parts, self.parameter_rows())
+
+    def headline(self) -> str:
+        """The result in some sentences, with what it does not say."""
+        before, after = self.accuracy["nominal"], self.accuracy["holdout"]
+        where = f"at {after.poses} poses that were not used for the fit"
+        if not after.poses:
+            before, after = self.accuracy["nominal_train"], self.accuracy["train"]
+            where = f"at the {after.poses} poses of the fit itself (none was held out)"
+        text = (
+            f"{QUANTITY[self.kind].capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
+            f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
+            f"{where}. {CAUTION[self.kind]}By the parameters' sigmas alone a position over the "
+            f"joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS once a base is "
+            f"fitted. {self.identified} of {len(self.parameters)} parameters identified (condition "
+            f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
+            f"iterations, {self.seconds:.2f} s."
+        )
+        return text + (f" {self.status.advice}." if self.status.advice else "")
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: `robot` is the calibrated robot, whole, as `load_robot` reads it."""
+        accuracies = {}
+        for key, value in self.accuracy.items():
+            accuracies[key] = value.to_dict() | {"numbers": self.numbers[key]}
+            for name, turn in zip(("rms_mrad", "max_mrad"), self.turns.get(key, ()), strict=False):
+                accuracies[key][name] = finite(1e3 * turn)
+        return {
+            "schema": SCHEMA,
+            "kind": KIND,
+            "measured": self.kind,
+            "robot": self.robot.to_dict(),
+            "nominal_robot": self.nominal.to_dict(),
+            "parts": list(self.parts),
+            "instrument": dict(self.instrument),
+            "status": str(self.status),
+            "advice": self.status.advice,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "parameters": [p.to_dict() for p in self.parameters],
+            "identified": self.identified,
+            "beyond_one_reflector": list(self.beyond),
+            "condition": finite(self.identification.condition),
+            "position_sigma_mm": finite(1e3 * self.position_sigma),
+            "accuracy": accuracies,
+            "notices": list(self.notices),
+            "provenance": vars(self.provenance),
+        }
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())

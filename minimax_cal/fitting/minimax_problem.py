@@ -1,0 +1,225 @@
+"""The worst error as a minimax problem, with the distances between targets kept [paper M].
+
+The worst target, f_i = F_i / m_i, as in the paper; or the worst of all measured points.  Values are
+divided by their size at the start and parameters scaled to unit curvature: the solver then sees
+numbers near one, whatever the robot's size and the instrument's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.minimax import Linear
+
+DISTANCE_FORMS = ("two-sided", "squared", "off")
+LEAST_TOLERANCE = 1e-6  # a distance is never asked to hold better than a micrometre [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """What the instrument says about the distances between targets [paper M, eq. 8].
+
+    pairs: (l, 2) indices of targets measured together.  mean: (l,) mean measured distance [m].
+    tolerance: (l,) how far the model's distance may lie from it, sqrt(eps) of the paper [m].
+    """
+
+    pairs: Array
+    mean: Array
+    tolerance: Array
+
+
+def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distances:
+    """The distances of all pairs measured together three times or more, and how well known.
+
+    tolerance: for all pairs [m].  NaN takes the instrument's own accuracy: sqrt(2) times the
+    typical `u95` where there is such a column, else the scatter of each measured distance.
+    """
+    pairs, mean, spread = [], [], []
+    for a in range(len(data.targets)):
+        for b in range(a + 1, len(data.targets)):
+            distance = np.linalg.norm(data.y[:, a] - data.y[:, b], axis=-1)
+            distance = distance[np.isfinite(distance)]
+            if len(distance) > 2:
+                pairs.append((a, b))
+                mean.append(distance.mean())
+                spread.append(distance.std(ddof=1))
+    scatter = np.array(spread)
+    if "u95" in data.columns and np.isfinite(data.columns["u95"]).any():
+        scatter = np.full(len(pairs), np.sqrt(2.0) * float(np.nanmedian(data.columns["u95"])))
+    if np.isfinite(tolerance):
+        scatter = np.full(len(pairs), tolerance)
+    return Distances(
+        np.array(pairs, dtype=int).reshape(-1, 2),
+        np.array(mean),
+        np.maximum(scatter, LEAST_TOLERANCE),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """min over x of the largest f_i, as `solvers.minimax` wants it.
+
+    per: "target" for f_i = F_i / m_i, "point" for the squared distance of every measured point.
+    start, first: where the scaling was found, and the derivatives there.
+    scale: (free,) divides a step's entries.  size: divides the f_i [m^2].
+    form: "two-sided" |e| <= tol, or the paper's "squared" e^2 <= tol^2, whose gradient vanishes
+    at e = 0, or "off".
+    """
+
+    per: str
+    model: Model
+    distances: Distances
+    start: State
+    first: Sensitivity
+    scale: Array
+    size: float
+    form: str
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds of the scaled distance deviations."""
+        count = len(self.distances.mean)
+        return np.full(count, -1.0 if self.form == "two-sided" else -np.inf)
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds of the scaled distance deviations."""
+        return np.ones(len(self.distances.mean))
+
+    def deviation(self, x: State) -> tuple[Array, Array]:
+        """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
+        pairs, names = self.distances.pairs, self.model.names
+        between = x.targets[pairs[:, 0]] - x.targets[pairs[:, 1]]
+        length = np.maximum(np.linalg.norm(between, axis=-1), 1e-12)
+        c = (length - self.distances.mean) / self.distances.tolerance
+        slope = np.zeros((len(pairs), names.count))
+        unit = between / length[:, None] / self.distances.tolerance[:, None]
+        first = 5 * names.joints + 6
+        for row, (a, b) in enumerate(pairs):
+            slope[row, first + 3 * a : first + 3 * a + 3] = unit[row]
+            slope[row, first + 3 * b : first + 3 * b + 3] = -unit[row]
+        if self.form == "squared":
+            slope, c = 2.0 * c[:, None] * slope, c**2
+        return c, slope[:, self.model.active] / self.scale
+
+    def evaluate(self, x: State) -> tuple[Array, Array]:
+        """f and c."""
+        value, _ = PER[self.per]
+        return (value(self.model, x) + prior_of(self.model, x)) / self.size, self.deviation(x)[0]
+
+    def linearise(self, x: State) -> Linear:
+        """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""
+        model = self.model
+        at = self.first if x is self.start else PER[self.per][1](model, x)
+        total, weight = model.counts.sum(), model.prior.weight[model.active]
+        off = (model.prior.mean - model.values(x))[model.active]
+        c, normal = self.deviation(x)
+
+        def curvature(weights: Array) -> Array:
+            both = at.curvature(weights) + 2.0 * weights.sum() * np.diag(weight) / total
+            # one divisor an entry: the quotient is as symmetric as what it came from
+            return np.asarray(both / (self.size * np.outer(self.scale, self.scale)))
+
+        return Linear(
+            f=(at.f + prior_of(model, x)) / self.size,
+            slope=(at.slope - 2.0 * weight * off / total) / self.size / self.scale,
+            c=c,
+            normal=normal,
+            curvature=curvature,
+        )
+
+    def step(self, x: State, d: Array) -> State:
+        """The state moved by a scaled step in the free parameters."""
+        full = np.zeros(self.model.names.count)
+        full[self.model.active] = d / self.scale
+        return x.step(full)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """f (n,) [m^2], its derivative (n, free), and the weighted sum of its curvatures."""
+
+    f: Array
+    slope: Array
+    curvature: Callable[[Array], Array]
+
+
+def prior_of(model: Model, x: State) -> float:
+    """The prior's part of every f_i: the share it has in a mean square [m^2]."""
+    if not model.prior.weight.any():
+        return 0.0
+    off = model.prior.mean - model.values(x)
+    return float((model.prior.weight * off**2).sum() / model.counts.sum())
+
+
+def target_values(model: Model, x: State) -> Array:
+    """F_i / m_i of every target: (k,) [m^2]."""
+    return np.asarray(model.cost(x) / model.counts)
+
+
+def target_sensitivity(model: Model, x: State) -> Sensitivity:
+    """F_i / m_i and its derivatives."""
+    normal = model.normal(x, model.active)
+    counts = model.counts
+    return Sensitivity(
+        normal.cost / counts,
+        -2.0 * normal.slope / counts[:, None],
+        lambda weights: 2.0 * np.einsum("k,kij->ij", weights / counts, normal.gram),
+    )
+
+
+def point_values(model: Model, x: State) -> Array:
+    """The squared distance of every measured point, target by target: (points,) [m^2]."""
+    parts = [(model.error_of(x, block)[0] ** 2).sum(axis=-2) for block in model.blocks(x)]
+    return np.asarray(np.concatenate(parts, axis=-1)[model.seen])
+
+
+def point_sensitivity(model: Model, x: State) -> Sensitivity:
+    """Squared distances and their derivatives."""
+    blocks = model.blocks(x)
+    rows = [model.weighted_rows(x, block, model.active) for block in blocks]
+    f = np.concatenate([(error**2).sum(axis=-2) for error, _ in rows], axis=-1)
+    slopes = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
+    slope = np.concatenate(slopes, axis=1)
+
+    def curvature(weights: Array) -> Array:
+        spread = np.zeros(model.seen.shape)
+        spread[model.seen] = np.sqrt(weights)
+        total = np.zeros((slope.shape[-1],) * 2)
+        for block, (_, turned) in zip(blocks, rows, strict=True):
+            part = turned * spread[:, None, None, block.rows]
+            flat = np.moveaxis(part, 1, 0).reshape(len(total), -1)
+            total += flat @ flat.T
+        return 2.0 * total
+
+    return Sensitivity(f[model.seen], slope[model.seen], curvature)
+
+
+PER = {
+    "target": (target_values, target_sensitivity),
+    "point": (point_values, point_sensitivity),
+}
+
+
+def worst_of(model: Model, start: State, distances: Distances, form: str, per: str) -> Worst:
+    """The minimax problem scaled at a start.  Raises OptionError for an unknown form."""
+    if form not in DISTANCE_FORMS:
+        raise OptionError(f"distance form {form!r}; choose {', '.join(DISTANCE_FORMS)}")
+    if form == "off":
+        none = np.zeros(0)
+        distances = Distances(np.zeros((0, 2), dtype=int), none, none)
+    first = PER[per][1](model, start)
+    size = float(first.f.max())
+    size = size if size > 0.0 else 1e-18
+    mean = 0.5 * np.diag(first.curvature(np.full(len(first.f), 1.0 / len(first.f))))
+    mean = mean + model.prior.weight[model.active] / model.counts.sum()
+    scale = np.sqrt(np.maximum(2.0 * mean / size, 1e-30))
+    return Worst(per, model, distances, start, first, scale, size, form)

@@ -1,0 +1,248 @@
+"""Fits that a few wrong points cannot pull: losses that grow more slowly than the square.
+
+From a fit to the points that belong together (`trimmed`) a loss of the points' distances is
+minimised by iteratively reweighted separable least squares, with the scale held [Yohai 1987].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.fitting.suspects import EXPLANATION, RIDGE, Scores, Spread, Suspect, suspects_of
+from minimax_cal.fitting.trimmed import Fitter, Weighted, concentrate, set_aside, soften
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
+
+SQUARE = "square"  # the loss of plain least squares
+START = 0.3  # share of the points that may leave the start of a loss
+MOST = 0.5  # no method tells wrong points from right ones where they are the majority
+ROUNDS = 200  # of reweighting
+SETTLED = 1e-6  # change of a weight that ends them
+UNTOLD = 100.0  # times the variance: these poses no longer tell a parameter
+ALL: Array = np.ones(0, dtype=bool)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """rho(z) of a point's distance in robust standard deviations, by the weight rho'(z) / z.
+
+    weight, slope: of u = z / tuning, (n,): the weight, and the derivative of u weight(u).
+    tuning: what makes the fit 95 % as efficient as least squares where all errors are Gaussian, in
+    three dimensions.
+    """
+
+    weight: Callable[[Array], Array]
+    slope: Callable[[Array], Array]
+    tuning: float
+
+
+LOSSES = {  # [Huber 1964; Holland and Welsch 1977; Beaton and Tukey 1974]
+    "huber": Loss(
+        lambda u: np.asarray(1.0 / np.maximum(u, 1.0)), lambda u: np.asarray((u < 1.0) * 1.0), 1.628
+    ),
+    "cauchy": Loss(
+        lambda u: np.asarray(1.0 / (1.0 + u**2)),
+        lambda u: np.asarray((1.0 - u**2) / (1.0 + u**2) ** 2),
+        2.6656,
+    ),
+    "tukey": Loss(
+        lambda u: np.maximum(1.0 - u**2, 0.0) ** 2,
+        lambda u: np.where(u < 1.0, (1.0 - u**2) * (1.0 - 5.0 * u**2), 0.0),
+        5.4902,
+    ),
+}
+
+
+def reweighted(at: Weighted, kept: Array, loss: Loss, scale: float) -> Weighted:
+    """The minimum of a loss by iteratively reweighted least squares, the scale held.
+
+    kept: (k, m) 0 for points set aside, which stay out.
+    """
+    for _ in range(ROUNDS):
+        size = distances(at.plain, at.state) / (scale * loss.tuning)
+        weights = kept * loss.weight(size)
+        change = float(np.abs(weights - at.weights)[at.judged].max(initial=0.0))
+        at = at.again(weights)
+        if change <= SETTLED:
+            return at
+    return at.unsettled()
+
+
+def distances(model: Model, state: State) -> Array:
+    """(k, m) distance of each point from its prediction, times the root of its weight [m]."""
+    parts = [(model.error_of(state, block)[0] ** 2).sum(axis=-2) for block in model.blocks(state)]
+    return np.asarray(np.sqrt(np.concatenate(parts, axis=-1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Robust:
+    """A fit whose points have weights.
+
+    at: the fit.  kept: its model with the points set aside at weight 0, not weighted by the loss.
+    loss_scale: standard deviation of a coordinate at which the loss was taken [m].
+    line: (m,) of the file.
+    """
+
+    at: Weighted
+    kept: Model
+    loss: str
+    loss_scale: float
+    line: Array
+    notices: tuple[str, ...] = ()
+
+    @property
+    def plain(self) -> Model:
+        """The model as given, with the prior of the last fit."""
+        return self.at.plain
+
+    @property
+    def model(self) -> Model:
+        """The model weighted by the loss too."""
+        return self.at.model
+
+    @property
+    def fit(self) -> LeastSquares[State]:
+        """Its least squares."""
+        return self.at.found
+
+    @property
+    def weights(self) -> Array:
+        """(k, m) from 0 to 1, beside those of the measurements; 0 where not measured."""
+        return self.at.weights
+
+    @property
+    def rounds(self) -> int:
+        """How many fits it took."""
+        return self.at.rounds
+
+    @cached_property
+    def judged(self) -> tuple[Scores, Spread]:
+        """How far off each point is, and how ordinary points scatter."""
+        found = self.at.scores()
+        return found, self.at.spread(found)
+
+    @property
+    def scale(self) -> float:
+        """Standard deviation of a coordinate of an ordinary point [m], of the typical weight."""
+        return self.judged[1].scale
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """The points that stand out from the fit, the least likely first."""
+        return suspects_of(self.at.plain, self.at.state, *self.judged, self.line)
+
+    @property
+    def by_pose(self) -> Model:
+        """The model with one weight a pose, the least of its targets': a pose needs them all."""
+        least = np.where(self.plain.seen, self.weights, 1.0).min(axis=0)
+        return replace(self.plain, weight=self.plain.weight * least)
+
+
+def check_robust(loss: str, trim: float) -> None:
+    """Raise OptionError for a choice that does not exist."""
+    if loss not in (SQUARE, *LOSSES):
+        raise OptionError(f"no loss {loss!r}; choose {', '.join((SQUARE, *LOSSES))}")
+    if not 0.0 <= trim < MOST:
+        raise OptionError(f"trim {trim:g}: give a share of the points, 0 <= trim < {MOST:g}")
+
+
+def robust_fit(
+    fitter: Fitter,
+    plain: Model,
+    found: LeastSquares[State],
+    line: Array,
+    loss: str = SQUARE,
+    trim: float = 0.0,
+    judged: Array = ALL,
+) -> Robust:
+    """Minimise a loss of the distances, with at most a share of the points set aside.
+
+    fitter: least squares of a model from a state.  plain, found: the plain fit, where it starts.
+    line: (m,) of the file, for the list of suspects.  trim: the share.  judged: (k,) False for
+    targets that do not pull at the fit.  Raises OptionError.
+    """
+    check_robust(loss, trim)
+    judged = judged if len(judged) else np.ones(len(plain.y), dtype=bool)
+    seen = plain.seen.astype(float)
+    at, kept = Weighted(fitter, plain, found, seen, judged), seen
+    scale = np.nan
+    if not np.isfinite(found.cost).all():  # its status tells why; there is nothing to start from
+        loss, trim = SQUARE, 0.0
+    if loss != SQUARE or trim > 0.0:
+        at = set_aside(concentrate(soften(at), max(trim, START)), trim or START)
+        kept = at.weights if trim else seen
+    if loss != SQUARE:
+        scale = at.spread(at.scores()).scale
+        at = reweighted(at, kept, LOSSES[loss], scale)
+    kept_model = replace(at.plain, weight=plain.weight * kept)
+    robust = Robust(at, kept_model, loss, scale, line)
+    if not at.rounds:
+        return robust
+    return replace(robust, notices=tuple(remarks(at, kept, robust.suspects, trim)))
+
+
+def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: float) -> Iterator[str]:
+    """What the reader should know beside the list of suspects."""
+    away = int((at.plain.seen & (kept == 0.0)).sum())
+    if suspects:
+        yield f"{len(suspects)} of {at.count} points stand out from the fit: {EXPLANATION}"
+    if trim:
+        yield f"--trim {trim:g}: {away} of {at.count} points are set aside"
+    more = f"--trim {trim:g}: {len(suspects) - away} more points stand out"
+    if trim and len(suspects) > away and away == at.most(trim):
+        yield f"{more} and pull at the fit; give a larger share or another --loss"
+    elif trim and len(suspects) > away:
+        yield f"{more}, but not from a fit without them; they stay in it"
+    names = at.plain.names.all
+    lost = ", ".join(names[i] for i in np.flatnonzero(at.plain.active)[untold(at)])
+    if lost:
+        yield f"without the points that stand out the poses hardly tell {lost}"
+
+
+def untold(at: Weighted) -> Array:
+    """(free,) True for parameters whose variance the weights raise by a factor UNTOLD or more."""
+    prior = np.diag(at.plain.prior.weight[at.plain.active])
+    both = [
+        model.normal(at.state, model.active).gram.sum(axis=0) + prior
+        for model in (at.plain, at.model)
+    ]
+    ridge = RIDGE * np.diag(np.diag(both[0]))
+    before, after = (np.diag(solve_normal(gram + ridge, np.eye(len(gram)))) for gram in both)
+    return np.asarray(after > UNTOLD * before)
+
+
+def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array, Array]:
+    """What a loss does to the covariance of a fit [Huber and Ronchetti 2009, 7.6].
+
+    With psi = rho' along the error, of each target: (k,) mean derivative of psi, a third along and
+    two thirds across, and (k,) mean of psi^2 per coordinate [m^2].  Least squares has ones and the
+    mean square error.  scale: `Robust.loss_scale`.
+    """
+    size = distances(model, state)
+    counts = np.maximum(model.counts, 1)
+    if loss == SQUARE:
+        return np.ones(len(size)), (size**2).sum(axis=1) / (3.0 * counts)
+    own = LOSSES[loss]
+    u = size / (scale * own.tuning)
+    weight = own.weight(u)
+    slope = np.where(model.seen, (own.slope(u) + 2.0 * weight) / 3.0, 0.0)
+    return slope.sum(axis=1) / counts, ((weight * size) ** 2).sum(axis=1) / (3.0 * counts)
+
+
+def flatness(robust: Robust, state: State) -> float:
+    """By how much a loss pulls less, for small changes, than the weights of its fit: at least 1.
+
+    The sandwich of a weighted fit takes the weights for given; the true slope of psi is less.
+    """
+    slope, _ = moments(robust.kept, state, robust.loss, robust.loss_scale)
+    counts = robust.kept.counts
+    if robust.loss == SQUARE or not np.isfinite(robust.loss_scale):
+        return 1.0
+    return float(robust.weights[robust.kept.seen].sum() / (slope * counts).sum())

@@ -1,0 +1,190 @@
+"""A start that needs no guess: the tracker may stand anywhere.
+
+Near the nominal geometry the base and the targets come out in closed form; far from it a search
+over base rotations finds the basin of the global minimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.model import Model, SumOfSquares
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots import kinematics
+from minimax_cal.solvers import least_squares
+from minimax_cal.solvers.least_squares import LeastSquares, Limits
+
+SCREEN, KEEP, ROUNDS = 15, 6, 8  # steps of the first look, starts that go on, further rounds
+ENOUGH = 60  # poses that tell one basin from another
+OCTAHEDRAL = Rotation.create_group("O").as_matrix()  # the 24 turns of a cube
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Base and targets that fit a fixed geometry best.
+
+    state: the geometry with its base and targets.  mean_square: of the point errors [m^2].
+    mirrored: the same if the measurement frame were left-handed [m^2].
+    """
+
+    state: State
+    mean_square: float
+    mirrored: float
+
+
+def fit_frame(model: Model, mdh: Array) -> Frame:
+    """The global best base and targets for a given geometry.
+
+    With S = R_b' the residual S y - c - R_n t - o_n is linear in (S, c, t).  Eliminating c and t
+    leaves a quadratic in the nine entries of S; over the rotations it is minimised from its
+    unconstrained minimum projected by SVD, and from the 24 turns of a cube, all at once.
+    """
+    links = kinematics.chain(mdh, model.q, model.prismatic)
+    k, _, m = model.y.shape
+    root = np.sqrt(model.weight)[..., None, None]
+    measured = np.swapaxes(model.y, -1, -2)
+    centre = measured[model.seen].mean(axis=0)
+    y = measured - centre
+    plain = np.zeros((k, m, 3, 3 + 3 * k))
+    plain[..., :3] = np.eye(3)
+    for i in range(k):
+        plain[i, ..., 3 + 3 * i : 6 + 3 * i] = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
+    turned = np.einsum("ij,kmc->kmijc", np.eye(3), y).reshape(k, m, 3, 9)
+    known = np.broadcast_to(links.origin.T[None, :, :, None], (k, m, 3, 1))
+    rows = np.concatenate([root * plain, root * turned, root * known], axis=-1)
+    rows = rows[model.seen].reshape(-1, rows.shape[-1])
+    # one QR eliminates c and t and condenses the rest to ten columns
+    free = 3 + 3 * k
+    plain_q, _ = np.linalg.qr(rows[:, :free])
+    rest = rows[:, free:]
+    rest = rest - plain_q @ (plain_q.T @ rest)
+    _, condensed = np.linalg.qr(rest)
+    matrix, right = condensed[:, :9], condensed[:, 9]
+
+    def best(handed: float) -> tuple[Array, float]:
+        guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
+        starts = np.concatenate([project(guess[None]), OCTAHEDRAL])
+        found, cost = polish(handed * matrix, right, starts)
+        winner = int(np.argmin(cost))
+        return handed * found[winner], float(cost[winner]) / np.count_nonzero(model.seen)
+
+    turn, mean_square = best(1.0)
+    _, mirrored = best(-1.0)
+    # an ill-conditioned set of poses leaves some of c, t open: the least solution then
+    s = turn.reshape(9)
+    lengths = np.linalg.lstsq(
+        rows[:, :free], rows[:, free : free + 9] @ s - rows[:, -1], rcond=1e-10
+    )
+    shift, targets = lengths[0][:3], lengths[0][3:].reshape(k, 3)
+    state = State(mdh, turn.T, centre + turn.T @ shift, targets)
+    return Frame(state, mean_square, mirrored)
+
+
+def project(matrix: Array) -> Array:
+    """The nearest rotations, by SVD.  matrix: (..., 3, 3)."""
+    u, _, vt = np.linalg.svd(matrix)
+    flip = np.ones((*matrix.shape[:-2], 3))
+    flip[..., 2] = np.linalg.det(u @ vt)
+    return np.asarray((u * flip[..., None, :]) @ vt)
+
+
+def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
+    """Minimise |matrix vec(S) - right|^2 over rotations S from each start (B, 3, 3)."""
+    turn = starts
+    axes = kinematics.hat(np.eye(3))
+    damping = np.full(len(starts), 1e-3)
+
+    def residual(s: Array) -> Array:
+        return np.asarray(s.reshape(-1, 9) @ matrix.T - right)
+
+    error = residual(turn)
+    cost = (error**2).sum(-1)
+    for _ in range(100):
+        slopes = (turn[:, None] @ axes).reshape(-1, 3, 9) @ matrix.T  # S exp(hat(w)), (B, 3, rows)
+        gram = slopes @ np.swapaxes(slopes, -1, -2)
+        scale = np.trace(gram, axis1=-2, axis2=-1)[:, None, None] + 1e-300
+        pull = -(slopes @ error[..., None])
+        step = np.linalg.solve(gram + damping[:, None, None] * scale * np.eye(3), pull)[..., 0]
+        trial = turn @ kinematics.rotation(step)
+        after_error = residual(trial)
+        after = (after_error**2).sum(-1)
+        better = after < cost
+        turn = np.where(better[:, None, None], trial, turn)
+        error = np.where(better[:, None], after_error, error)
+        small = np.abs(cost - after) <= 1e-15 * cost
+        cost = np.where(better, after, cost)
+        damping = np.where(better, damping / 10.0, damping * 4.0)
+        if np.all(small | (damping > 1e6)):
+            break
+    return turn, cost
+
+
+def search(
+    model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = ROUNDS
+) -> LeastSquares[State]:
+    """The best fit over base rotations when the geometry's angles may be far off.
+
+    First the 24 turns of a cube for the base, with the angles as given.  While the best fit misses
+    by more than good [m], further rounds turn the cube at random and set two link angles at random
+    in each start: what is far off is mostly one or two zero positions.  Returns the best fits on
+    all poses, best first.
+    """
+    rng = np.random.default_rng(0)  # the same data give the same answer
+    found = descend(model, starts_at(model, np.repeat(mdh[None], 24, axis=0), OCTAHEDRAL), points)
+    for _ in range(rounds if good > 0.0 else 0):
+        if np.sqrt(found.cost[0] / points) <= good:
+            break
+        turns = OCTAHEDRAL @ Rotation.random(rng=rng).as_matrix()
+        links = np.repeat(mdh[None], 24, axis=0)
+        for link in links:
+            spots = [(rng.integers(len(mdh)), rng.integers(2, 4)) for _ in range(2)]
+            for joint, column in spots:
+                link[joint, column] = rng.uniform(-np.pi, np.pi)
+        other = descend(model, starts_at(model, links, turns), points)
+        found = other if other.cost[0] < found.cost[0] else found
+    return found
+
+
+def starts_at(model: Model, mdh: Array, turns: Array) -> State:
+    """Starts with the base turned and amid the points, targets in the flange."""
+    centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
+    origin = np.broadcast_to(centre, (len(mdh), 3))
+    return State(mdh, turns, origin, np.zeros((len(mdh), model.y.shape[0], 3)))
+
+
+def descend(model: Model, starts: State, points: float) -> LeastSquares[State]:
+    """The best of many starts, screened on some of the poses and finished on all.
+
+    All take a few damped steps, the best few go on, and the two best of these are finished.
+    """
+    few, count = thinned(model, ENOUGH), len(starts.mdh)
+    some = float(few.counts.sum())
+    problem = SumOfSquares(few)
+    first = least_squares.solve(problem, starts, count, some, limits=Limits(1e-9, SCREEN))
+    chosen = np.argsort(first.cost)[:KEEP]
+    second = least_squares.solve(
+        problem, first.x.take(chosen), len(chosen), some, limits=Limits(1e-9, 100)
+    )
+    best = np.argsort(second.cost)[:2]  # the others are other minima, or the same one
+    final = least_squares.solve(SumOfSquares(model), second.x.take(best), len(best), points)
+    order = np.argsort(final.cost)
+    return replace(
+        final,
+        x=final.x.take(order),
+        cost=final.cost[order],
+        iterations=final.iterations[order],
+        status=tuple(final.status[i] for i in order),
+        trace=final.trace[:, order],
+    )
+
+
+def thinned(model: Model, most: int) -> Model:
+    """The model with at most so many poses, spread evenly over the rows."""
+    m = len(model.q)
+    rows = np.linspace(0, m - 1, min(m, most)).astype(int)
+    thin = replace(model, q=model.q[rows], y=model.y[..., rows], weight=model.weight[:, rows])
+    return thin if np.all(thin.counts >= 3) else model

@@ -1,0 +1,245 @@
+"""Points that stand out from a fit, each with the chance that an ordinary point does so.
+
+A suspect is no verdict.  The point may be wrong, or the model: an effect that it lacks, such as a
+compliant joint, makes errors of millimetres at the poses that load it.  So suspects are listed and
+left to the reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import minimize_scalar
+from scipy.special import betaln, fdtr
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Table
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.least_squares import solve_normal
+
+LEVEL = 0.01  # share of a list that is expected to be ordinary points
+FOLLOWED = 0.01  # a fit that leaves less of a direction's variance hides what is wrong there
+RIDGE = 1e-10  # of each parameter's own weight: one that the kept points do not tell is open
+LEAST_SCALE = 1e-7  # no instrument tells less [m]
+TAILS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
+CLEARLY = 2.0  # gain in log-likelihood that makes tails heavier than the Gaussian's
+ROUNDS = 30
+
+EXPLANATION = (
+    "a suspect may be a wrong point or a real effect that the fit lacks (a compliant joint moves a "
+    "small arm by millimetres at the poses that load it); run minimax-cal diagnose before you "
+    "delete a row"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How far each point is from the fit, in what the noise and the fit's own error allow.
+
+    square: (k, m) squared distance, standardised [m^2].  freedom: (k, m) in how many directions the
+    point was judged, 0 where not measured or where the fit follows the point.
+    """
+
+    square: Array
+    freedom: Array
+
+
+def scores(model: Model, state: State, weights: Array) -> Scores:
+    """Standardised distances e' C^-1 e at a fit in which points had weights besides the model's.
+
+    weights: (k, m), 0 for points that the fit has not used.  With whitened rows X_i of the
+    Jacobian, A = sum w X'X + P and B = sum w^2 X'X + P (P the prior's weight) the error of point i
+    has the covariance C = I - 2 w_i X_i A^-1 X_i' + X_i A^-1 B A^-1 X_i' in units of the noise:
+    I - H for a point of the fit, I + H for another.  Either way the result is that of the point
+    judged by all others [Cook and Weisberg 1982, "Residuals and Influence in Regression", ch. 2].
+    """
+    active = model.active
+    prior = np.diag(model.prior.weight[active])
+
+    def gram(share: Array) -> Array:
+        some = replace(model, weight=model.weight * share)
+        return np.asarray(some.normal(state, active).gram.sum(axis=0))
+
+    ridge = RIDGE * np.diag(np.diag(gram(np.ones_like(weights))))
+    cover = solve_normal(gram(weights) + prior + ridge, np.eye(len(prior)))
+    spread = cover @ (gram(weights**2) + prior) @ cover
+    square, freedom = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
+    for block in model.blocks(state):
+        error, rows = model.weighted_rows(state, block, active)
+        own = weights[:, block.rows, None, None]
+        left = np.eye(3) - 2.0 * own * hat_blocks(rows, cover) + hat_blocks(rows, spread)
+        share, axes = np.linalg.eigh(left)
+        along = np.einsum("kcab,kac->kcb", axes, error)
+        told = share > FOLLOWED
+        square[:, block.rows] = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
+        freedom[:, block.rows] = told.sum(axis=-1)
+    return Scores(square, np.where(model.seen, freedom, 0))
+
+
+def hat_blocks(rows: Array, matrix: Array) -> Array:
+    """X_i M X_i' of every point: (k, c, 3, 3).  rows: (k, p, 3, c).  matrix: M (p, p)."""
+    k, p, _, c = rows.shape
+    turned = (matrix @ rows.reshape(k, p, 3 * c)).reshape(rows.shape)
+    return np.asarray(np.einsum("kpac,kpbc->kcab", rows, turned))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Ordinary points scatter by Student's t: scale per coordinate [m], degrees of freedom."""
+
+    scale: float
+    freedom: float
+
+    def chance(self, found: Scores) -> Array:
+        """(k, m) that an ordinary point is as far off or farther; 1 where it was not judged."""
+        judged = found.freedom > 0
+        freedom = np.maximum(found.freedom, 1)
+        ratio = found.square / freedom / self.scale**2
+        return np.where(judged, stats.f.sf(ratio, freedom, self.freedom), 1.0)
+
+
+def spread_of(found: Scores, spare: float) -> Spread:
+    """Scale and tails of the ordinary points, whatever the suspects are.
+
+    The start is the median of the distances, taken for Gaussian.  In turn the suspects are listed
+    and Student's t is fitted to the other points by maximum likelihood [Lange, Little and Taylor
+    1989], which knows that their distances end where the suspects begin.  Errors of a model have
+    heavy tails: they make the list shorter, while outliers beyond a gap do not.  spare: degrees of
+    freedom of the fit, which the scale cannot have more of.
+    """
+    judged = found.freedom > 0
+    freedom, mean_square = found.freedom[judged], (found.square / np.maximum(found.freedom, 1))
+    mean_square = mean_square[judged]
+    if not len(mean_square):
+        return Spread(LEAST_SCALE, 1.0)
+    middle = np.median(mean_square / stats.f.ppf(0.5, freedom, spare))
+    here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), spare)
+    before = [np.zeros(len(mean_square), dtype=bool)]
+    for _ in range(ROUNDS):
+        far = unlikely(here.chance(found)[judged])
+        if any(np.array_equal(far, other) for other in before):
+            break
+        before.append(far)
+        edge = float(mean_square[far].min(initial=np.inf))
+        here = student(mean_square[~far], freedom[~far], edge, spare, here.scale)
+    if len(before) == 1:  # no suspects at the median's scale: the rest decides on the tails
+        here = student(mean_square, freedom, np.inf, spare, here.scale)
+    return here
+
+
+def student(mean_square: Array, freedom: Array, edge: float, spare: float, usual: float) -> Spread:
+    """Student's t by maximum likelihood from points below an edge; light tails if in doubt.
+
+    mean_square: (n,) standardised squared distance per direction [m^2], which over the variance is
+    distributed as F.  freedom: (n,) directions.
+    """
+    known = np.maximum(mean_square, LEAST_SCALE**2)
+    kinds, times = np.unique(freedom, return_counts=True)
+
+    def loss(log_scale: float, tail: float) -> float:
+        variance = np.exp(2.0 * log_scale)
+        size = np.log(known / variance)
+        wide = 0.5 * (freedom + tail) * np.log1p(freedom * known / variance / tail)
+        shape = 0.5 * kinds * np.log(kinds / tail) - betaln(0.5 * kinds, 0.5 * tail)
+        inside = np.log(fdtr(kinds, tail, edge / variance))
+        density = ((0.5 * freedom - 1.0) * size - wide).sum() + times @ (shape - inside)
+        return float(len(known) * 2.0 * log_scale - density)
+
+    middle = np.log(usual)
+    best: list[tuple[float, Spread]] = []
+    for tail in (spare, *(tail for tail in TAILS if tail < spare)):
+        found = minimize_scalar(
+            loss, bounds=(middle - 2.0, middle + 2.0), args=(tail,), method="bounded"
+        )
+        scale = max(float(np.exp(found.x)), LEAST_SCALE)
+        best.append(
+            (float(found.fun) + (CLEARLY if tail < spare else 0.0), Spread(scale, float(tail)))
+        )
+    return min(best, key=lambda one: one[0])[1]
+
+
+def unlikely(chance: Array, level: float = LEVEL) -> Array:
+    """True for points that stand out, of any shape [Benjamini and Hochberg 1995].
+
+    Of those listed a share `level` is expected to be ordinary; without outliers the list is empty
+    but for one data set in 1 / level.  That holds for points of one noise: where noise grows with
+    range and no u95 tells, two to five times as many lists name an ordinary point.
+    """
+    order = np.sort(chance, axis=None)
+    count = len(order)
+    below = np.flatnonzero(order <= level * (np.arange(count) + 1.0) / max(count, 1))
+    limit = order[below[-1]] if len(below) else -1.0
+    return np.asarray(chance <= limit)
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A point that stands out from the fit.
+
+    line: of the file.  pose: index of the row.  distance: from the prediction [m].  score: the
+    distance standardised by scale and leverage.  chance: that an ordinary point scores as much.
+    together: whether all targets of the pose are suspects: then its joint values may be wrong.
+    """
+
+    line: int
+    target: str
+    pose: int
+    distance: float
+    score: float
+    chance: float
+    together: bool
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON, in millimetres."""
+        return {
+            "line": self.line,
+            "target": self.target,
+            "distance_mm": 1e3 * self.distance,
+            "score": self.score,
+            "chance": self.chance,
+            "together": self.together,
+        }
+
+
+def suspects_of(
+    model: Model, state: State, found: Scores, spread: Spread, line: Array
+) -> tuple[Suspect, ...]:
+    """The points that stand out, the least likely first.  line: (m,) of the file."""
+    chance = spread.chance(found)
+    judged = found.freedom > 0
+    far = np.zeros(judged.shape, dtype=bool)
+    far[judged] = unlikely(chance[judged])
+    distance = np.linalg.norm(model.error(state), axis=-1)
+    score = np.sqrt(found.square) / spread.scale
+    together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)
+    where = sorted(np.argwhere(far).tolist(), key=lambda at: (chance[*at], -score[*at]))
+    return tuple(
+        Suspect(
+            line=int(line[pose]),
+            target=model.names.targets[target],
+            pose=pose,
+            distance=float(distance[target, pose]),
+            score=float(score[target, pose]),
+            chance=float(chance[target, pose]),
+            together=bool(together[pose]),
+        )
+        for target, pose in where
+    )
+
+
+def table_of(suspects: Sequence[Suspect]) -> Table:
+    """The list for people."""
+    return Table(
+        "points that stand out (may be real effects: run minimax-cal diagnose)",
+        ("line", "target", "distance mm", "score", "chance", "of the pose"),
+        tuple(
+            (s.line, s.target, 1e3 * s.distance, s.score, s.chance,
+             "all targets" if s.together else "")
+            for s in suspects
+        ),
+        ("d", "", ".4f", ".1f", ".1e", ""),
+    )  # fmt: skip

@@ -1,0 +1,463 @@
+"""How sure the parameters of a fit are, and the positions that it predicts.
+
+An estimator that weighs the errors e of each pose by A is off, to first order, by H^-1 sum J'A e
+with H = sum J'A J plus the prior.  What the e do from pose to pose is told in two ways.  `by_noise`
+knows it: covariance s^2 W^-1 + t^2 S S', the instrument's noise and the joints' jitter, which moves
+all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H^-1 [Huber 1967].
+`by_poses` asks the poses: what does the fit do without each of them?  It covers model error too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import read_text
+from minimax_cal.modelling.cell import Cell, load_cell, still
+from minimax_cal.modelling.effects.table import names_of
+from minimax_cal.modelling.joint_fit import extended
+from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
+from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.robots import kinematics
+from minimax_cal.solvers.least_squares import solve_normal
+
+PLENTY = 1000  # poses that tell all; of more, so many are drawn
+SPARE = 3.0  # degrees of freedom that tell two noises apart
+ALONE = 1e-3  # of what all poses tell of a direction, all but one must tell this share
+# A fit of the worst point rests on a few points: other noise would choose others.  With this share
+# of the mean multiplier as the least of any point, `by_noise` covers as it should; no theory says
+# so, but runs with 30 to 160 poses, one target and three (experiments.coverage shows some).
+LEAST_POINT = 0.3
+CHUNK = 2048  # poses whose Jacobian is kept at a time
+FRAMES = ("measurement", "base")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """How a fit weighs its points: min over x of the sum of share_i F_i, and the prior.
+
+    model: with the fit's free parameters, prior and effects; its weights are the instrument's.
+    share: (k,) weight of each target besides, or (k, m) of each point where the worst one counts.
+    mix: (m, 3k, 3k) as `model.pose_weights` where it weighs poses; empty for plain points.
+    """
+
+    model: Model
+    share: Array
+    mix: Array = field(default_factory=lambda: NO_MIX)
+
+    def at(self, rows: Array) -> Estimator:
+        """The same on some poses.  rows: indices, possibly repeated."""
+        model = self.model
+        few = replace(
+            model,
+            q=model.q[rows],
+            y=model.y[..., rows],
+            weight=model.weight[:, rows],
+            fields=model.fields[..., rows] if len(model.fields) else model.fields,
+            moved=model.moved[..., rows] if len(model.moved) else model.moved,
+        )
+        share = self.share if self.share.ndim == 1 else self.share[:, rows]
+        return Estimator(few, share, self.mix[rows] if len(self.mix) else self.mix)
+
+    def thinned(self, group: Array, most: int) -> tuple[Estimator, Array]:
+        """About so many rows at most, whole poses drawn at random; as much less of the prior.
+
+        group: (m,) rows with the same number are one pose.  Returns the rows too.
+        """
+        _, member = np.unique(group, return_inverse=True)
+        count, m = int(member.max()) + 1, len(member)
+        if m <= most:
+            return self, np.arange(m)
+        chosen = np.random.default_rng(0).permutation(count)[: max(count * most // m, 1)]
+        rows = np.flatnonzero(np.isin(member, chosen))
+        few, prior = self.at(rows), self.model.prior
+        less = Prior(prior.mean, prior.weight * len(rows) / m)
+        return replace(few, model=few.model.with_prior(less)), rows
+
+
+def point_share(mu: Array, seen: Array) -> Array:
+    """(k, m) weights of the points in a fit of the worst one.
+
+    mu: (points,) its multipliers, target by target.  seen: (k, m) which points there are.
+    """
+    out = np.zeros(seen.shape)
+    out[seen] = np.maximum(mu * np.count_nonzero(seen), LEAST_POINT)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """A linearised fit pose by pose, points in units of the instrument's noise.
+
+    error: (m, r) errors, r = 3k.  slope: (m, r, p) derivative by the free parameters.
+    arm: (m, r, n) motion of the points per unit of each joint.  pull: (m, r, p) A times `slope`.
+    off, prior: (p,) how far the parameters are from the prior's mean, and its weights.
+    seen: (k, m) which points were measured.
+    """
+
+    error: Array
+    slope: Array
+    arm: Array
+    pull: Array
+    off: Array
+    prior: Array
+    seen: Array
+
+    @staticmethod
+    def of(estimator: Estimator, state: State) -> Poses:
+        """All poses of an estimator at its solution."""
+        model, (m, n) = estimator.model, estimator.model.q.shape
+        block = Block(slice(0, m), kinematics.chain(state.mdh, model.q, model.prismatic))
+        error, turned = model.weighted_rows(state, block, np.ones(model.names.count, dtype=bool))
+        k, p = turned.shape[:2]
+        if len(estimator.mix):  # weighs along the axes of the instrument
+            error, turned = state.rotation @ error, state.rotation @ turned
+        every = np.moveaxis(turned, (3, 0, 2, 1), (0, 1, 2, 3)).reshape(m, 3 * k, p)
+        slope = every[..., model.active]
+        if len(estimator.mix):
+            pull = estimator.mix @ slope
+        else:
+            pull = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * slope
+        joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
+        off = (model.prior.mean - model.values(state))[model.active]
+        return Poses(
+            error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
+            slope=slope,
+            arm=every[..., joints],
+            pull=pull,
+            off=off,
+            prior=model.prior.weight[model.active],
+            seen=model.seen,
+        )
+
+    @property
+    def bread(self) -> Array:
+        """(p, p) H."""
+        flat = [a.reshape(-1, a.shape[-1]) for a in (self.slope, self.pull)]
+        return np.asarray(flat[0].T @ flat[1] + np.diag(self.prior))
+
+    @property
+    def mean_square(self) -> float:
+        """Of a coordinate's error, as a prior was weighed against it in the fit [m^2]."""
+        paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
+        count = 3.0 * np.count_nonzero(self.seen)
+        return float((self.error**2).sum()) / max(count - paid, 1.0)
+
+    @property
+    def gram(self) -> Array:
+        """(m, p, p) J'A J of each pose."""
+        return np.asarray(np.swapaxes(self.slope, -1, -2) @ self.pull)
+
+    @property
+    def score(self) -> Array:
+        """(m, p) J'A e of each pose."""
+        return np.asarray(np.einsum("mrp,mr->mp", self.pull, self.error))
+
+    def rows(self) -> Rows:
+        """For the estimate of the noises; a prior is some more rows, as noisy as a typical one."""
+        m, r, p = self.slope.shape
+        parts = (np.moveaxis(a.reshape(m, r // 3, 3, -1), 0, 3) for a in (self.slope, self.arm))
+        slope, arm = (np.moveaxis(part, 2, 0) for part in parts)
+        plain = np.moveaxis(self.error.reshape(m, r // 3, 3), 0, 2)
+        none = np.zeros((r // 3, 0, 3, m))
+        bare = rows_of(plain, none, arm, self.seen.astype(float))
+        known = np.flatnonzero(self.prior)
+        root = np.sqrt(self.prior[known])
+        more = np.zeros((len(known), p))
+        more[np.arange(len(known)), known] = root
+        return replace(
+            bare,
+            error=np.concatenate([bare.error, root * self.off[known]]),
+            basis=orthonormal(np.concatenate([bare.of(slope), more])),
+            stretch=np.concatenate([bare.stretch, np.ones(len(known))]),
+            count=bare.count + len(known),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What is known about the parameters of a fit.
+
+    names: of all p parameters.  units: of each, SI.  covariance: (p, p), the base's in its own
+    axes, NaN where a parameter is not identified.  noise: of a typical coordinate and of the
+    joints.  spare: degrees of freedom of the noise.  source: `poses` or `noise`.
+    """
+
+    names: Names
+    units: tuple[str, ...]
+    covariance: Array
+    noise: Noise
+    spare: float
+    source: str
+
+    @property
+    def active(self) -> Array:
+        """(p,) True where a parameter is identified."""
+        return np.asarray(np.isfinite(np.diag(self.covariance)))
+
+    @property
+    def sigma(self) -> Array:
+        """(p,) standard deviations [SI]."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+    @property
+    def correlation(self) -> Array:
+        """(p, p) correlations; NaN where not identified."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self.covariance / np.outer(self.sigma, self.sigma))
+
+    @property
+    def root(self) -> Array:
+        """R (p, r) with RR' the covariance, rows of zeros where not identified."""
+        known = np.flatnonzero(self.active)
+        sigma = np.where(self.sigma[known] > 0.0, self.sigma[known], 1.0)
+        alike = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
+        values, vectors = np.linalg.eigh(alike)
+        out = np.zeros((self.names.count, len(known)))
+        out[known] = sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return out
+
+    def widened(self, factor: float) -> Uncertainty:
+        """The same with all sigmas times a factor."""
+        return replace(self, covariance=factor**2 * self.covariance)
+
+    def half_width(self, level: float = 0.95) -> Array:
+        """(p,) half of the interval of each parameter: Student's quantile times sigma [SI]."""
+        return quantile(level, self.spare) * self.sigma
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the identified parameters, lengths in millimetres."""
+        known = np.flatnonzero(self.active)
+        scale = scales(self.units)[known]
+        rows = self.covariance[np.ix_(known, known)] * np.outer(scale, scale)
+        names = self.names.all
+        return {
+            "names": [names[i] for i in known],
+            "units": ["mm" if self.units[i] == "m" else self.units[i] for i in known],
+            "rows": rows.tolist(),
+            "source": self.source,
+            "degrees_of_freedom": self.spare,
+            "noise_mm": 1e3 * float(np.sqrt(self.noise.variance)),
+            "jitter_rad": self.noise.jitter,
+            "jitter_ratio": self.noise.ratio,
+        }
+
+
+def quantile(level: float, spare: float) -> float:
+    """Student's two-sided quantile.  spare: degrees of freedom, at least one counts."""
+    return float(stats.t.ppf(0.5 + 0.5 * level, max(spare, 1.0)))
+
+
+def scales(units: tuple[str, ...]) -> Array:
+    """(p,) what a parameter is multiplied by in JSON: 1e3 for lengths."""
+    return np.array([1e3 if unit == "m" else 1.0 for unit in units])
+
+
+def noise_of(poses: Poses) -> tuple[Noise, float]:
+    """Instrument's noise and joints' jitter by `noise.restricted`, and their degrees of freedom.
+
+    None are free where the poses do not determine the parameters.
+    """
+    rows, p = poses.rows(), poses.slope.shape[-1]
+    spare = float(rows.count - p) if rows.basis.shape[1] == p else 0.0
+    if spare >= SPARE:
+        return restricted(rows, np.zeros((len(rows.error), 0))), spare
+    left = rows.error - rows.basis @ (rows.basis.T @ rows.error)
+    return Noise(0.0, float(left @ left) / max(spare, 1.0), 0.0), spare
+
+
+def by_noise(poses: Poses, noise: Noise) -> Array:
+    """H^-1 F H^-1 with F = sum J'A (s^2 + t^2 S S') A J: (p, p) of the free parameters [SI]."""
+    pull = poses.pull.reshape(-1, poses.pull.shape[-1])
+    swing = np.swapaxes(poses.pull, -1, -2) @ poses.arm
+    filling = noise.variance * pull.T @ pull
+    filling += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
+    return sandwich(poses, filling)
+
+
+def by_poses(poses: Poses, group: Array) -> Array:
+    """The jackknife over poses: (p, p) of the free parameters [SI].
+
+    (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
+    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  group: (m,) rows with the same
+    number are one pose.  NaN where the fit needs one of the poses.
+    """
+    _, member = np.unique(group, return_inverse=True)
+    count, p = int(member.max()) + 1, poses.slope.shape[-1]
+    gram, score = np.zeros((count, p, p)), np.zeros((count, p))
+    np.add.at(gram, member, poses.gram)
+    np.add.at(score, member, poses.score)
+    try:
+        np.linalg.cholesky((1.0 - ALONE) * poses.bread - gram)
+    except np.linalg.LinAlgError:
+        return np.full((p, p), np.nan)
+    change = solve_normal(poses.bread - gram, score[..., None])[..., 0]
+    prior = sandwich(poses, np.zeros((p, p)))
+    return np.asarray((count - 1) / count * change.T @ change + prior)
+
+
+def sandwich(poses: Poses, filling: Array) -> Array:
+    """H^-1 F H^-1.  A prior is rows as noisy as a typical one: its weight times their variance."""
+    if poses.prior.any():
+        filling = filling + poses.mean_square * np.diag(poses.prior)
+    half = solve_normal(poses.bread, filling)
+    return np.asarray(solve_normal(poses.bread, half.T))
+
+
+def uncertainty_of(
+    estimator: Estimator, state: State, group: Array, units: tuple[str, ...] = ()
+) -> Uncertainty:
+    """What is known about the parameters of a fit, given its solution.
+
+    `by_poses` where the fit needs none of its poses, for it covers as well as `by_noise` where the
+    noises are all there is, and better where they are not (experiments.coverage).  Not for a fit of
+    the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
+    """
+    few, rows = estimator.thinned(group, PLENTY)
+    poses = Poses.of(few, state)
+    noise, spare = noise_of(poses)
+    found, source = np.full(poses.bread.shape, np.nan), "poses"
+    if spare >= 1.0 and estimator.share.ndim == 1:
+        found = by_poses(poses, group[rows])
+    if spare >= 1.0 and np.isnan(found).any():
+        found, source = by_noise(poses, noise), "noise"
+    names, active = few.model.names, few.model.active
+    covariance = np.full((names.count,) * 2, np.nan)
+    covariance[np.ix_(active, active)] = 0.5 * (found + found.T) * len(rows) / len(group)
+    own = tuple("m" if length else "rad" for length in names.linear[: names.geometric])
+    return Uncertainty(names, (*own, *units), covariance, noise, spare, source)
+
+
+# ---- positions -------------------------------------------------------------------------------
+
+
+def position_covariance(
+    cell: Cell,
+    known: Uncertainty,
+    q: Array,
+    frame: str = "measurement",
+    *,
+    jitter: bool = False,
+) -> Array:
+    """Covariance of the predicted position of each target anywhere: (m, k, 3, 3) [m^2].
+
+    q: (m, n) joints as the controller gives them [rad, m].  jitter: whether to add that of the
+    joints at a new pose.  frame: `measurement`, where the instrument will see the targets, in its
+    axes: base, links and targets all enter, and which of several redundant parameters were kept
+    does not matter.  `base`, where they are in the robot's base frame, in its axes: links and
+    targets enter, the base's pose does not.  Where a link parameter repeats the base (d1, theta1)
+    and is not identified, the base frame is the one in which it is nominal.
+    """
+    q = np.atleast_2d(np.asarray(q, dtype=float))
+    parts = []
+    for first in range(0, len(q), CHUNK):
+        factor = position_factor(cell, known, q[first : first + CHUNK], frame, jitter=jitter)
+        parts.append(factor @ np.swapaxes(factor, -1, -2))
+    return np.concatenate(parts)
+
+
+def position_factor(
+    cell: Cell, known: Uncertainty, q: Array, frame: str, *, jitter: bool = False
+) -> Array:
+    """F (m, k, 3, r) with FF' the covariance of positions; columns are the same for all targets.
+
+    So that the mean over the targets is the factor of their centroid's.  Arguments as
+    `position_covariance`.  Raises OptionError.
+    """
+    if frame not in FRAMES:
+        raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
+    model, state = model_at(cell, q)
+    n = model.names.joints
+    slope = np.swapaxes(model.jacobian(state), 0, 1)
+    if frame == "measurement":
+        slope = state.rotation @ slope
+    root = known.root
+    if frame == "base":
+        root[5 * n : 5 * n + 6] = 0.0
+    factor = slope @ root
+    if not jitter:
+        return np.asarray(factor)
+    joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
+    return np.concatenate([factor, known.noise.jitter * slope[..., joints]], axis=-1)
+
+
+def model_at(cell: Cell, q: Array) -> tuple[Model, State]:
+    """The model of a cell at poses (m, n) where nothing was measured, and its state."""
+    data = still(np.atleast_2d(np.asarray(q, dtype=float)), cell.targets, cell.robot)
+    names = Names(cell.robot.joints, cell.targets)
+    m, k, nothing = data.poses, len(cell.targets), np.zeros(names.count)
+    model = Model(
+        q=data.q * cell.robot.sign,
+        prismatic=cell.robot.prismatic,
+        y=np.zeros((k, 3, m)),
+        weight=np.ones((k, m)),
+        names=names,
+        active=np.ones(names.count, dtype=bool),
+        prior=Prior(nothing, nothing),
+    )
+    values = np.concatenate([np.zeros(0), *cell.effects.values])
+    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots, values)
+    if not cell.effects.terms:
+        return model, state
+    return extended(model, cell.robot, data, state, cell.effects.terms)
+
+
+def holding_radius(covariance: Array, level: float = 0.95) -> Array:
+    """Radius about the prediction that holds a share of the positions: (...) [m].
+
+    covariance: (..., 3, 3) [m^2].  The squared distance is taken for a gamma variable of its mean
+    and variance [Welch 1938, Satterthwaite 1946]: exact where one direction or all three are alike.
+    """
+    mean = np.trace(covariance, axis1=-2, axis2=-1)
+    square = np.einsum("...ij,...ij->...", covariance, covariance)
+    spread = np.where(mean > 0.0, square / np.where(mean > 0.0, mean, 1.0), 0.0)
+    freedom = np.where(square > 0.0, mean**2 / np.where(square > 0.0, square, 1.0), 1.0)
+    return np.asarray(np.sqrt(spread * stats.chi2.ppf(level, freedom)))
+
+
+# ---- saved fits ------------------------------------------------------------------------------
+
+
+def load_uncertainty(path: Path | str) -> tuple[Cell, Uncertainty]:
+    """The cell of a saved calibration and how sure its parameters are.  Raises CalibrationError."""
+    cell = load_cell(path)
+    content = json.loads(read_text(path))
+    return cell, uncertainty_from_dict(content, cell, str(path))
+
+
+def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -> Uncertainty:
+    """From the JSON of a calibration: its key `covariance`.  Raises CalibrationError."""
+    if "covariance" not in content:
+        raise CalibrationError(
+            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate -o"
+        )
+    nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.targets, cell.robot))
+    effects, own = names_of(cell.effects.terms, nowhere)
+    names = Names(cell.robot.joints, cell.targets, effects)
+    units = (*("m" if x else "rad" for x in names.linear[: names.geometric]), *own)
+    try:
+        part = content["covariance"]
+        place = np.array([names.index(str(name)) for name in part["names"]], dtype=int)
+        rows = np.array(part["rows"], dtype=float).reshape(len(place), len(place))
+        ratio, jitter = float(part["jitter_ratio"]), float(part["jitter_rad"])
+        noise = Noise(ratio, (1e-3 * float(part["noise_mm"])) ** 2, jitter)
+        spare, kind = float(part["degrees_of_freedom"]), str(part["source"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"{source}: its covariance does not fit its robot and targets ({error})"
+        ) from error
+    if not np.isfinite(rows).all() or np.any(np.diag(rows) < 0.0) or np.any(rows != rows.T):
+        raise CalibrationError(f"{source}: its covariance is no symmetric matrix of numbers")
+    scale = scales(units)[place]
+    covariance = np.full((names.count,) * 2, np.nan)
+    covariance[np.ix_(place, place)] = rows / np.outer(scale, scale)
+    return Uncertainty(names, units, covariance, noise, spare, kind)

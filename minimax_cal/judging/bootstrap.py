@@ -1,0 +1,318 @@
+"""How sure a calibration is, by calibrating again on poses drawn from those measured.
+
+Poses are drawn with replacement, all rows of a pose together [Davison and Hinkley 1997, sec. 6.2.4:
+cases], and each fit starts at the solution.  A sum of squares takes two Gauss-Newton steps from
+there, the first of all replicates at once; a minimax is solved again.  Nothing is assumed about the
+errors but that poses are independent.  The poses left out of a replicate judge it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.fitting.calibrate import (
+    QP_TOLERANCE,
+    Fit,
+    Options,
+    Report,
+    fit_cell,
+    silent,
+    usable,
+)
+from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.robust import flatness
+from minimax_cal.fitting.uncertainty import model_at
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
+from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.least_squares import solve_normal
+from minimax_cal.solvers.minimax import Sqp
+from minimax_cal.solvers.status import Status
+from qp_backends import solve as solve_qp
+
+BUNDLES = 2000  # more poses than these are drawn in bundles
+LEAST = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
+MOST_LOST = 0.5  # of the replicates
+BATCH = 64  # replicates whose Gram matrices are kept at a time
+PACE = 25  # replicates between two words on progress
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """Calibrations of poses drawn anew.
+
+    fit: of the poses as measured.  names, units, value: of the p identified parameters [SI].
+    change: (B, p) from the fit to each replicate, the base's along its own axes [SI].
+    place: (p,) of each among all parameters.  out_of_bag: (B,) RMS distance on the poses that were
+    not drawn, NaN without any [m].  lost: replicates whose poses did not determine the parameters,
+    or whose solver did not end well.
+    """
+
+    fit: Calibration
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Array
+    change: Array
+    place: Array
+    out_of_bag: Array
+    lost: int
+
+    @property
+    def sigma(self) -> Array:
+        """(p,) standard deviation over the replicates [SI]."""
+        return np.asarray(self.change.std(axis=0, ddof=1))
+
+    def interval(self, level: float = 0.95) -> Array:
+        """(p, 2) percentiles of each parameter [SI]."""
+        return np.asarray(self.value[:, None] + percentiles(self.change, level).T)
+
+    def positions(self, q: Array) -> Array:
+        """(B, m, k, 3) where each replicate expects the instrument to see each target [m].
+
+        To first order about the fit.  q: (m, n) joints as the controller gives them [rad, m].
+        """
+        model, state = model_at(self.fit.cell, q)
+        slope = state.rotation @ np.swapaxes(model.jacobian(state), 0, 1)
+        return np.asarray(
+            self.fit.predict(q) + np.einsum("mkcp,bp->bmkc", slope[..., self.place], self.change)
+        )
+
+    def position_interval(self, q: Array, level: float = 0.95) -> Array:
+        """(2, m, k, 3) percentiles of each coordinate of the predicted positions [m]."""
+        return percentiles(self.positions(q), level)
+
+    def rms_interval(self, level: float = 0.95) -> Interval:
+        """Percentiles of the RMS distance on poses that a replicate has not seen [m].
+
+        Somewhat too large: a replicate has seen fewer poses than the fit.
+        """
+        known = self.out_of_bag[np.isfinite(self.out_of_bag)]
+        low, high = percentiles(known, level) if len(known) else (np.nan, np.nan)
+        return Interval(float(low), float(high))
+
+    def table(self, level: float = 0.95) -> Table:
+        """Every parameter with its percentiles, in mm, mrad, or the effect's own unit."""
+        shown = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+        rows: list[tuple[Cell, ...]] = []
+        for i, (low, high) in enumerate(self.interval(level)):
+            unit, scale = shown.get(self.units[i], (self.units[i], 1.0))
+            numbers = (self.value[i], self.sigma[i], low, high)
+            rows.append((self.names[i], unit, *(scale * float(number) for number in numbers)))
+        return Table(
+            f"{len(self.change)} calibrations of poses drawn anew: {100.0 * level:g} % intervals",
+            ("name", "unit", "value", "sigma", "low", "high"),
+            tuple(rows),
+            ("", "", *[".5g"] * 4),
+        )
+
+    def to_dict(self, level: float = 0.95) -> dict[str, Any]:
+        """For JSON, lengths in millimetres."""
+        scale = np.array([1e3 if unit == "m" else 1.0 for unit in self.units])
+        ends = self.interval(level) * scale[:, None]
+        rms = self.rms_interval(level)
+        known = np.isfinite(rms.low)
+        return {
+            "replicates": len(self.change),
+            "lost": self.lost,
+            "level": level,
+            "parameters": [
+                {"name": name, "unit": "mm" if unit == "m" else unit, "sigma": float(sigma),
+                 "interval": ends[i].tolist()}
+                for i, (name, unit, sigma) in enumerate(
+                    zip(self.names, self.units, self.sigma * scale, strict=True))
+            ],
+            "out_of_bag_rms_mm": [1e3 * rms.low, 1e3 * rms.high] if known else None,
+        }  # fmt: skip
+
+
+def percentiles(values: Array, level: float) -> Array:
+    """(2, ...) the ends of the middle share of values (B, ...)."""
+    return np.asarray(np.quantile(values, (0.5 - 0.5 * level, 0.5 + 0.5 * level), axis=0))
+
+
+def bootstrap(
+    fit: Calibration, replicates: int = 500, seed: int = 0, report: Report = silent
+) -> Bootstrap:
+    """Calibrate again on poses drawn from the training poses.
+
+    report: called with a word on progress.  Raises OptionError; DataError where most draws do not
+    determine the parameters.
+    """
+    if replicates < 2:
+        raise OptionError(f"{replicates} replicates: give 2 or more, 500 as a rule")
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    if fit.objective == "point":
+        raise OptionError(
+            "objective point rests on the few worst points, which a bootstrap cannot draw anew; "
+            "choose sum, minimax, pose or smr:K"
+        )
+    options, train = options_of(fit), fit.data.take(~fit.held)
+    found = fit_cell(fit.nominal.robot, train, options, silent)
+    draws = draw(found.group, replicates, np.random.default_rng(seed))
+    change, good = (solved_again if found.worst else stepped)(found, train, options, draws, report)
+    # a robust loss would weigh each draw anew, and so give way more than with weights that are kept
+    change = change * flatness(found.robust, found.state)
+    lost = replicates - int(np.count_nonzero(good))
+    if lost > MOST_LOST * replicates:
+        raise DataError(
+            f"{fit.data.source}: {lost} of {replicates} draws of {draws.times.shape[1]} poses do "
+            f"not determine the {change.shape[1]} parameters; measure more poses"
+        )
+    place = np.flatnonzero(found.identification.active)
+    by_name = {p.name: p for p in fit.parameters}
+    chosen = [by_name[found.names.all[i]] for i in place]
+    return Bootstrap(
+        fit=fit,
+        names=tuple(p.name for p in chosen),
+        units=tuple(p.unit for p in chosen),
+        value=np.array([p.value for p in chosen]),
+        change=change[good],
+        place=place,
+        out_of_bag=unseen(found, change[good], draws, good),
+        lost=lost,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """times: (B, M) how often each pose is drawn.  member: (m,) the pose of each row."""
+
+    times: Array
+    member: Array
+
+    def rows(self, number: int) -> Array:
+        """(m,) how often each row is drawn in one replicate."""
+        return np.asarray(self.times[number][self.member])
+
+
+def draw(group: Array, replicates: int, rng: np.random.Generator) -> Draws:
+    """Poses drawn with replacement.  group: (m,) rows with the same number are one pose."""
+    _, member = np.unique(group, return_inverse=True)
+    member = member % BUNDLES
+    count = int(member.max()) + 1
+    return Draws(rng.multinomial(count, np.full(count, 1.0 / count), size=replicates), member)
+
+
+def options_of(fit: Calibration) -> Options:
+    """The options that a calibration was made with, its effects with the variants chosen."""
+    settings = dict(fit.provenance.settings)
+    nan = {key: np.nan for key, value in settings.items() if value is None}
+    return Options(**{**settings, **nan, "effects": fit.cell.effects.terms})  # type: ignore[arg-type]
+
+
+def stepped(
+    found: Fit, train: Measurements, options: Options, draws: Draws, report: Report
+) -> tuple[Array, Array]:
+    """Replicates of a sum of squares: two Gauss-Newton steps from the fit.
+
+    The first takes all at once, since each row's part of the normal equations is the same for all.
+    Returns the changes (B, p) of the free parameters, and (B,) True where the draws determine them.
+    """
+    model, share = found.estimator.model, found.estimator.share
+    model = model.emphasise(share)
+    model = with_poses(model, found.estimator.mix) if len(found.estimator.mix) else model
+    part, pull = normal_parts(model, found.state, draws)
+    prior = model.prior.weight[model.active]
+    off = (model.prior.mean - model.values(found.state))[model.active]
+    good = determined(draws, part, prior)
+    gram = np.tensordot(draws.times[good], part, 1) + np.diag(prior)
+    change = np.zeros((len(good), len(prior)))
+    change[good] = solve_normal(gram, (draws.times[good] @ pull + prior * off)[..., None])[..., 0]
+    for done, number in enumerate(np.flatnonzero(good).tolist()):
+        if done % PACE == 0:
+            report(f"replicate {number + 1} of {len(good)}")
+        problem = SumOfSquares(replace(model, weight=model.weight * draws.rows(number)))
+        x = problem.step(found.state, change[number])
+        _, slope, gram = problem.normal(x)
+        x = problem.step(x, solve_normal(gram, slope[:, None])[:, 0])
+        change[number] = between(found.state, x)[model.active]
+    return change, good
+
+
+def solved_again(
+    found: Fit, train: Measurements, options: Options, draws: Draws, report: Report
+) -> tuple[Array, Array]:
+    """Replicates of a minimax, each solved from the fit.  Returns as `stepped`."""
+    qp = partial(solve_qp, name=usable(options.qp)[0], tolerance=QP_TOLERANCE)
+    active = found.estimator.model.active
+    part, _ = normal_parts(found.estimator.model, found.state, draws)
+    good = determined(draws, part, found.estimator.model.prior.weight[active])
+    change = np.zeros((len(good), int(active.sum())))
+    for done, number in enumerate(np.flatnonzero(good).tolist()):
+        if done % PACE == 0:
+            report(f"replicate {number + 1} of {len(good)}")
+        rows = np.repeat(np.arange(len(draws.member)), draws.rows(number))
+        model = found.estimator.at(rows).model
+        distances = measured_distances(train.take(rows), options.distance_tolerance)
+        problem = worst_of(model, found.state, distances, options.distance, "target")
+        best = minimax.solve(problem, found.state, qp, Sqp(hessian=options.hessian))
+        good[number] = best.status is Status.CONVERGED
+        change[number] = between(found.state, best.x)[active]
+    return change, good
+
+
+def normal_parts(model: Model, state: State, draws: Draws) -> tuple[Array, Array]:
+    """What each pose adds to Gram matrix (M, p, p) and slope (M, p) of the free parameters."""
+    count, p = draws.times.shape[1], int(model.active.sum())
+    gram, pull = np.zeros((count, p, p)), np.zeros((count, p))
+    for block in model.blocks(state):
+        error, turned = model.weighted_rows(state, block, model.active)
+        slope = np.moveaxis(turned, (3, 1), (0, 1)).reshape(error.shape[-1], p, -1)
+        own = draws.member[block.rows]
+        np.add.at(gram, own, slope @ np.swapaxes(slope, 1, 2))
+        flat = np.moveaxis(error, 2, 0).reshape(len(slope), -1, 1)
+        np.add.at(pull, own, (slope @ flat)[..., 0])
+    return gram, pull
+
+
+def determined(draws: Draws, gram: Array, prior: Array) -> Array:
+    """(B,) True where a draw tells every direction a share LEAST as well as all poses do."""
+    root = np.linalg.inv(np.linalg.cholesky(gram.sum(axis=0) + np.diag(prior)))
+    alike = root @ gram @ root.T
+    known = root @ np.diag(prior) @ root.T
+    out = np.zeros(len(draws.times), dtype=bool)
+    for first in range(0, len(out), BATCH):
+        part = np.tensordot(draws.times[first : first + BATCH], alike, 1) + known
+        out[first : first + BATCH] = np.linalg.eigvalsh(part)[:, 0] > LEAST
+    return out
+
+
+def between(start: State, end: State) -> Array:
+    """(p,) the step that takes one state to another."""
+    turn = Rotation.from_matrix(start.rotation.T @ end.rotation).as_rotvec()
+    return np.concatenate(
+        [
+            links_of(end.mdh - start.mdh),
+            start.rotation.T @ (end.origin - start.origin),
+            turn,
+            (end.targets - start.targets).reshape(-1),
+            end.effects - start.effects,
+        ]
+    )
+
+
+def unseen(found: Fit, change: Array, draws: Draws, good: Array) -> Array:
+    """(B,) RMS distance of each replicate on the poses that it has not seen, to first order [m]."""
+    model = found.estimator.model
+    error = np.swapaxes(np.nan_to_num(model.error(found.state)), 0, 1)
+    slope = np.swapaxes(model.jacobian(found.state), 0, 1)[..., model.active]
+    out = np.full(len(change), np.nan)
+    for i, number in enumerate(np.flatnonzero(good).tolist()):
+        left = draws.rows(number) == 0
+        seen = model.seen.T[left]
+        if seen.any():
+            square = ((error[left] - slope[left] @ change[i]) ** 2).sum(axis=-1)
+            out[i] = np.sqrt(square[seen].mean())
+    return out

@@ -1,0 +1,419 @@
+"""All values of a robot on held-out and on training poses, before and after: tables and JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.iso9283.formulas import mean_of
+from minimax_cal.judging.iso9283.visits import (
+    MOST,
+    Scatter,
+    Stops,
+    Values,
+    locked,
+    scatter_of,
+    stops_of,
+    values_of,
+    view_of,
+)
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+
+CYCLES = 30  # visits of a pose that the standard asks for (6.9)
+PARTS = {"holdout": "held out", "train": "training"}
+NO_TURNS = "not available: needs three reflectors, not on a line, measured at one pose"
+LOCKED = "a and c left out near gimbal lock, b within 5.7 deg of +-90 deg"
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Held-out or training poses.  names: (P,) of the poses.  values: by the name of the cell.
+
+    locked: number of poses near gimbal lock.
+    """
+
+    names: Array
+    values: Mapping[str, Values]
+    scatter: Scatter
+    locked: int
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why something is not available."""
+        if not any(np.isfinite(values.angle).any() for values in self.values.values()):
+            return {"AO": NO_TURNS}
+        return {"AO_a, AO_c": f"{LOCKED}, at {self.locked} poses"} if self.locked else {}
+
+
+@dataclass(frozen=True, eq=False)
+class Iso9283:
+    """Values by the formulas of ISO 9283 on held-out and on training poses, before and after.
+
+    parts: by the keys of PARTS, those that hold poses.  targets: k names.  tcp: which point.
+    conditions: clause, what the standard asks, what the data tell.
+    """
+
+    robot: str
+    source: str
+    targets: tuple[str, ...]
+    tcp: str
+    parts: Mapping[str, Part]
+    conditions: tuple[tuple[str, str, str], ...]
+    notices: tuple[str, ...] = ()
+
+    def rows(self) -> list[tuple[str, str, Part, Values]]:
+        """Every part with every cell, and their words."""
+        return [
+            (PARTS[key], name, part, values)
+            for key, part in self.parts.items()
+            for name, values in part.values.items()
+        ]
+
+    def position_table(self) -> Table:
+        """AP of the TCP."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, name, part, values in self.rows():
+            size = 1e3 * np.linalg.norm(values.position, axis=1)
+            if np.isfinite(size).any():
+                each = (1e3 * rms(axis) for axis in values.position.T)
+                rows.append((title, name, *summary(size), *each, worst(part.names, size)))
+        return Table(
+            f"{self.robot}: pose accuracy AP of {self.tcp} (7.2), by the formulas of ISO 9283",
+            ("poses", "cell", "count", "AP mean mm", "RMS mm", "max mm",
+             "AP_x RMS mm", "AP_y RMS mm", "AP_z RMS mm", "worst pose"),
+            tuple(rows),
+            ("", "", "d", *[".4f"] * 6, ""),
+        )  # fmt: skip
+
+    def target_table(self) -> Table:
+        """AP of each target; empty where there is only one."""
+        rows: list[tuple[TableCell, ...]] = [
+            (title, name, target, *summary(1e3 * np.linalg.norm(values.targets[:, i], axis=1)))
+            for title, name, _, values in self.rows()
+            for i, target in enumerate(self.targets)
+            if len(self.targets) > 1
+        ]
+        header = ("poses", "cell", "target", "count", "AP mean mm", "RMS mm", "max mm")
+        formats = ("", "", "", "d", *[".4f"] * 3)
+        return Table("pose accuracy AP of each target (7.2)", header, tuple(rows), formats)
+
+    def orientation_table(self) -> Table:
+        """AO and AO'; or why there is none."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, name, part, values in self.rows():
+            if np.isfinite(values.angle).any():
+                each = (1e3 * rms(axis) for axis in values.euler.T)
+                rows.append((title, name, *summary(1e3 * values.angle), *each, part.locked))
+        title = "orientation accuracy (7.2)"
+        if not rows:
+            return Table(title, ("poses", "AO"), (("all", NO_TURNS),))
+        return Table(
+            f"{title}: AO', the angle between attained and commanded; AO_a, AO_b, AO_c, Euler "
+            f"angles about x, y, z ({LOCKED})",
+            ("poses", "cell", "count", "AO' mean mrad", "RMS mrad", "max mrad",
+             "AO_a RMS mrad", "AO_b RMS mrad", "AO_c RMS mrad", "left out"),
+            tuple(rows),
+            ("", "", "d", *[".4f"] * 6, "d"),
+        )  # fmt: skip
+
+    def distance_table(self) -> Table:
+        """AD over pairs of poses, and RD where both were visited again."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, name, part, values in self.rows():
+            kinds = {"all": values.pairs, "consecutive": values.moves, "repeated": values.repeated}
+            for kind, errors in kinds.items():
+                if len(errors):
+                    mean = 1e3 * float(errors.mean())
+                    scatter = part.scatter.distance if kind == "repeated" else np.zeros(0)
+                    most = 1e3 * float(scatter.max()) if len(scatter) else math.nan
+                    rows.append((title, name, kind, *summary(1e3 * np.abs(errors)), mean, most))
+        return Table(
+            "distance accuracy AD and repeatability RD between poses of one part (7.3)",
+            ("poses", "cell", "pairs", "count", "|AD| mean mm", "RMS mm", "max mm",
+             "AD mean mm", "RD max mm"),
+            tuple(rows),
+            ("", "", "", "d", ".4f", ".4f", ".4f", "+.4f", ".4f"),
+        )  # fmt: skip
+
+    def repeat_table(self) -> Table:
+        """RP, vAP and RO of each pose that was visited again; empty without any."""
+        rows: list[tuple[TableCell, ...]] = []
+        for key, part in self.parts.items():
+            s = part.scatter
+            for i in np.flatnonzero(np.isfinite(s.all_ways)):
+                position = (1e3 * float(v[i]) for v in (s.one_way, s.all_ways, s.variation))
+                angles = (1e3 * float(v) for v in (*s.euler[i], s.angle[i]))
+                rows.append((str(part.names[i]), PARTS[key], int(s.stops[i]), int(s.ways[i]),
+                             *position, *angles))  # fmt: skip
+        return Table(
+            f"pose repeatability (7.2) of {self.tcp}: RP of the worst single way of approach, RP "
+            f"over all ways, vAP between ways, RO ({CYCLES} visits each way are due)",
+            ("pose", "poses", "visits", "ways", "RP mm", "RP all mm", "vAP mm",
+             "RO_a mrad", "RO_b mrad", "RO_c mrad", "RO' mrad"),
+            tuple(rows),
+            ("", "", "d", "d", *[".4f"] * 7),
+        )  # fmt: skip
+
+    def pose_table(self) -> Table:
+        """AP and AO of every pose."""
+        rows: list[tuple[TableCell, ...]] = []
+        for title, name, part, values in self.rows():
+            size = np.linalg.norm(values.position, axis=1)
+            columns = np.column_stack([size, values.position, values.angle, values.euler])
+            for i, row in enumerate(1e3 * columns):
+                rows.append((str(part.names[i]), title, name, *map(float, row)))
+        return Table(
+            "every pose",
+            ("pose", "poses", "cell", "AP mm", "AP_x mm", "AP_y mm", "AP_z mm", "AO' mrad",
+             "AO_a mrad", "AO_b mrad", "AO_c mrad"),
+            tuple(rows),
+            ("", "", "", ".4f", *["+.4f"] * 3, ".4f", *["+.4f"] * 3),
+        )  # fmt: skip
+
+    def conditions_table(self) -> Table:
+        """What the standard asks of a test, and what these data tell."""
+        header = ("clause", "ISO 9283 asks", "these data")
+        return Table("why this is no test by ISO 9283", header, self.conditions)
+
+    def tables(self, *, poses: bool = False) -> tuple[Table, ...]:
+        """Every table that holds something.  poses: with a row for each pose."""
+        shown = (
+            self.position_table(),
+            self.target_table(),
+            self.orientation_table(),
+            self.distance_table(),
+            self.repeat_table(),
+            *((self.pose_table(),) if poses else ()),
+            self.conditions_table(),
+        )
+        return tuple(table for table in shown if table.rows)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join(table.text(width) for table in self.tables())
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: mm and mrad, null where not available."""
+        return {
+            "schema": 1,
+            "kind": "iso9283",
+            "robot": self.robot,
+            "data": self.source,
+            "targets": list(self.targets),
+            "tcp": self.tcp,
+            "parts": {key: part_to_dict(part, self.targets) for key, part in self.parts.items()},
+            "conditions": [
+                dict(zip(("clause", "asked", "told"), row, strict=True)) for row in self.conditions
+            ],
+            "notices": list(self.notices),
+        }
+
+
+def part_to_dict(part: Part, targets: Sequence[str]) -> dict[str, Any]:
+    """One part for JSON."""
+    s = part.scatter
+    cells = {
+        name: {
+            "AP_mm": figures(1e3 * np.linalg.norm(v.position, axis=1)),
+            **{f"AP_{x}_mm": figures(1e3 * v.position[:, i]) for i, x in enumerate("xyz")},
+            "AP_target_mm": {
+                target: figures(1e3 * np.linalg.norm(v.targets[:, i], axis=1))
+                for i, target in enumerate(targets)
+            },
+            "AO_angle_mrad": figures(1e3 * v.angle),
+            **{f"AO_{a}_mrad": figures(1e3 * v.euler[:, i]) for i, a in enumerate("abc")},
+            "AD_mm": {
+                "all": figures(1e3 * v.pairs),
+                "consecutive": figures(1e3 * v.moves),
+                "repeated": figures(1e3 * v.repeated),
+            },
+        }
+        for name, v in part.values.items()
+    }
+    each = [
+        {
+            "pose": str(part.names[i]),
+            "visits": int(s.stops[i]),
+            "directions": int(s.ways[i]),
+            "RP_mm": finite(1e3 * s.one_way[i]),
+            "RP_all_mm": finite(1e3 * s.all_ways[i]),
+            "RP_target_mm": {t: finite(1e3 * s.targets[i, j]) for j, t in enumerate(targets)},
+            "vAP_mm": finite(1e3 * s.variation[i]),
+            "RO_mrad": [finite(1e3 * value) for value in s.euler[i]],
+            "RO_angle_mrad": finite(1e3 * s.angle[i]),
+            "cells": {
+                name: {
+                    "AP_mm": [finite(1e3 * value) for value in v.position[i]],
+                    "AO_mrad": [finite(1e3 * value) for value in v.euler[i]],
+                    "AO_angle_mrad": finite(1e3 * v.angle[i]),
+                }
+                for name, v in part.values.items()
+            },
+        }
+        for i in range(len(part.names))
+    ]
+    repeat = {
+        "RP_mm": figures(1e3 * s.one_way),
+        "RP_all_mm": figures(1e3 * s.all_ways),
+        "vAP_mm": figures(1e3 * s.variation),
+        "RO_angle_mrad": figures(1e3 * s.angle),
+        "RD_mm": figures(1e3 * s.distance),
+    }
+    return {"cells": cells, "repeat": repeat, "not_available": part.reasons, "poses": each}
+
+
+def summary(values: Array) -> tuple[int, float, float, float]:
+    """Count, mean, RMS and largest size of some values; NaN without any."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return 0, math.nan, math.nan, math.nan
+    return len(known), float(known.mean()), rms(known), float(np.abs(known).max())
+
+
+def figures(values: Array) -> dict[str, float | None]:
+    """`summary` for JSON."""
+    count, mean, square, most = summary(values)
+    return {"count": count, "mean": finite(mean), "rms": finite(square), "max": finite(most)}
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square, NaN left out; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+
+
+def worst(names: Array, values: Array) -> str:
+    """The name with the largest value."""
+    known = np.isfinite(values)
+    return str(names[known][np.argmax(values[known])]) if known.any() else ""
+
+
+def finite(value: float) -> float | None:
+    """For JSON: null where there is no number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def iso9283(
+    cells: Mapping[str, Cell],
+    data: Measurements,
+    held: Array,
+    tcp: str | Sequence[float] = "centroid",
+) -> Iso9283:
+    """AP, AO, AD, and where poses were visited again RP, vAP, RO, RD.
+
+    cells: who commands, by name; the first is the controller's own arm, usually "before" (nominal)
+    and "after" (calibrated).  held: (m,) True where no fit has seen the pose.  tcp: centroid (of
+    the targets), a target, or a point of the last frame (3,) [m].  Raises CalibrationError.
+    """
+    data = with_history(data)
+    chosen, told = tcp_of(data, tcp)
+    commanded = {name: data.y - np.moveaxis(c.error(data), 0, 1) for name, c in cells.items()}
+    stops = stops_of(data, commanded, np.asarray(held, dtype=bool))
+    parts = {}
+    for key, mask in (("holdout", stops.held), ("train", ~stops.held)):
+        if mask.any():
+            parts[key] = part_of(cells, stops.take(mask), data.targets, chosen)
+    robot = next(iter(cells.values())).robot.name
+    notices = tuple(remarks(data, stops, parts))
+    asked = conditions(data, stops)
+    return Iso9283(robot, data.source, data.targets, told, parts, asked, notices)
+
+
+def tcp_of(data: Measurements, tcp: str | Sequence[float]) -> tuple[int | Array, str]:
+    """The TCP for `view_of`, and in words.  Raises OptionError."""
+    if isinstance(tcp, str):
+        if tcp != "centroid" and tcp not in data.targets:
+            raise OptionError(
+                f"no TCP {tcp!r}; choose centroid, {', '.join(data.targets)}, or X,Y,Z in mm"
+            )
+        if tcp == "centroid":
+            centre = "the targets' centroid" if len(data.targets) > 1 else data.targets[0]
+            return np.zeros(0), centre
+        return data.targets.index(tcp), tcp
+    point = np.asarray(tcp, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise OptionError("the TCP: give three numbers X,Y,Z in the last frame")
+    if len(data.targets) < 3:
+        raise DataError(f"{data.source}: a TCP away from the targets needs three of them")
+    x, y, z = 1e3 * point
+    return point, f"the point {x:g}, {y:g}, {z:g} mm of the flange"
+
+
+def part_of(
+    cells: Mapping[str, Cell], stops: Stops, targets: tuple[str, ...], tcp: int | Array
+) -> Part:
+    """All values of some stops."""
+    names, pose = stops.poses()
+    values, each, middle = {}, {}, {}
+    real = mean_of(stops.attained, pose, len(names))
+    for key, cell in cells.items():
+        spots = cell.spots[[cell.targets.index(target) for target in targets]]
+        told = mean_of(stops.commanded[key], pose, len(names))
+        middle[key] = view_of(cell, real, told, spots, tcp)
+        each[key] = view_of(cell, stops.attained, stops.commanded[key], spots, tcp)
+        values[key] = values_of(middle[key], each[key], stops)
+    first = next(iter(cells))
+    near = int(locked(middle[first]).sum())
+    return Part(names, values, scatter_of(each[first], stops), near)
+
+
+def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list[str]:
+    """What the reader should know."""
+    out = []
+    merged = data.poses - len(stops.pose)
+    if merged:
+        out.append(
+            f"{data.source}: {merged} rows repeat the joints of the row before and count as one "
+            "stop with it; label them in a column pose if the arm had moved away between"
+        )
+    for key, part in parts.items():
+        if len(part.names) > MOST:
+            out.append(f"AD of the {PARTS[key]} poses: pairs of {MOST} of {len(part.names)}")
+        if not np.isfinite(part.values[next(iter(part.values))].position).any():
+            out.append(
+                f"the TCP was measured at none of the {PARTS[key]} poses: choose one target for it "
+                f"(--tcp {data.targets[0]})"
+            )
+    return out
+
+
+def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], ...]:
+    """Conditions of a test by the standard that matter here, and what the data tell of each."""
+    often = np.unique(stops.pose, return_counts=True)[1]
+    enough, poses = int((often >= CYCLES).sum()), len(often)
+
+    def told(stem: str, scale: float, unit: str) -> str:
+        column = data.columns.get(stem, np.zeros(0)).astype(float)
+        known = scale * column[np.isfinite(column)]
+        if not len(known):
+            return "not told"
+        return f"{stem} {between(known)} {unit}"
+
+    cycles = f"{between(often)} visits; {CYCLES} or more at {enough} of {poses} poses"
+    return (
+        ("6.3", "stated ambient temperature, 20 C for choice", told("temperature", 1.0, "C")),
+        ("6.4", "base frame found on the robot, apart from the test",
+         "best fit to the training poses: AP is smaller than with a measured base"),
+        ("6.5", "uncertainty of the instrument at most a quarter of a value",
+         told("u95", 1e3, "mm")),
+        ("6.6", "rated load on the flange", told("payload", 1.0, "kg")),
+        ("6.7", "stated velocities, up to the rated one", "not told"),
+        ("6.8", "five poses on a plane in a cube of the workspace", f"{poses} poses, anywhere"),
+        ("6.9", f"{CYCLES} cycles", cycles),
+    )  # fmt: skip
+
+
+def between(values: Array) -> str:
+    """As 20 to 22, or 20."""
+    low, high = f"{values.min():g}", f"{values.max():g}"
+    return low if low == high else f"{low} to {high}"

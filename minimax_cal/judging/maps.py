@@ -1,0 +1,368 @@
+"""Maps of the workspace: where a fit is sure, where the arm was seen to miss, how far data reach.
+
+Two sections in the base frame: a half-plane through the axis of joint 1 (distance from it, height),
+into which all poses are turned, and a horizontal slab.  Joints are sampled within their limits;
+collisions and the floor are not known.  Numbers only: `map_picture` draws them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import binned_statistic_2d, binom
+
+from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius, position_factor
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.saved import AFTER, Saved
+from minimax_cal.measuring.pose_rows import plain
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots.robot import Robot
+
+Predict = Callable[[Array], Array]  # joints (m, n) [rad, m] -> radius that holds 95 % (m,) [m]
+CHUNK = 2048  # samples that are predicted at once
+WIDER = 0.25  # share of the poses' range added at either end where a limit is not known
+NEAR = 0.95  # share of the training poses that count as near another one
+LITTLE = 0.5  # a joint that moved over less of its range is worth a notice
+LEVEL, DOUBT = 0.95, 0.01  # share that the radius holds; chance of as few, below which it is told
+SLIDE = 0.5  # of a slide without limits and without poses [m]
+
+
+def unknown(q: Array) -> Array:
+    """The prediction of a fit that does not tell its covariance: (m,) NaN."""
+    return np.full(len(q), np.nan)
+
+
+def predictor(cell: Cell, known: Uncertainty, frame: str = "measurement") -> Predict:
+    """What a fit's covariance predicts for the targets' centroid.  frame: see `uncertainty`.
+
+    Without the joints' own scatter (repeatability), and true only as far as the model is: what the
+    model leaves out is not in it.  Raises OptionError for a frame that does not exist.
+    """
+    if frame not in FRAMES:
+        raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
+
+    def radius(q: Array) -> Array:
+        factor = position_factor(cell, known, q, frame).mean(axis=1)
+        return holding_radius(factor @ np.swapaxes(factor, -1, -2), LEVEL)
+
+    return radius
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What is mapped.  samples: of the joints.  bins: along the wider side of a section.
+
+    height, slab: middle and thickness of the horizontal section in the base frame, NaN for the
+    median height of the samples and a fifth of the arm's reach [m].
+    """
+
+    samples: int = 100_000
+    bins: int = 40
+    height: float = np.nan
+    slab: float = np.nan
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """Predictions binned over a section.
+
+    axes: labels of its coordinates.  x, y: (a + 1,), (b + 1,) edges of the bins [m].
+    count: (a, b) samples.  median, worst: (a, b) radius that holds 95 % [m].  reached: (a, b) share
+    of the samples among the training poses.  The last three are NaN in an empty bin.
+    """
+
+    name: str
+    axes: tuple[str, str]
+    x: Array
+    y: Array
+    count: Array
+    median: Array
+    worst: Array
+    reached: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: mm, null in an empty bin; rows along the first coordinate."""
+        return {
+            "name": self.name,
+            "axes": list(self.axes),
+            "edges_mm": [(1e3 * self.x).tolist(), (1e3 * self.y).tolist()],
+            "samples": self.count.astype(int).tolist(),
+            "radius95_median_mm": plain(1e3 * self.median),
+            "radius95_worst_mm": plain(1e3 * self.worst),
+            "reached": plain(self.reached),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Observed errors of the targets' centroid.
+
+    place: (m, 3) in the base frame [m].  error: (m,) by the name of the cell, NaN where no target
+    was measured [m].  held: (m,) True where the fit has not seen the pose.
+    """
+
+    place: Array
+    error: dict[str, Array]
+    held: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, mm."""
+        return {
+            "place_mm": plain(1e3 * self.place),
+            "held_out": self.held.tolist(),
+            **{f"{name}_mm": plain(1e3 * error) for name, error in self.error.items()},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Joints at random, and the training poses.  place: (N, 3) in the base frame [m].
+
+    radius: (N,) that holds 95 % [m].  reached: (N,) True among the training poses.
+    """
+
+    place: Array
+    radius: Array
+    reached: Array
+
+
+@dataclass(frozen=True, eq=False)
+class WorkspaceMap:
+    """Sections through the workspace, and what was observed.  height, slab: see `Grid`.
+
+    inside: how many held-out poses lie within the radius predicted for them, and of how many.
+    """
+
+    robot: str
+    sections: tuple[Section, ...]
+    sampled: Sampled
+    seen: Seen
+    height: float
+    slab: float
+    inside: tuple[int, int]
+    notices: tuple[str, ...]
+
+    @property
+    def predicted(self) -> bool:
+        """Whether the fit told its covariance."""
+        return bool(np.isfinite(self.sampled.radius).any())
+
+    def table(self) -> Table:
+        """Predicted radius where the data reach and beyond; observed errors."""
+        rows: list[tuple[TableCell, ...]] = []
+        reached = self.sampled.reached
+        for title, mask in (("where the data reach", reached), ("beyond", ~reached)):
+            share = 100.0 * float(mask.mean())
+            what = f"predicted, {title} ({share:.0f} % of the samples)"
+            rows.append((what, int(mask.sum()), *spread(self.sampled.radius[mask])))
+        for title, mask in (("held-out", self.seen.held), ("training", ~self.seen.held)):
+            for name, error in self.seen.error.items():
+                what = f"observed {name}, {title} poses"
+                rows.append((what, int(mask.sum()), *spread(error[mask])))
+        return Table(
+            f"{self.robot}: position over the workspace; predicted: radius that holds 95 %, by the "
+            "fit's covariance; observed: error of the targets' centroid",
+            ("what", "count", "median mm", "95 % mm", "worst mm"),
+            tuple(row for row in rows if row[1]),
+            ("", "d", ".4f", ".4f", ".4f"),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        table = self.table()
+        return {
+            "schema": 1,
+            "kind": "map",
+            "robot": self.robot,
+            "height_mm": 1e3 * self.height,
+            "slab_mm": 1e3 * self.slab,
+            "summary": [
+                dict(zip(("what", "count", "median_mm", "q95_mm", "worst_mm"),
+                         [plain(np.array(v)) if isinstance(v, float) else v for v in row],
+                         strict=True))
+                for row in table.rows
+            ],
+            "held_out_inside": dict(zip(("count", "of"), self.inside, strict=True)),
+            "sections": [section.to_dict() for section in self.sections],
+            "observed": self.seen.to_dict(),
+            "notices": list(self.notices),
+        }  # fmt: skip
+
+
+def spread(values: Array) -> tuple[float, float, float]:
+    """Median, 95 % quantile and largest [mm]; NaN without any."""
+    known = 1e3 * values[np.isfinite(values)]
+    if not len(known):
+        return np.nan, np.nan, np.nan
+    return float(np.median(known)), float(np.quantile(known, 0.95)), float(known.max())
+
+
+def joint_range(robot: Robot, q: Array) -> tuple[Array, Array]:
+    """(n,) lowest and highest joint values to sample: the limits, at most one turn [rad, m].
+
+    q: (m, n) poses that say what to sample where a limit is not known; m may be 0.
+    """
+    most = np.where(robot.prismatic, SLIDE, np.pi)
+    low, high = -most, most
+    if len(q):
+        low, high = q.min(axis=0), q.max(axis=0)
+        more = WIDER * (high - low)
+        turn = np.where(robot.prismatic, np.inf, np.pi)
+        low = np.minimum(low, np.maximum(low - more, -turn))
+        high = np.maximum(high, np.minimum(high + more, turn))
+    lower = np.where(np.isfinite(robot.lower), robot.lower, low)
+    upper = np.where(np.isfinite(robot.upper), robot.upper, high)
+    bound = np.where(robot.prismatic, np.inf, np.pi)
+    outside = (lower > bound) | (upper < -bound)  # a range beyond a turn stays as it is
+    return (
+        np.where(outside, lower, np.maximum(lower, -bound)),
+        np.where(outside, upper, np.minimum(upper, bound)),
+    )
+
+
+def tcp_place(cell: Cell, q: Array) -> Array:
+    """The targets' centroid in the base frame, effects left out: (m, 3) [m].  q: (m, n)."""
+    pose = cell.robot.pose(q)
+    return np.asarray(pose[:, :3, :3] @ cell.spots.mean(axis=0) + pose[:, :3, 3])
+
+
+def reached_by(train: Array, q: Array) -> Array:
+    """(m,) True where a pose lies among the training poses: interpolation, not extrapolation.
+
+    Every joint is within its range in the training poses, and the nearest of them is no farther
+    than 95 % of them are from their own nearest; joints in units of their ranges.
+    train: (M, n) [rad, m].  q: (m, n).
+    """
+    poses = np.unique(np.round(train, 9), axis=0)
+    if len(poses) < 3:
+        return np.zeros(len(q), dtype=bool)
+    low, high = poses.min(axis=0), poses.max(axis=0)
+    size = np.where(high > low, high - low, 1.0)
+    tree = cKDTree(poses / size)
+    own = np.asarray(tree.query(poses / size, k=2)[0])
+    inside = np.all((q >= low - 1e-9) & (q <= high + 1e-9), axis=1)
+    away = np.asarray(tree.query(q / size)[0])
+    return np.asarray(inside & (away <= np.quantile(own[:, 1], NEAR)))
+
+
+def sample(cell: Cell, predict: Predict, train: Array, grid: Grid) -> Sampled:
+    """Joints at random over their range, and the training poses; what is predicted there."""
+    low, high = joint_range(cell.robot, train)
+    rng = np.random.default_rng(grid.seed)
+    q = np.concatenate([train, rng.uniform(low, high, (grid.samples, cell.robot.joints))])
+    parts = np.array_split(q, max(1, len(q) // CHUNK))
+    radius = np.concatenate([predict(part) for part in parts])
+    return Sampled(tcp_place(cell, q), radius, reached_by(train, q))
+
+
+def section(
+    name: str, axes: tuple[str, str], at: tuple[Array, Array], some: Sampled, size: float
+) -> Section:
+    """Samples binned into squares.  at: (N,) coordinates of each [m].  size: of a bin [m]."""
+    edges = [
+        size * np.arange(np.floor(part.min() / size), np.ceil(part.max() / size) + 1.5)
+        for part in at
+    ]
+
+    def binned(values: Array, statistic: Literal["count", "mean", "median", "max"]) -> Array:
+        found = binned_statistic_2d(at[0], at[1], values, statistic=statistic, bins=edges)
+        return np.asarray(found.statistic, dtype=float)
+
+    count = binned(some.radius, "count")
+    reached = binned(some.reached.astype(float), "mean")
+    median = worst = np.full_like(count, np.nan)
+    if np.isfinite(some.radius).all():
+        median, worst = binned(some.radius, "median"), binned(some.radius, "max")
+    return Section(name, axes, edges[0], edges[1], count, median, worst, reached)
+
+
+def workspace_map(saved: Saved, predict: Predict = unknown, grid: Grid = Grid()) -> WorkspaceMap:
+    """Sections through the workspace of a saved calibration.
+
+    predict: radius that holds 95 % of the position of the targets' centroid, at given joints.
+    Raises OptionError.
+    """
+    check_grid(grid)
+    cell, data, held = saved.cells[AFTER], saved.data, saved.held
+    train = data.q[~held]
+    some = sample(cell, predict, train if len(train) else data.q, grid)
+    height = grid.height if np.isfinite(grid.height) else float(np.median(some.place[:, 2]))
+    slab = grid.slab if np.isfinite(grid.slab) else 0.2 * cell.robot.reach()
+    x, y, z = some.place.T
+    flat = np.abs(z - height) <= 0.5 * slab
+    if not flat.any():
+        raise OptionError(
+            f"height {1e3 * height:g} mm: the arm does not come there; it reaches "
+            f"{1e3 * z.min():.0f} to {1e3 * z.max():.0f} mm"
+        )
+    size = float(max(2.0 * np.hypot(x, y).max(), np.ptp(z))) / grid.bins
+    sections = (
+        section("vertical", ("distance from axis 1 (m)", "height (m)"), (np.hypot(x, y), z), some,
+                size),
+        section("horizontal", ("x (m)", "y (m)"), (x[flat], y[flat]), taken(some, flat), size),
+    )  # fmt: skip
+    errors = {}
+    for name, one in saved.cells.items():
+        there = data.seen.T[..., None]
+        total = np.where(there, one.error(data), 0.0).sum(axis=0)
+        errors[name] = np.linalg.norm(total, axis=-1) / there.sum(axis=(0, 2))
+    seen = Seen(tcp_place(cell, data.q), errors, held)
+    radius, error = predict(data.q[held]), errors[AFTER][held]
+    known = np.isfinite(radius) & np.isfinite(error)
+    inside = int((error[known] <= radius[known]).sum()), int(known.sum())
+    notices = tuple(remarks(cell.robot, train, inside))
+    return WorkspaceMap(cell.robot.name, sections, some, seen, height, slab, inside, notices)
+
+
+def taken(some: Sampled, mask: Array) -> Sampled:
+    """Some of the samples."""
+    return Sampled(some.place[mask], some.radius[mask], some.reached[mask])
+
+
+def check_grid(grid: Grid) -> None:
+    """Raise OptionError for a grid that makes no sense."""
+    for name, value, least, most in (
+        ("samples", grid.samples, 100, 10_000_000),
+        ("bins", grid.bins, 2, 400),
+    ):
+        if not least <= value <= most:
+            raise OptionError(f"{name} {value}: give {least} to {most}")
+    if grid.seed < 0:
+        raise OptionError(f"seed {grid.seed}: give a whole number, 0 or more")
+    if grid.slab <= 0.0 or np.isinf(grid.slab) or np.isinf(grid.height):
+        raise OptionError("height and slab of the section: give finite numbers, slab over 0")
+
+
+def remarks(robot: Robot, train: Array, inside: tuple[int, int]) -> list[str]:
+    """Notices about what was sampled, and about a prediction that the held-out poses belie."""
+    out = []
+    count, of = inside
+    if binom.cdf(count, of, LEVEL) < DOUBT:
+        out.append(
+            f"the predicted radius holds {count} of {of} held-out poses, not {100 * LEVEL:.0f} %: "
+            "what the model leaves out is not in the prediction"
+        )
+    free = ~(np.isfinite(robot.lower) & np.isfinite(robot.upper))
+    names = ", ".join(f"J{i + 1}" for i in np.flatnonzero(free))
+    if free.any():
+        out.append(
+            f"{robot.name}: no limits of {names}: sampled over the range of the poses and a "
+            "quarter more at either end"
+        )
+    if len(train):
+        low, high = joint_range(robot, train)
+        share = np.ptp(train, axis=0) / np.maximum(high - low, 1e-12)
+        out += [
+            f"J{i + 1} moved over {100.0 * share[i]:.0f} % of its range in the training poses: "
+            "what lies beyond is extrapolation"
+            for i in np.flatnonzero(share < LITTLE)
+        ]
+    return out

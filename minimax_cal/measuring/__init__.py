@@ -1,0 +1,1 @@
+"""Measurements: reading, checking, faults, accuracy."""

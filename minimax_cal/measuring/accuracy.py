@@ -1,0 +1,72 @@
+"""Accuracy of positions: functions of error arrays, nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Distances between measured and predicted points, over all measured points.
+
+    sse_mm2, counts: per target, the sum of squares F_i and at how many poses it was measured.
+    worst: (pose, target) of the largest distance, (-1, -1) without points.
+    """
+
+    rms_mm: float
+    max_mm: float
+    mean_mm: float
+    poses: int
+    sse_mm2: tuple[float, ...]
+    counts: tuple[int, ...]
+    worst: tuple[int, int] = (-1, -1)
+
+    def table(self, title: str, targets: tuple[str, ...]) -> Table:
+        """As a table, a row a target and one for all."""
+        rows: list[tuple[Cell, ...]] = [
+            (name, count, math.sqrt(sse / count) if count else math.nan, math.nan, math.nan, sse)
+            for name, count, sse in zip(targets, self.counts, self.sse_mm2, strict=True)
+        ]
+        total = (sum(self.counts), self.rms_mm, self.mean_mm, self.max_mm, sum(self.sse_mm2))
+        return Table(
+            title,
+            ("target", "points", "RMS mm", "mean mm", "max mm", "sum mm^2"),
+            (*rows, ("all", *total)),
+            ("", "d", ".4f", ".4f", ".4f", ".4f"),
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON: NaN, which JSON does not know, is null."""
+        numbers = {"rms_mm": self.rms_mm, "max_mm": self.max_mm, "mean_mm": self.mean_mm}
+        return {key: None if math.isnan(value) else value for key, value in numbers.items()} | {
+            "poses": self.poses,
+            "sse_mm2": list(self.sse_mm2),
+            "points": list(self.counts),
+        }
+
+
+def accuracy(error: Array) -> Accuracy:
+    """Summary of point errors (k, m, 3), NaN where not measured [m]; NaN without any point."""
+    distance = 1e3 * np.linalg.norm(error, axis=-1)
+    seen = np.isfinite(distance)
+    sse = tuple(float(np.nansum(row**2)) for row in distance)
+    counts = tuple(int(row.sum()) for row in seen)
+    if not seen.any():
+        return Accuracy(math.nan, math.nan, math.nan, 0, sse, counts)
+    target, pose = np.unravel_index(int(np.nanargmax(distance)), distance.shape)
+    found = distance[seen]
+    return Accuracy(
+        rms_mm=float(np.sqrt(np.mean(found**2))),
+        max_mm=float(found.max()),
+        mean_mm=float(found.mean()),
+        poses=int(seen.any(axis=0).sum()),
+        sse_mm2=sse,
+        counts=counts,
+        worst=(int(pose), int(target)),
+    )

@@ -1,0 +1,193 @@
+"""Slips that no fit should be asked to explain: units, signs, swapped reflectors, too few poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations, permutations, product
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.robot import Robot
+
+STANDS_OUT = 8.0  # times the typical error, and 4 times what 95 % keep to: worth a look
+TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
+
+
+def check_joints(robot: Robot, data: Measurements) -> None:
+    """Raise DataError if the joint columns cannot belong to the robot."""
+    n = data.q.shape[1]
+    if n != robot.joints:
+        raise DataError(
+            f"{data.source}: has {n} joint columns, but {robot.name} has {robot.joints} joints"
+        )
+    for i in np.flatnonzero(data.sliding != robot.prismatic):
+        unit, mend = ("rad", "mm") if robot.prismatic[i] else ("mm", "rad")
+        kind = "slides" if robot.prismatic[i] else "turns"
+        raise DataError(
+            f"{data.source}: joint {i + 1} of {robot.name} {kind}; name its column "
+            f"q{i + 1}_{mend}, not q{i + 1}_{unit}"
+        )
+    limit = np.where(robot.prismatic, np.inf, np.maximum(TURNS, 2.0 * span(robot)))
+    beyond = np.abs(data.q) > limit
+    if beyond.any():
+        row, joint = np.argwhere(beyond)[0]
+        raise DataError(
+            f"{data.source}:{data.line[row]}: joint {joint + 1} at {data.q[row, joint]:.1f} rad is "
+            f"more than two turns; degrees? then name the columns q1_deg, q2_deg, ..."
+        )
+
+
+def span(robot: Robot) -> Array:
+    """(n,) the larger of the two joint limits, 0 where unknown."""
+    limits = np.maximum(np.abs(robot.lower), np.abs(robot.upper))
+    return np.where(np.isfinite(limits), limits, 0.0)
+
+
+def check_count(data: Measurements, poses: int, unknowns: int, known: int) -> None:
+    """Raise DataError if the poses cannot determine the unknowns.
+
+    poses: number of different ones.  unknowns: free parameters.  known: priors on them.
+    """
+    if poses == 1 and data.poses > 1:
+        raise DataError(f"{data.source}: all {data.poses} rows have the same joint values")
+    a_pose = min(3.0 * data.seen.sum() / data.poses, 6.0)  # a rigid flange has six freedoms
+    needed = int(np.ceil((unknowns - known) / a_pose)) + 1
+    if poses < needed:
+        raise DataError(
+            f"{data.source}: {poses} different poses for the fit, but {unknowns} unknown "
+            f"parameters need at least {needed}; measure more poses, hold out fewer, fix "
+            "parameters (--fix) or give priors (--prior)"
+        )
+
+
+def limit_notices(robot: Robot, data: Measurements) -> list[str]:
+    """Notices about joint values outside the robot's limits (1 % of slack)."""
+    slack = 0.01 * (robot.upper - robot.lower)
+    slack = np.where(np.isfinite(slack), slack, 0.0)
+    outside = (data.q < robot.lower - slack) | (data.q > robot.upper + slack)
+    return [
+        f"{data.source}: joint {i + 1} is outside the limits of {robot.name} at "
+        f"{int(outside[:, i].sum())} poses"
+        for i in np.flatnonzero(outside.any(axis=0))
+    ]
+
+
+def suspicions(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Slips worth testing when nothing fits: what to say, and the data with the slip mended."""
+    turning = ~robot.prismatic
+    factor = np.pi / 180.0
+    yield (
+        "the joint values look like degrees; name the columns q1_deg, q2_deg, ...",
+        replace(data, q=np.where(turning, data.q * factor, data.q)),
+    )
+    yield (
+        "the joint values look like radians; name the columns q1_rad, q2_rad, ...",
+        replace(data, q=np.where(turning, data.q / factor, data.q)),
+    )
+    yield (
+        "the points look like millimetres given as metres: name the columns smr1_x_mm, ... (or the "
+        "robot file gives metres under the unit mm)",
+        data.with_y(data.y * 1e-3),
+    )
+    yield (
+        "the points look like metres given as millimetres: name the columns smr1_x_m, ... (or the "
+        "robot file gives millimetres under the unit m)",
+        data.with_y(data.y * 1e3),
+    )
+    for i, j in ((2, 1), (1, 2)):
+        for sign in (1.0, -1.0):
+            if robot.joints > 2 and turning[i] and turning[j]:
+                q = data.q.copy()
+                q[:, i] += sign * q[:, j]
+                word = "+" if sign > 0 else "-"
+                yield (
+                    f"joints {i + 1} and {j + 1} look coupled (a linked arm); "
+                    f"give q{i + 1} {word} q{j + 1} as joint {i + 1}",
+                    replace(data, q=q),
+                )
+    for count in range(1, min(robot.joints, 6) + 1):
+        for flipped in combinations(range(robot.joints), count):
+            q = data.q.copy()
+            q[:, flipped] *= -1.0
+            names = ", ".join(f"{i + 1}" for i in flipped)
+            yield (
+                f"the sign of joint {names} looks reversed; set its sign in the robot file",
+                replace(data, q=q),
+            )
+
+
+def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
+    """Under which names the targets of each row fit best.
+
+    error_of: (k, k, m) distance from measured target i to predicted target j at each pose, NaN
+    where i was not measured [m].  Returns the order (m, k) of the targets, its sum of squares and
+    that of the names as given, (m,) each [m^2].
+    """
+    k = len(error_of)
+    squared = error_of**2
+    orders = list(permutations(range(k))) if k <= 4 else transpositions(k)
+    cost = np.stack([np.nansum(squared[range(k), order, :], axis=0) for order in orders])
+    best = cost.argmin(axis=0)
+    return np.array(orders)[best], cost.min(axis=0), cost[0]
+
+
+def swapped(error_of: Array) -> Array:
+    """Rows whose targets fit far better under other names.  error_of: as `best_orders`."""
+    _, least, own = best_orders(error_of)
+    usual = float(np.median(least))
+    return np.flatnonzero((least < 0.1 * own) & (own > 25.0 * usual))
+
+
+def outliers(data: Measurements, distance: Array) -> list[str]:
+    """Points that miss by far more than the others.  distance: (k, m), NaN where not measured."""
+    usual = float(np.nanmedian(distance))
+    with np.errstate(invalid="ignore"):
+        far = distance > max(STANDS_OUT * usual, 4.0 * np.nanquantile(distance, 0.95), 1e-6)
+    found = np.argwhere(far)
+    if not len(found):
+        return []
+    worst = sorted(found, key=lambda at: -distance[tuple(at)])[:5]
+    named = ", ".join(
+        f"line {data.line[pose]} {data.targets[target]} {1e3 * distance[target, pose]:.3g} mm"
+        for target, pose in worst
+    )
+    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+    return [
+        f"{data.source}: points that stand out (typical error {1e3 * usual:.3g} mm): {named}{more}"
+    ]
+
+
+def check_spread(data: Measurements) -> None:
+    """Raise DataError if one target's points spread a hundred times more than another's."""
+    spread = np.array([np.nanstd(data.y[:, i], axis=0).max() for i in range(len(data.targets))])
+    if spread.max() > 100.0 * spread.min() and np.all(data.seen.sum(axis=0) > 5):
+        big, small = (data.targets[i] for i in (int(spread.argmax()), int(spread.argmin())))
+        raise DataError(
+            f"{data.source}: the points of {big} spread over {spread.max():.3g} m, those of "
+            f"{small} over {spread.min():.3g} m; one of them has the wrong unit"
+        )
+
+
+def transpositions(k: int) -> list[tuple[int, ...]]:
+    """The identity and all exchanges of two of k targets."""
+    out = [tuple(range(k))]
+    for a, b in product(range(k), range(k)):
+        if a < b:
+            order = list(range(k))
+            order[a], order[b] = b, a
+            out.append(tuple(order))
+    return out
+
+
+def collinear(data: Measurements) -> bool:
+    """Whether three or more targets lie on a line, as their measured distances say."""
+    whole = data.y[data.seen.all(axis=1)]
+    if whole.shape[1] < 3 or not len(whole):
+        return False
+    spread = whole - whole.mean(axis=1, keepdims=True)
+    singular = np.linalg.svd(spread, compute_uv=False)
+    return bool(np.median(singular[:, 1] / singular[:, 0]) < 0.02)

@@ -1,0 +1,177 @@
+"""CSV files with the unit in every column's name: rows, names, numbers."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import hashlib
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import read_text
+
+UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
+JOINT = re.compile(r"q(\d+)_(rad|deg|mm|m)")
+TARGET = re.compile(r"smr(\d+)_([xyz])_(mm|m)")
+# Optional columns that some part of the project understands: pattern, factor to SI by unit.
+OPTIONAL = {
+    name: re.compile(pattern)
+    for name, pattern in {
+        "order": r"order",
+        "time": r"time_(s)",
+        "temperature": r"temperature_(C)",
+        "payload": r"payload_(kg)",
+        "tau": r"tau\d+_(Nm)",
+        "approach": r"approach\d+",
+        "session": r"session",
+        "u95": r"u95_(mm|m)",
+        "pose": r"pose",
+        "split": r"split",
+        "qread": r"qread\d+_(rad|deg|mm|m)",
+        "base": r"base\d+_[xyz]_(mm|m)",
+    }.items()
+}
+TEXT = {"session", "pose", "split"}  # labels, compared but never computed with
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A CSV file as text: header, rows, and the line on which each row ends.
+
+    digest: SHA-256 of the file.
+    """
+
+    path: Path | str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    line: Array
+    digest: str
+
+    def text(self, name: str) -> list[str]:
+        """The cells of a column."""
+        at = self.header.index(name)
+        return [row[at] for row in self.rows]
+
+    def number(self, name: str, *, unit: str = "", empty: bool = False) -> Array:
+        """A column as floats, in SI.  empty: whether empty cells, NaN, are allowed."""
+        return numbers(self.path, name, self.text(name), self.line, empty=empty) * UNITS.get(
+            unit, 1.0
+        )
+
+    def joints(self) -> tuple[Array, Array]:
+        """Joint values (m, n) [rad, m], and (n,) True where a column has a unit of length."""
+        found = sorted(
+            (int(m[1]), m[2], name) for name in self.header if (m := JOINT.fullmatch(name))
+        )
+        q = np.stack([self.number(name, unit=unit) for _, unit, name in found], axis=1)
+        return q, np.array([unit in ("m", "mm") for _, unit, _ in found])
+
+
+def read_rows(path: Path | str) -> Rows:
+    """Read a CSV file.  Raises DataError where it is none."""
+    text = read_text(path, kind=DataError)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    if "\0" in text:
+        raise DataError(f"{path}: is not a text file; expected CSV")
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise DataError(f"{path}:{reader.line_num}: is not CSV ({error})") from error
+    rows = [(number, row) for number, row in lines if any(row)]
+    if not rows:
+        raise DataError(f"{path}: is empty")
+    (_, header), *body = rows
+    while header and not header[-1]:  # a trailing comma
+        header.pop()
+    return Rows(
+        path,
+        tuple(header),
+        tuple(tuple(row) for _, row in body),
+        np.array([number for number, _ in body], dtype=int),
+        digest,
+    )
+
+
+def whole_rows(file: Rows) -> Rows:
+    """The file with every row as long as its header.  Raises DataError; also without any row."""
+    if not file.rows:
+        raise DataError(f"{file.path}: holds a header but no rows")
+    length = len(file.header)
+    for at, row in zip(file.line, file.rows, strict=True):
+        if len(row) < length or any(row[length:]):
+            raise DataError(f"{file.path}:{at}: {len(row)} cells, but the header has {length}")
+    return replace(file, rows=tuple(row[:length] for row in file.rows))
+
+
+def header_check(path: Path | str, header: Sequence[str]) -> None:
+    """Raise DataError for a header that cannot be understood."""
+    joints = [m for name in header if (m := JOINT.fullmatch(name))]
+    targets = [m for name in header if (m := TARGET.fullmatch(name))]
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise DataError(f"{path}:1: column {twice[0] or '(without a name)'} stands twice")
+    if not joints:
+        hint = "; is it separated by ';'? save it with commas" if ";" in header[0] else ""
+        raise DataError(
+            f"{path}:1: no joint columns; name them q1_rad (or q1_deg, q1_mm), q2_rad, ...{hint}"
+        )
+    numbers_found = sorted(int(m[1]) for m in joints)
+    missing = sorted(set(range(1, numbers_found[-1] + 1)) - set(numbers_found))
+    if missing:
+        raise DataError(f"{path}:1: column q{missing[0]}_{joints[0][2]} is missing")
+    if len(set(numbers_found)) < len(numbers_found):
+        raise DataError(f"{path}:1: a joint has two columns; keep one unit for each joint")
+    if {"rad", "deg"} <= {m[2] for m in joints}:
+        raise DataError(f"{path}:1: joint columns mix _rad and _deg; use one of them")
+    if not targets:
+        raise DataError(f"{path}:1: no target columns; name them smr1_x_mm, smr1_y_mm, smr1_z_mm")
+    for number in sorted({int(m[1]) for m in targets}):
+        axes = [m[2] for m in targets if int(m[1]) == number]
+        unit = next(m[3] for m in targets if int(m[1]) == number)
+        for axis in "xyz":
+            if axes.count(axis) != 1:
+                fault = "is missing" if axis not in axes else "is given in two units"
+                raise DataError(f"{path}:1: column smr{number}_{axis}_{unit} {fault}")
+
+
+def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:
+    """One column as floats; an empty cell is NaN where that is allowed.  Raises DataError."""
+    out = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        if not cell and empty:
+            continue
+        try:
+            out[i] = float(cell if "_" not in cell else "no number")
+        except ValueError:
+            what = f"{cell!r} is not a number" if cell else "is empty"
+            comma = "; use a decimal point" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
+            raise DataError(f"{path}:{line[i]}: column {name}: {what}{comma}") from None
+        if not np.isfinite(out[i]):
+            mend = "; leave the cell empty where it was not measured" if empty else ""
+            raise DataError(f"{path}:{line[i]}: column {name}: {cell} is not a finite number{mend}")
+    return out
+
+
+def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
+    """Which optional column a name is, or ''."""
+    for kind, pattern in OPTIONAL.items():
+        if match := pattern.fullmatch(name):
+            return kind, match
+    return "", None
+
+
+def near(name: str) -> str:
+    """A hint when a column's name is close to one that would be used."""
+    known = ["order", "time_s", "temperature_C", "payload_kg", "session", "u95_mm", "pose", "split"]
+    known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
+    known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
+    match = difflib.get_close_matches(name, known, 1, cutoff=0.75)
+    return f" (did you mean {match[0]}?)" if match else ""

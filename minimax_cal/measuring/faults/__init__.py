@@ -1,0 +1,31 @@
+"""Faults of the data, found before any effect is fitted: points, rows, nests, sessions, joints.
+
+Distances between targets tell without any model: a point that moved, rows with exchanged names, a
+nest that shifted.  What lies across the plane of the targets they cannot show; there, and with one
+or two targets, the residual of a fit must stand out grossly.
+"""
+
+from minimax_cal.measuring.faults.declared import noise
+from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.faults.find import find_faults, mended
+from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
+from minimax_cal.measuring.faults.nests import target_shifts
+from minimax_cal.measuring.faults.outliers import outlying
+from minimax_cal.measuring.faults.sessions import mixed_units, session_jumps
+from minimax_cal.measuring.faults.swaps import swapped_rows
+
+__all__ = [
+    "Amount",
+    "Fault",
+    "find_faults",
+    "looks_read_back",
+    "mended",
+    "mixed_units",
+    "noise",
+    "outlying",
+    "read_back",
+    "session_jumps",
+    "swapped_rows",
+    "target_shifts",
+    "unsettled",
+]

@@ -1,0 +1,52 @@
+"""Whether the noise is what the data declare."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults.distances import FEWEST, between
+from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.measurements import Measurements, groups
+
+
+def noise(data: Measurements) -> tuple[Fault, ...]:
+    """A notice if the scatter of the distances, or of revisits, is not what `u95` says.
+
+    Revisits hold the robot's own repeatability too: they can only show less than declared.
+    """
+    if "u95" not in data.columns or not np.isfinite(data.columns["u95"].astype(float)).any():
+        return ()
+    declared = float(np.nanmedian(data.columns["u95"].astype(float)))
+    apart = between(data)
+    if len(apart.pairs):
+        seen, by = 1.96 * float(np.median(apart.sigma)) / np.sqrt(2.0), "the targets' distances"
+    else:
+        spread = revisit_scatter(data)
+        if len(spread) < FEWEST:
+            return ()
+        seen, by = 1.96 * float(np.sqrt(np.median(spread) / stats.chi2.median(1))), "revisits"
+    ratio = seen / declared
+    if ratio > 0.5 and (ratio < 2.0 or by == "revisits"):
+        return ()
+    return (
+        Fault(
+            "noise",
+            "all",
+            np.zeros(0, dtype=int),
+            np.zeros(0, dtype=int),
+            (Amount("u95", seen, np.nan, "m"), Amount("declared", declared, np.nan, "m")),
+            f"column u95_mm says {1e3 * declared:.3g} mm, {by} say {1e3 * seen:.3g} mm",
+            notice=True,
+        ),
+    )
+
+
+def revisit_scatter(data: Measurements) -> Array:
+    """Squared differences of coordinates at poses visited again, halved: variances [m^2]."""
+    group = groups(data)
+    order = np.argsort(group, kind="stable")
+    again = np.flatnonzero(np.diff(group[order]) == 0)[::2]
+    change = data.y[order[again + 1]] - data.y[order[again]]
+    return np.asarray(0.5 * change[np.isfinite(change)] ** 2)

@@ -1,0 +1,48 @@
+"""What is wrong with data: a `Fault` and its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+
+NO_ERROR: Array = np.zeros((0, 0, 3))
+
+
+@dataclass(frozen=True)
+class Amount:
+    """A number about a fault.  value, sigma: in `unit`, SI; sigma is NaN where not known."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Fault:
+    """One thing wrong with the data, or a notice.
+
+    effect: outliers, swapped_rows, target_shift or readback; as notices also mixed_units,
+    session_jump and noise.  place: smr1, smr1 or smr2, all, frame.
+    rows: (r,) rows of the data; of a shift all rows after it, as visited.
+    targets: outliers (r,) the target of each row; swapped rows (r, k) in whose columns each
+    target stands; shift: which nest it can be; else of length 0.
+    notice: whether the data may be used as they are.
+    """
+
+    effect: str
+    place: str
+    rows: Array
+    targets: Array
+    parameters: tuple[Amount, ...]
+    text: str
+    notice: bool = False
+
+
+def listed(names: list[str], most: int = 8) -> str:
+    """Some names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

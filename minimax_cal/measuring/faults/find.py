@@ -1,0 +1,45 @@
+"""All faults of the data, and the data without them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults.declared import noise
+from minimax_cal.measuring.faults.fault import NO_ERROR, Fault
+from minimax_cal.measuring.faults.joints import unsettled
+from minimax_cal.measuring.faults.nests import target_shifts
+from minimax_cal.measuring.faults.outliers import outlying
+from minimax_cal.measuring.faults.sessions import mixed_units, session_jumps
+from minimax_cal.measuring.faults.swaps import swapped_rows
+from minimax_cal.measuring.measurements import Measurements
+
+
+def find_faults(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
+    """Everything found; each test looks at data mended by those before it.
+
+    error: (k, m, 3) measured minus predicted by a fit, in the axes of the data as `Cell.error`
+    gives them [m]; or of length 0 for none.
+    """
+    swapped = swapped_rows(data, error)
+    mended_names = mended(data, swapped)
+    if swapped and len(error):
+        error = error.copy()
+        error[:, swapped[0].rows] = np.nan  # of the names as they stood
+    shifts = target_shifts(mended_names)
+    outliers = outlying(mended_names, error, shifts)
+    good = mended(mended_names, outliers)
+    notices = (*mixed_units(data), *session_jumps(good, error), *noise(good))
+    return (*swapped, *shifts, *outliers, *unsettled(data), *notices)
+
+
+def mended(data: Measurements, faults: tuple[Fault, ...]) -> Measurements:
+    """Swapped rows put right, outlying points NaN; the rows stay, and so does a shifted nest."""
+    y = data.y.copy()
+    for fault in faults:
+        if fault.effect == "swapped_rows":
+            y[fault.rows] = y[fault.rows[:, None], fault.targets]
+    for fault in faults:
+        if fault.effect == "outliers":
+            y[fault.rows, fault.targets] = np.nan
+    return data.with_y(y)

@@ -1,0 +1,158 @@
+"""Nests that shifted: steps in the distances of one target over the visits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults.chance import ALIKE, FALSE_ALARM
+from minimax_cal.measuring.faults.distances import Between, between, scatter
+from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.history import visits
+from minimax_cal.measuring.measurements import Measurements
+
+NEAR = 8  # visits by which ranks may misplace a step
+SHORTEST = 4  # visits on each side of a step
+MATTERS = 1.5  # steps below so many times the scatter of a distance change nothing
+MOST_STEPS = 5  # shifts of nests in one data set
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A step in the distances of one target: `at` is the first visit after it.
+
+    change, sigma: (p,) of every pair [m].  targets: any one of these explains it, the best first.
+    """
+
+    at: int
+    targets: Array
+    change: Array
+    sigma: Array
+
+
+def target_shifts(data: Measurements) -> tuple[Fault, ...]:
+    """Nests that moved during the session, as steps of their distances over the visits."""
+    apart = between(data)
+    order = visits(data)
+    off = apart.off[:, order]
+    faults: list[Fault] = []
+    while len(faults) < MOST_STEPS and (step := find_step(off, apart)):
+        off = off.copy()
+        off[:, step[0].at :] -= (step[0].change * apart.of(int(step[0].targets[0])))[:, None]
+        faults.append(shift_of(data, order, apart, step[0]))
+    return tuple(faults)
+
+
+def find_step(off: Array, apart: Between) -> list[Step]:
+    """The clearest step, if one is beyond chance.  off: (p, m) by visit, NaN not measured [m].
+
+    Ranks, so that no outlier counts for more than one visit; each pair's scan over all places is
+    judged by a Bonferroni bound, with the scatter widened where neighbours are alike, and must do
+    better than a steady drift.
+    """
+    pairs, m = off.shape
+    best, place = np.zeros(pairs), np.zeros(pairs, dtype=int)
+    for pair in range(pairs):
+        known = np.flatnonzero(np.isfinite(off[pair]))
+        if len(known) >= 2 * SHORTEST:
+            best[pair], first = scan(off[pair, known])
+            place[pair] = known[first]
+    limit = float(stats.chi2.isf(FALSE_ALARM / max(pairs * m, 1), 1))
+    if not pairs or best.max() < limit:
+        return []
+    at = int(place[best.argmax()])
+    before, after = off[:, :at], off[:, at:]
+    many = np.isfinite(before).sum(axis=1), np.isfinite(after).sum(axis=1)
+    told = np.minimum(*many) >= 2
+    change, sigma = np.zeros(pairs), np.full(pairs, np.inf)
+    change[told] = np.nanmedian(after[told], axis=1) - np.nanmedian(before[told], axis=1)
+    inside = np.concatenate(
+        [
+            before[told] - np.nanmedian(before[told], axis=1, keepdims=True),
+            after[told] - np.nanmedian(after[told], axis=1, keepdims=True),
+        ],
+        axis=1,
+    )
+    share = 1.0 / many[0][told] + 1.0 / many[1][told]
+    sigma[told] = 1.2533 * scatter(inside) * np.sqrt(share)  # of a median
+    strength = (change / sigma) ** 2
+    rest = np.array([strength[~apart.of(i)].sum() for i in range(int(apart.pairs.max()) + 1)])
+    if np.abs(change[told]).max() < MATTERS * float(np.median(scatter(inside))):
+        return []
+    order = np.argsort(rest, kind="stable")
+    targets = order[rest[order] <= rest.min() + ALIKE]
+    at = place_of(off[told], change[told], scatter(inside), at)
+    return [Step(at, targets, change, sigma)]
+
+
+def place_of(off: Array, change: Array, sigma: Array, at: int) -> int:
+    """First visit after a step, near a first guess, by least squares that outliers do not sway.
+
+    off: (p, m) by visit [m].  change, sigma: (p,) of the step and of one distance [m].
+    """
+    middle = np.nanmedian(off[:, :at], axis=1)
+    z = (off - middle[:, None]) / sigma[:, None]
+    gain = np.clip(z**2, 0, 25.0) - np.clip((z - (change / sigma)[:, None]) ** 2, 0, 25.0)
+    before = np.cumsum(np.nansum(gain, axis=0))  # lost by a later start
+    low, high = max(at - NEAR, SHORTEST), min(at + NEAR, off.shape[1] - SHORTEST)
+    return low + int(before[low - 1 : high].argmin())
+
+
+def scan(value: Array) -> tuple[float, int]:
+    """Largest squared standard score of a step in a series, and the first entry after it.
+
+    value: (m,).  0 where a steady drift explains the series as well.
+    """
+    m = len(value)
+    score = stats.norm.ppf((stats.rankdata(value) - 0.5) / m)
+    score = (score - score.mean()) / max(float(score.std()), 1e-12)
+    count = np.arange(SHORTEST, m - SHORTEST + 1)
+    total = np.cumsum(score)[count - 1]
+    gain = total**2 * m / (count * (m - count))
+    first = int(count[gain.argmax()])
+    inside = score - np.where(np.arange(m) < first, score[:first].mean(), score[first:].mean())
+    alike = float(inside[1:] @ inside[:-1] / max(inside @ inside, 1e-12))
+    wider = (1.0 + max(alike, 0.0)) / (1.0 - max(alike, 0.0))
+    time = np.linspace(-1.0, 1.0, m)
+    drift = (score @ time) ** 2 / (time @ time)
+    strength = float(gain.max())
+    if strength - drift < 0.1 * strength:
+        return 0.0, first
+    return strength / wider, first
+
+
+def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fault:
+    """The fault that a step stands for."""
+    first = int(step.targets[0])
+    own = np.flatnonzero(apart.of(first) & np.isfinite(step.sigma))
+    size = in_plane(apart, own, first, step.change[own])
+    rows = order[step.at :]
+    amounts = [Amount("size", size, float(step.sigma[own].max()), "m")]
+    for pair in own:
+        a, b = (data.targets[i] for i in apart.pairs[pair])
+        amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), float(step.sigma[pair]), "m"))
+    place = " or ".join(data.targets[i] for i in step.targets)
+    text = (
+        f"{place} moved by {1e3 * size:.3g} mm or more before line {data.line[rows[0]]} "
+        f"(visit {step.at + 1} of {len(order)})"
+    )
+    return Fault("target_shift", place, rows, step.targets, tuple(amounts), text)
+
+
+def in_plane(apart: Between, own: Array, target: int, change: Array) -> float:
+    """Least shift of a target that changes its distances as seen [m].
+
+    own: its pairs.  change: of each [m].
+    """
+    others = [int(apart.pairs[pair].sum() - target) for pair in own]
+    cosine = np.eye(len(own))
+    for i, j in combinations(range(len(own)), 2):
+        both = np.isin(apart.pairs, (others[i], others[j])).all(axis=1)
+        if both.any():
+            a, b, c = apart.centre[own[i]], apart.centre[own[j]], apart.centre[both][0]
+            cosine[i, j] = cosine[j, i] = np.clip((a * a + b * b - c * c) / (2 * a * b), -1, 1)
+    return float(np.sqrt(max(change @ np.linalg.pinv(cosine, rcond=0.05) @ change, 0.0)))

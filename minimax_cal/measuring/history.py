@@ -1,0 +1,139 @@
+"""What the visiting order tells of each pose: the last move, its direction, the time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+
+STILL = 1e-7  # a joint that moved less did not move [rad, m]
+
+
+def with_history(data: Measurements) -> Measurements:
+    """The data with columns that a split into parts would lose; columns already there are kept.
+
+    approach1..n: (m,) sign of the joint's last move, 0 unknown.  move1..n: (m,) the move from the
+    pose before [rad, m], 0 unknown.  followed: (m,) 1 where the pose before is known, else 0.
+    clock: (m,) place in the session, 0 first to 1 last.
+    """
+    order = visits(data)
+    linked = followed(data)
+    move = moves(data)
+    approach = np.zeros_like(move)
+    approach[order] = last_signs(move[order], linked[order])
+    joints = range(data.q.shape[1])
+    found = {f"approach{j + 1}": approach[:, j] for j in joints}
+    found |= {f"move{j + 1}": move[:, j] for j in joints}
+    found |= {"followed": linked.astype(float), "clock": clock(data)}
+    return replace(data, columns={**found, **data.columns})
+
+
+def sessions(data: Measurements) -> Array:
+    """(m,) number of each row's session, in the order of their first rows."""
+    if "session" not in data.columns:
+        return np.zeros(data.poses, dtype=int)
+    _, first, label = np.unique(data.columns["session"], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[label.reshape(-1)])
+
+
+def numbered(data: Measurements) -> bool:
+    """Whether there is an `order` column with a number in it."""
+    return "order" in data.columns and bool(np.isfinite(data.columns["order"].astype(float)).any())
+
+
+def visits(data: Measurements) -> Array:
+    """(m,) the rows as they were visited; rows without a number come last in their session."""
+    if not numbered(data):
+        return np.arange(data.poses)
+    return np.lexsort((data.columns["order"].astype(float), sessions(data)))
+
+
+def moves(data: Measurements) -> Array:
+    """(m, n) joint moves from the pose before, 0 where that is not known [rad, m].
+
+    Those of `with_history` where the data have them: a part of the data knows no better.
+    """
+    names = [f"move{j + 1}" for j in range(data.q.shape[1])]
+    if all(name in data.columns for name in names):
+        return np.stack([data.columns[name] for name in names], axis=1)
+    order = visits(data)
+    move = np.zeros_like(data.q)
+    move[order[1:]] = np.diff(data.q[order], axis=0)
+    return np.where(followed(data)[:, None], move, 0.0)
+
+
+def followed(data: Measurements) -> Array:
+    """(m,) True where the pose visited just before is in the data.
+
+    A gap in `order` hides poses that were visited and left out.  So does a number that stands at
+    two places of the file with different joints: one cannot tell which of them came before.
+    """
+    if "followed" in data.columns:
+        return np.asarray(data.columns["followed"] > 0.0)
+    rows = visits(data)
+    session = sessions(data)[rows]
+    linked = np.append(False, session[1:] == session[:-1])
+    if numbered(data):
+        number = data.columns["order"].astype(float)[rows]
+        step = np.append(np.inf, np.diff(number))
+        same = np.append(False, np.all(np.abs(np.diff(data.q[rows], axis=0)) < STILL, axis=1))
+        beside = np.append(False, np.diff(rows) == 1)
+        clash = linked & (step == 0.0) & ~same & ~beside
+        muddled = np.isin(number, number[clash])
+        with np.errstate(invalid="ignore"):
+            linked &= step <= stride(number, linked) * (1.0 + 1e-9)
+        linked &= ~muddled & ~np.append(False, muddled[:-1])
+    out = np.zeros(data.poses, dtype=bool)
+    out[rows] = linked
+    return out
+
+
+def stride(number: Array, linked: Array) -> float:
+    """Largest step of the visit number between poses that follow each other.
+
+    Whole numbers may count in tens; where a pose was squeezed in (1, 1.5, 2) one is still a step.
+    """
+    step = np.diff(number)[linked[1:]]
+    step = step[step > 0.0]
+    return max(1.0, float(step.min())) if len(step) else 1.0
+
+
+def last_signs(move: Array, linked: Array) -> Array:
+    """(m, n) sign of the last move of each joint, 0 unknown.
+
+    move: (m, n) as visited.  linked: (m,) False where what was before is not known.
+    """
+    sign = np.where(np.abs(move) > STILL, np.sign(move), 0.0)
+    told = (sign != 0.0) | ~linked[:, None]
+    index = np.where(told, np.arange(len(move))[:, None], 0)
+    return np.take_along_axis(sign, np.maximum.accumulate(index, axis=0), axis=0)
+
+
+def clock(data: Measurements) -> Array:
+    """(m,) place in the session, 0 to 1: by time, else by visit number, else by row."""
+    order = visits(data)
+    when = np.empty(data.poses)
+    when[order] = np.arange(data.poses)
+    for name in ("time", "order"):
+        if name not in data.columns:
+            continue
+        given = data.columns[name].astype(float)
+        known = np.isfinite(given)
+        if name == "order" and restarts(given, sessions(data)):
+            break
+        if known.sum() > 1:
+            by_visit = np.argsort(when[known])
+            when = np.interp(when, when[known][by_visit], given[known][by_visit])
+            break
+    length = np.ptp(when)
+    return np.asarray((when - when.min()) / (length if length > 0.0 else 1.0))
+
+
+def restarts(number: Array, session: Array) -> bool:
+    """Whether the visit numbers of a later session begin again among those of an earlier one."""
+    spans = [(number[session == s].min(), number[session == s].max()) for s in np.unique(session)]
+    return any(nxt[0] <= last[1] for last, nxt in pairwise(spans))

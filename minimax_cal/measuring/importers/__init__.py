@@ -1,0 +1,227 @@
+"""Files of trackers and controllers as they are, one format a module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
+from minimax_cal.measuring.importers.reading import (
+    ANGLES,
+    LENGTHS,
+    TEMPERATURES,
+    TIMES,
+    Reading,
+    Told,
+)
+from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
+from minimax_cal.measuring.measurements import Measurements, write_measurements
+
+__all__ = ["IMPORTERS", "Imported", "import_files", "read_any", "save", "units_of"]
+
+# Tried in this order.  `text`: looks at the text alone; `rows`: at header and cells.
+IMPORTERS = {
+    "rapid": "text",
+    "leica": "rows",
+    "robodk": "rows",
+    "tracker6d": "rows",
+    "contract": "rows",
+    "figaroh": "rows",
+    "joint_rows": "rows",
+    "smr_files": "rows",
+    "columns": "rows",
+}
+LAYOUTS = ("", "pose", "target")
+DATES = ("dmy", "mdy", "ymd")
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """data: the measurements.  assembly: every file and column, and how it was understood."""
+
+    data: Measurements
+    assembly: Assembly
+
+    def files(self) -> Table:
+        """A row for each file."""
+        rows = tuple(
+            (
+                str(r.sheet.path),
+                r.format,
+                DELIMITERS.get(r.sheet.delimiter, "-"),
+                DECIMALS.get(r.sheet.decimal, "-"),
+                r.sheet.encoding,
+                len(r.line),
+                how,
+            )
+            for r, how in zip(self.assembly.readings, self.assembly.matched, strict=True)
+        )
+        header = ("file", "format", "delimiter", "decimal", "encoding", "rows", "matched by")
+        return Table("files", header, rows)
+
+    def columns(self) -> tuple[Table, ...]:
+        """A table for each file: its columns."""
+        header = ("column", "meaning", "unit", "known by", "first row, SI")
+        return tuple(
+            Table(str(r.sheet.path), header, tuple(map(row_of, meanings)))
+            for r, meanings in zip(self.assembly.readings, self.assembly.meanings, strict=True)
+        )
+
+    def headline(self) -> str:
+        """What came out, in a line."""
+        data = self.data
+        whole = ", ".join(
+            f"{name} at {count}" for name, count in zip(data.targets, data.seen.sum(0), strict=True)
+        )
+        return f"{data.poses} poses, {data.q.shape[1]} joints; points: {whole}"
+
+
+def row_of(meaning: Meaning) -> tuple[str, ...]:
+    """A column as a row of the table."""
+    column = meaning.column
+    return (column.name, meaning.meaning, meaning.unit, meaning.known, meaning.first)
+
+
+def units_of(texts: Sequence[str]) -> dict[str, str]:
+    """Units by meaning from `q=deg,smr=mm`, or bare: `deg,mm`.  Raises OptionError."""
+    found: dict[str, str] = {}
+    for part in (p.strip() for text in texts for p in text.split(",") if p.strip()):
+        name, equals, unit = part.rpartition("=")
+        if not equals:
+            name = "q" if unit in ANGLES else "smr" if unit in LENGTHS else ""
+        kinds: Sequence[str] = (*ANGLES, *LENGTHS) if name.startswith("q") else tuple(LENGTHS)
+        kinds = TEMPERATURES if name == "temperature" else kinds
+        kinds = (*TIMES, *DATES) if name == "time" else kinds
+        if not name or unit not in kinds:
+            ways = [f"{name}={kind}" for kind in kinds] if name else ["q=deg", "smr=mm", "time=dmy"]
+            raise OptionError(f"--units {part!r}: write {', '.join(ways[:-1])} or {ways[-1]}")
+        found[name] = unit
+    return found
+
+
+def read_any(path: Path | str, told: Told, *, joints: bool = False) -> Reading:
+    """A file in the first format that fits.  joints: the user said that it holds joint values.
+
+    Raises DataError with what to add.
+    """
+    sheet: Sheet = open_text(path)
+    whole = False
+    for name, looks_at in IMPORTERS.items():
+        module = import_module(f"minimax_cal.measuring.importers.{name}")
+        if looks_at == "rows" and not whole:
+            sheet, whole = cut(sheet, told.decimal), True
+        mapped = name == "columns" and told.columns and not joints
+        if mapped or (module.fits(sheet, joints) and not (told.columns and not joints)):
+            reading: Reading = module.read(sheet, told)
+            return reading
+    raise DataError(unknown(sheet))
+
+
+def unknown(sheet: Sheet) -> str:
+    """A format that nobody knows: what to add."""
+    w = sheet.width
+    if sheet.header:
+        names = ", ".join(sheet.header[:6])
+        return (
+            f"{sheet.path}:1: columns {names}{' ...' if w > 6 else ''} are not known; say what "
+            "they are, as --columns 1-3=smr1_mm,4-9=q_deg"
+        )
+    targets = 3 if w >= 13 else 1
+    example = ",".join([f"smr{i + 1}_mm" for i in range(targets)] + ["q_deg"])
+    return (
+        f"{sheet.path}: has {w} columns and no header; say what they are, as --columns {example} "
+        f"({w - 3 * targets} joints) or --columns q_deg,smr1_mm"
+    )
+
+
+def import_files(
+    files: Sequence[Path | str],
+    joints: Path | str | None = None,
+    *,
+    columns: str = "",
+    units: str | Sequence[str] | Mapping[str, str] = (),
+    layout: str = "",
+    decimal: str = "",
+) -> Imported:
+    """Measurements from files as trackers and controllers write them.
+
+    joints: a file of joint values, where the points stand alone.  columns, units, layout, decimal:
+    what the files do not tell (the error asks for it).  Raises DataError, OptionError.
+    """
+    if not files:
+        raise OptionError("name a file to import")
+    if layout not in LAYOUTS:
+        raise OptionError(f"--layout {layout!r}: write pose or target")
+    sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
+    if sign not in ("", *DECIMALS):
+        raise OptionError(f"--decimal {decimal!r}: write comma or point")
+    if not isinstance(units, Mapping):
+        units = units_of([units] if isinstance(units, str) else units)
+    told = Told(columns, units, layout, sign)
+    readings = [read_any(path, told) for path in files]
+    points = [reading for reading in readings if reading.smrs]
+    turns = [reading for reading in readings if reading.joints]
+    alone = [reading for reading in turns if not reading.smrs]
+    if joints is not None:
+        held = read_any(joints, told, joints=True)
+        if not held.joints:
+            raise DataError(f"{joints}: holds no joint values; name its columns q1_deg, q2_deg ...")
+        if turns:
+            raise DataError(
+                f"{turns[0].sheet.path}: holds joint values, as --joints {joints} does; leave one "
+                "of them out"
+            )
+    elif len(turns) == 1:
+        held = turns[0]
+    elif turns:
+        raise DataError(
+            f"{turns[1].sheet.path}: holds joint values, as {turns[0].sheet.path} does; import "
+            "one at a time, or name the file of joints with --joints"
+        )
+    else:
+        raise DataError(f"{points[0].sheet.path if points else files[0]}: {no_joints(points)}")
+    if not points:
+        raise DataError(
+            f"{held.sheet.path}: holds joint values but no points; add the tracker's file"
+        )
+    neither = [r for r in readings if r not in points and r not in alone]
+    if neither:
+        raise DataError(f"{neither[0].sheet.path}: holds neither points nor joint values")
+    if held not in points or len(points) == 1:
+        assembly = assemble(points, held, told)
+        return Imported(assembly.data, assembly)
+    other = next(r for r in points if r is not held)
+    raise DataError(
+        f"{other.sheet.path}: holds points without joints, but {held.sheet.path} holds both; "
+        "import it alone"
+    )
+
+
+def no_joints(points: Sequence[Reading]) -> str:
+    """What to do about missing joint values."""
+    if points:
+        return "holds points but no joint values; add --joints FILE"
+    return "holds neither points nor joint values; say what its columns are with --columns"
+
+
+def save(path: Path | str, imported: Imported) -> None:
+    """Write the contract's CSV; columns that nothing uses are kept as text."""
+    data = imported.data
+    columns = {name: blanks(column) for name, column in data.columns.items()}
+    write_measurements(path, replace(data, columns={**columns, **data.unknown}))
+
+
+def blanks(column: Array) -> Array:
+    """A column in which what is missing is an empty cell."""
+    if column.dtype.kind != "f" or np.isfinite(column).all():
+        return column
+    out = column.astype(object)
+    out[~np.isfinite(column)] = ""
+    return out

@@ -1,0 +1,291 @@
+"""Files understood become measurements in SI, and a table of what was understood."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.importers import contract
+from minimax_cal.measuring.importers.join import Places, in_file_order, place
+from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Reading, Told
+from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
+from minimax_cal.measuring.importers.units import decide
+from minimax_cal.measuring.measurements import Measurements, check_finite
+
+TEXTS = ("session", "split", "pose")
+OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns with a choice
+MIXED = "mixed"
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A row of the table: a column, what it means, its unit, how that is known, its first value."""
+
+    column: Column
+    meaning: str
+    unit: str
+    known: str
+    first: str
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """data: the measurements.  meanings: a tuple for each file, in the order of `readings`."""
+
+    data: Measurements
+    readings: tuple[Reading, ...]
+    meanings: tuple[tuple[Meaning, ...], ...]
+    matched: tuple[str, ...]
+
+
+def unit_of(column: Column, told: Told) -> tuple[str, str]:
+    """A column's unit and how it is known; '' where it is not."""
+    for name in (column.meaning, column.meaning.partition("_")[0], column.family):
+        if name in told.units:
+            also = f", though {column.known} says {column.unit}" if column.unit else ""
+            return told.units[name], "--units" + (also if column.unit != told.units[name] else "")
+    return column.unit, column.known
+
+
+def one_unit(
+    columns: Sequence[tuple[Reading, Column]], told: Told, kinds: Mapping[str, float]
+) -> str:
+    """The unit that columns of one kind share, '' where unknown, or MIXED.  Raises DataError."""
+    found = {unit_of(column, told)[0]: (reading, column) for reading, column in columns}
+    for unit, (reading, column) in found.items():
+        if unit and unit not in kinds:
+            raise DataError(
+                f"{reading.sheet.path}: column {column.name}: {unit} is no unit for it; one of "
+                f"{', '.join(kinds)}"
+            )
+    if len(found) > 1 and "" in found:
+        reading, column = found[""]
+        raise DataError(
+            f"{reading.sheet.path}: column {column.name} has no unit, others have; add "
+            f"--units {column.family}={next(unit for unit in found if unit)}"
+        )
+    return MIXED if len(found) > 1 else next(iter(found), "rad")
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What was decided: units of the joints' angles and of the points, and how they are known."""
+
+    q: str
+    y: str
+    why_q: str
+    why_y: str
+
+
+def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly:
+    """Measurements from files of points and the file of joints (which may be one).
+
+    Raises DataError.
+    """
+    points = in_file_order(list(points))
+    places = [place(reading, joints, told.layout) for reading in points]
+    poses = len(joints.line)
+    q_units = [unit_of(column, told)[0] for column in joints.joints]
+    sliding = np.array([unit in LENGTHS for unit in q_units])
+    turning = [(joints, c) for c, slides in zip(joints.joints, sliding, strict=True) if not slides]
+    spots = [(r, c) for r in points for c in r.columns if c.family == "smr"]
+    q_unit = one_unit(turning, told, ANGLES)
+    y_unit = one_unit(spots, told, LENGTHS)
+    if q_unit == MIXED:
+        raise DataError(f"{joints.sheet.path}: joint columns mix units of angle; use one of them")
+    raw_q = np.stack([joints.numbers(column, empty=False) for column in joints.joints], axis=1)
+    raw, names = raw_points(points, places, poses, told if y_unit == MIXED else None)
+    where = (joints.sheet.path, points[0].sheet.path)
+    scales = Scales(*decide(raw_q, raw, q_unit, "m" if y_unit == MIXED else y_unit, sliding, where))
+    scale = [LENGTHS.get(unit, ANGLES[scales.q]) for unit in q_units]
+    readings = tuple(points) if joints in points else (*points, joints)
+    columns: dict[str, Array] = {}
+    unknown: dict[str, Array] = {}
+    meanings = []
+    stamped = False
+    called = callings(points, places)
+    for i, reading in enumerate(readings):
+        alone = reading is joints and joints not in points
+        pose = np.arange(poses) if alone else places[i].pose
+        mine = []
+        for column in reading.columns:
+            if alone and column.family in ("smr", "target"):
+                column = replace(column, meaning="", remark="points come from the other file")
+            who = "" if alone else called[i].get(column.meaning.partition("_")[0], "")
+            found = understood(reading, column, told, scales, who)
+            mine.append(found.meaning)
+            stamped |= found.meaning.known.startswith(STAMPED)
+            if len(found.values) and found.kept:
+                unknown[column.name] = spread(found.values, pose, poses, "first")
+            elif len(found.values):
+                name = column.meaning
+                values = spread(found.values, pose, poses, name)
+                columns[name] = together(name, columns[name], values) if name in columns else values
+        meanings.append(tuple(mine))
+    if stamped:
+        columns["time"] = columns["time"] - np.nanmin(columns["time"])
+    targets = target_names(points, places)
+    for target, name in zip(targets, names, strict=True):
+        if name:
+            unknown[f"{target}_target"] = np.full(poses, name)
+    data = Measurements(
+        q=raw_q * scale,
+        y=raw * LENGTHS[scales.y],
+        targets=targets,
+        sliding=sliding,
+        line=joints.line,
+        columns=columns,
+        unknown=unknown,
+        notices=tuple(notice for reading in readings for notice in reading.notices),
+        source=str(joints.sheet.path),
+        digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
+    )
+    matched = (*(spot.how for spot in places), "")[: len(readings)]
+    return Assembly(check_finite(data), readings, tuple(meanings), matched)
+
+
+def target_names(points: Sequence[Reading], places: Sequence[Places]) -> tuple[str, ...]:
+    """smr1, smr2, ...; one file keeps the numbers it has."""
+    if len(points) == 1 and len(places[0].names) == 1:
+        return tuple(f"smr{number}" for number in points[0].smrs)
+    count = sum(len(r.smrs) * len(spot.names) for r, spot in zip(points, places, strict=True))
+    return tuple(f"smr{i + 1}" for i in range(count))
+
+
+def callings(points: Sequence[Reading], places: Sequence[Places]) -> list[dict[str, str]]:
+    """For each file: which target, or targets in turn, its columns smr1 ... are."""
+    targets = iter(target_names(points, places))
+    out = []
+    for reading, spot in zip(points, places, strict=True):
+        mine = {}
+        for number in reading.smrs:
+            names = [next(targets) for _ in spot.names]
+            mine[f"smr{number}"] = names[0] + (f" to {names[-1]}" if len(names) > 1 else "")
+        out.append(mine)
+    return out
+
+
+def raw_points(
+    points: Sequence[Reading], places: Sequence[Places], poses: int, told: Told | None
+) -> tuple[Array, tuple[str, ...]]:
+    """(poses, k, 3) points as in the files, and the targets' names.
+
+    told: where the columns' units differ; the points are then in metres.  Raises DataError.
+    """
+    blocks: list[Array] = []
+    names: list[str] = []
+    for reading, spot in zip(points, places, strict=True):
+        for number in reading.smrs:
+            block = np.full((poses, len(spot.names), 3), np.nan)
+            for axis, letter in enumerate("xyz"):
+                column = reading.column(f"smr{number}_{letter}")
+                factor = LENGTHS[unit_of(column, told)[0]] if told else 1.0
+                block[spot.pose, spot.slot, axis] = reading.numbers(column) * factor
+            partly = np.isnan(block).any(-1) & ~np.isnan(block).all(-1)
+            if partly.any():
+                pose, slot = np.argwhere(partly)[0]
+                row = np.flatnonzero((spot.pose == pose) & (spot.slot == slot))[0]
+                raise DataError(
+                    f"{reading.sheet.path}:{reading.line[row]}: a point has some of x, y, z only; "
+                    "complete it, or leave all three empty"
+                )
+            blocks.append(block)
+            names += spot.names
+    return np.concatenate(blocks, axis=1), tuple(names)
+
+
+@dataclass(frozen=True, eq=False)
+class Understood:
+    """A column's row in the table, and its values where it becomes a column of its own."""
+
+    meaning: Meaning
+    values: Array
+    kept: bool = False
+
+
+NOTHING = np.empty(0)
+
+
+def understood(
+    reading: Reading, column: Column, told: Told, scales: Scales, who: str
+) -> Understood:
+    """What a column means, with its values in SI.  who: the target of a point."""
+    unit, known = unit_of(column, told)
+    first = next((cell for cell in column.cells if cell), "")
+    family, path = column.family, reading.sheet.path
+    if not column.meaning:
+        kept = column.remark == contract.KEPT
+        what = "kept" if kept else "left out"
+        remark = "" if kept else column.remark
+        text = np.array(column.cells) if kept else NOTHING
+        return Understood(Meaning(column, what, unit, remark, first if kept else ""), text, kept)
+    if family == "q":
+        unit, known = (unit, known) if unit else (scales.q, scales.why_q)
+        slides = unit in LENGTHS
+        value = reading.number(column, 0, first) * (LENGTHS | ANGLES)[unit]
+        what = f"joint {column.meaning[1:]}"
+        si = f"{value:.6g} {'m' if slides else 'rad'}"
+        return Understood(Meaning(column, what, unit, known, si), NOTHING)
+    if family == "smr":
+        axis = column.meaning[-1]
+        unit, known = (unit, known) if unit else (scales.y, scales.why_y)
+        si = f"{reading.number(column, 0, first) * LENGTHS[unit]:.6g} m" if first else ""
+        return Understood(Meaning(column, f"{who} {axis}", unit, known, si), NOTHING)
+    if family == "target":
+        return Understood(Meaning(column, "name of the target", "", known, first), NOTHING)
+    if family == "time":
+        values, known = seconds(reading, column, told.units.get("time", ""))
+        if not len(values):
+            return Understood(Meaning(column, "left out", "", known, ""), values)
+        return Understood(Meaning(column, "time", "s", known, first), values)
+    if family == "temperature":
+        values, unit, known = celsius(reading, column, told.units.get("temperature", ""))
+        si = f"{values[0]:.6g} C" if len(values) else ""
+        what = "temperature" if len(values) else "left out"
+        return Understood(Meaning(column, what, unit, known, si), values)
+    if family in TEXTS:
+        return Understood(Meaning(column, family, "", known, first), np.array(column.cells))
+    factors = OF_UNIT.get(family, {})
+    if factors and unit not in factors:
+        what = f"{unit} is no unit for it" if unit else "has no unit"
+        raise DataError(
+            f"{path}: column {column.name}: {what}; add --units {family}={next(iter(factors))}"
+        )
+    values = reading.numbers(column) * factors.get(unit, 1.0)
+    if not np.isfinite(values).any():
+        return Understood(Meaning(column, "left out", "", "empty", ""), NOTHING)
+    si = f"{values[0]:.6g}" + (" rad" if family == "qread" else " m" if factors else "")
+    return Understood(Meaning(column, column.meaning, unit, known, si), values)
+
+
+def spread(values: Array, pose: Array, poses: int, name: str) -> Array:
+    """Values of rows as values of poses: the largest u95, the first time, the mean temperature."""
+    if values.dtype.kind in "US":
+        text = np.full(poses, "", dtype=object)
+        text[pose[::-1]] = values[::-1]
+        return text.astype(str)
+    out = np.full(poses, np.nan)
+    if name == "temperature":
+        given = np.isfinite(values)
+        count = np.bincount(pose[given], minlength=poses)
+        total = np.bincount(pose[given], values[given], minlength=poses)
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    if name in ("u95", "time"):
+        (np.fmax if name == "u95" else np.fmin).at(out, pose, values)
+        return out
+    out[pose[::-1]] = values[::-1]
+    return out
+
+
+def together(name: str, one: Array, other: Array) -> Array:
+    """A column that stands in two files: the largest u95, the first time, else the first file's."""
+    if one.dtype.kind in "US":
+        return np.where(one != "", one, other)
+    if name in ("u95", "time"):
+        return np.asarray((np.fmax if name == "u95" else np.fmin)(one, other))
+    return np.where(np.isfinite(one), one, other)

@@ -1,0 +1,193 @@
+"""What the columns of a file mean, before they become measurements."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.importers.sheet import COMMA, POINT, Sheet
+
+ANGLES = {"rad": 1.0, "deg": np.pi / 180.0, "mrad": 1e-3}
+LENGTHS = {"mm": 1e-3, "m": 1.0, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
+TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+TEMPERATURES = ("C", "K", "F")
+OTHERS = ("kg", "Nm")
+ALIASES = {"°": "deg", "º": "deg", "µm": "um", "μm": "um", "inch": "in", "°C": "C", "°F": "F"}
+ALIASES |= {"degC": "C", "degF": "F", "degree": "deg", "degrees": "deg", "radians": "rad"}
+KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
+JOINT = re.compile(r"(?:q|j|a|ax|axis|joint|theta)[ _]?(\d+)", re.IGNORECASE)
+POINT_NAME = re.compile(r"smr(\d+)_([xyz])")
+WORDS = {  # plain names that mean the same in any file
+    "time": ("time", "timestamp", "time stamp", "date time"),
+    "temperature": ("temperature", "temp", "measurement_temperature"),
+    "target": ("target", "target name", "reflector", "smr"),
+    "u95": ("u95", "u(95)", "u_95"),
+    "pose": ("pose", "point", "point name", "name", "id", "key", "no", "no.", "nr", "nr."),
+    "order": ("order",),
+    "session": ("session",),
+    "split": ("split",),
+}
+PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the user said: --columns, --units by meaning, --layout, --decimal."""
+
+    columns: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    layout: str = ""
+    decimal: str = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its name, what it means (as q3, smr1_x, u95, or '' for nothing), its unit.
+
+    known: how the unit is known.  remark: why a column means nothing.
+    """
+
+    name: str
+    meaning: str
+    unit: str
+    cells: tuple[str, ...]
+    known: str = ""
+    remark: str = ""
+
+    @property
+    def family(self) -> str:
+        """Meaning without numbers and axes: q, smr, u95."""
+        return re.match(r"u95|[a-z]+", self.meaning)[0] if self.meaning else ""  # type: ignore[index]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A file understood: columns of m cells each, and the line of each row."""
+
+    format: str
+    sheet: Sheet
+    columns: tuple[Column, ...]
+    line: Array
+    notices: tuple[str, ...] = ()
+
+    def find(self, meaning: str) -> Column | None:
+        """The column with a meaning."""
+        return next((c for c in self.columns if c.meaning == meaning), None)
+
+    def column(self, meaning: str) -> Column:
+        """The column with a meaning that is surely there."""
+        return next(c for c in self.columns if c.meaning == meaning)
+
+    @property
+    def joints(self) -> tuple[Column, ...]:
+        """Joint columns, by number."""
+        found = [c for c in self.columns if c.family == "q"]
+        return tuple(sorted(found, key=lambda c: int(c.meaning[1:])))
+
+    @property
+    def smrs(self) -> tuple[int, ...]:
+        """Numbers of the targets that have columns."""
+        found = (POINT_NAME.fullmatch(c.meaning) for c in self.columns)
+        return tuple(sorted({int(m[1]) for m in found if m}))
+
+    def numbers(self, column: Column, *, empty: bool = True) -> Array:
+        """A column as floats, NaN where empty.  Raises DataError."""
+        out = np.full(len(column.cells), np.nan)
+        for i, cell in enumerate(column.cells):
+            if cell or not empty:
+                out[i] = self.number(column, i, cell)
+        return out
+
+    def number(self, column: Column, row: int, cell: str) -> float:
+        """One cell.  Raises DataError."""
+        decimal_comma = self.sheet.decimal == ","
+        text = cell.replace(",", ".") if decimal_comma and COMMA.fullmatch(cell) else cell
+        if POINT.fullmatch(text) and np.isfinite(float(text)):
+            return float(text)
+        mend = "complete it or delete the row"
+        if COMMA.fullmatch(cell):
+            mend = "use a decimal point"
+        elif re.fullmatch(r"[-+]?\d{1,3}([.,' ]\d{3})+[.,]\d+", cell):
+            mend = "take the thousands separators out"
+        elif cell:
+            mend = "mend it, or leave it empty where it was not measured"
+            mend = mend if column.family != "q" else "mend it or delete the row"
+        what = f"{cell!r} is not a finite number" if cell else "is empty"
+        where = f"{self.sheet.path}:{self.line[row]}"
+        raise DataError(f"{where}: column {column.name}: {what}; {mend}")
+
+
+def unit_name(text: str) -> str:
+    """A unit as this project writes it, or ''."""
+    text = text.strip()
+    text = ALIASES.get(text, text)
+    return text if text in KNOWN else ""
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A header's name without its unit, and the unit: 'X [mm]', 'x (mm)', 'x_mm', 'x mm'."""
+    name = name.strip().lstrip("\ufeff").strip("'\"")
+    if (found := re.fullmatch(r"(.*?)\s*[\[(<]([^\[\](]*)[\])>]", name)) and unit_name(found[2]):
+        return found[1].strip(), unit_name(found[2])
+    if (found := re.fullmatch(r"(.+)[ _]([^ _]+)", name)) and unit_name(found[2]):
+        return found[1].strip(), unit_name(found[2])
+    return name, ""
+
+
+def stems(sheet: Sheet) -> tuple[str, ...]:
+    """The header's names in small letters, without units."""
+    return tuple(split_unit(name)[0].lower() for name in sheet.header)
+
+
+def plain(stem: str) -> str:
+    """The meaning of a name that means the same in any file."""
+    return PLAIN.get(stem, "")
+
+
+def named_reading(
+    title: str,
+    sheet: Sheet,
+    meaning: Callable[[str], str],
+    units: Mapping[str, str] | None = None,
+    remarks: Mapping[str, str] | None = None,
+) -> Reading:
+    """A file with a header.  meaning: of a stem.  units: that the format fixes, by family."""
+    columns = []
+    for i, name in enumerate(sheet.header):
+        stem, unit = split_unit(name)
+        what = meaning(stem.lower())
+        column = Column(name, what, unit, tuple(row[i] for row in sheet.cells), "header")
+        if not unit:
+            fixed = (units or {}).get(column.family, "") if what else ""
+            column = Column(name, what, fixed, column.cells, "format" if fixed else "")
+        if not what:
+            remark = (remarks or {}).get(stem.lower(), "")
+            column = Column(name, "", column.unit, column.cells, column.known, remark)
+        columns.append(column)
+    return checked(Reading(title, sheet, tuple(columns), sheet.line))
+
+
+def checked(reading: Reading) -> Reading:
+    """The reading, if no meaning stands twice and every target is whole.  Raises DataError."""
+    path = reading.sheet.path
+    seen: dict[str, str] = {}
+    for column in reading.columns:
+        if column.meaning and column.meaning in seen:
+            raise DataError(
+                f"{path}: columns {seen[column.meaning]!r} and {column.name!r} both are "
+                f"{column.meaning}; delete one, or say which with --columns"
+            )
+        seen[column.meaning] = column.name
+    for number in reading.smrs:
+        for axis in "xyz":
+            if f"smr{number}_{axis}" not in seen:
+                raise DataError(f"{path}: target {number} has no column for {axis}; add it")
+    numbers = [int(column.meaning[1:]) for column in reading.joints]
+    if missing := sorted(set(range(1, max(numbers, default=0) + 1)) - set(numbers)):
+        raise DataError(f"{path}: has no column for joint {missing[0]}; add it")
+    return reading

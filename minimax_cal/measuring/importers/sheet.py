@@ -1,0 +1,183 @@
+"""A text file as it is: encoding, delimiter, decimal sign, header and cells."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
+DECIMALS = {".": "point", ",": "comma"}
+POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
+COMMENTS = ("#", "%", "//", "!")
+LOOKED_AT = 200  # rows that decide the delimiter
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A file of rows and columns.
+
+    header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
+    delimiter, decimal: empty where the text has no columns.
+    """
+
+    path: Path
+    text: str
+    encoding: str
+    delimiter: str
+    decimal: str
+    header: tuple[str, ...]
+    line: Array
+    cells: tuple[tuple[str, ...], ...]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.header) or max(map(len, self.cells), default=0)
+
+
+def open_text(path: Path | str) -> Sheet:
+    """A text file, not yet cut into rows and columns.  Raises DataError."""
+    path = Path(path)
+    text, encoding = decoded(path)
+    if not text.strip():
+        raise DataError(f"{path}: is empty")
+    return Sheet(path, text, encoding, "", "", (), np.empty(0, dtype=int), ())
+
+
+def cut(sheet: Sheet, decimal: str = "") -> Sheet:
+    """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
+
+    decimal: the sign, where the user told it.
+    """
+    path, text = sheet.path, sheet.text
+    numbered = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip(" \t,;") and not line.lstrip().startswith(COMMENTS)
+    ]
+    delimiter = delimiter_of([line for _, line in numbered[:LOOKED_AT]])
+    if not delimiter:
+        raise DataError(f"{path}: has no columns that commas, semicolons, tabs or spaces separate")
+    rows = [(number, cells_of(path, number, line, delimiter)) for number, line in numbered]
+    header: tuple[str, ...] = ()
+    if is_header(rows[0][1]):
+        _, first = rows.pop(0)
+        header = tuple(trimmed(first))
+        if not rows:
+            raise DataError(f"{path}: holds a header but no rows")
+    width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
+    for number, row in rows:
+        if len(row) < width or any(row[width:]):
+            what = "the header has" if header else "most rows have"
+            raise DataError(
+                f"{path}:{number}: {len(trimmed(row))} cells, but {what} {width}; "
+                "complete the row or delete it"
+            )
+    line = np.array([number for number, _ in rows])
+    cells = tuple(tuple(row[:width]) for _, row in rows)
+    names = header or tuple(f"column {i + 1}" for i in range(width))
+    sign = decimal or decimal_of(path, names, line, cells)
+    return replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
+
+
+def decoded(path: Path) -> tuple[str, str]:
+    """The text and the name of its encoding."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    if raw.startswith(b"PK\x03\x04") or raw.startswith(b"\xd0\xcf\x11\xe0"):
+        raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
+    for mark, name in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
+        if raw.startswith(mark):
+            return raw.decode(name, errors="replace"), name
+    if b"\0" in raw:
+        raise DataError(f"{path}: is not a text file; expected rows of numbers")
+    try:
+        return raw.decode("utf-8-sig"), "utf-8"
+    except UnicodeDecodeError:
+        return raw.decode("latin-1"), "latin-1"
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """The cells of a line."""
+    if delimiter == " ":
+        return line.split()
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [cell.strip() for cell in row]
+
+
+def cells_of(path: Path, number: int, line: str, delimiter: str) -> list[str]:
+    """The cells of a line of a file.  Raises DataError."""
+    if delimiter != " " and line.count('"') % 2:
+        raise DataError(f"{path}:{number}: has a quotation mark without its pair; delete it")
+    return split_line(line, delimiter)
+
+
+def trimmed(row: list[str]) -> list[str]:
+    """A row without empty cells at its end."""
+    end = max((i + 1 for i, cell in enumerate(row) if cell), default=0)
+    return row[:end]
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number with either decimal sign."""
+    return bool(POINT.fullmatch(cell) or COMMA.fullmatch(cell))
+
+
+def is_header(row: list[str]) -> bool:
+    """Whether most cells of a row are words."""
+    filled = trimmed(row)
+    return 2 * sum(not is_number(cell) for cell in filled) > len(filled)
+
+
+def delimiter_of(lines: list[str]) -> str:
+    """The delimiter that cuts most lines into the same count of mostly numbers, or ''."""
+    best, most = "", 0.0
+    for delimiter in DELIMITERS:
+        rows = [split_line(line, delimiter) for line in lines if line.count('"') % 2 == 0]
+        if not rows:
+            continue
+        count, times = Counter(map(len, rows)).most_common(1)[0]
+        if count < 2 or 2 * times < len(rows):
+            continue
+        body = [cell for row in rows[1:] or rows for cell in row if cell]
+        score = sum(map(is_number, body)) / max(len(body), 1)
+        if score > most or not best:
+            best, most = delimiter, score
+    return best
+
+
+def decimal_of(
+    path: Path, names: tuple[str, ...], line: Array, cells: tuple[tuple[str, ...], ...]
+) -> str:
+    """The decimal sign, where the cells prove it.  Raises DataError."""
+    comma, point, proven = "", "", False
+    for number, row in zip(line, cells, strict=True):
+        for name, cell in zip(names, row, strict=True):
+            if found := COMMA.fullmatch(cell):
+                comma = comma or f"{path}:{number}: column {name}: {cell}"
+                proven |= len(found[2]) != 3 or len(found[1]) > 3 or found[1] in ("", "0")
+                proven |= bool(found[3])
+            elif not point and "." in cell and POINT.fullmatch(cell):
+                point = f"column {name} of line {number}: {cell}"
+    if comma and point:
+        raise DataError(
+            f"{comma} has a decimal comma, but {point} has a decimal point; use one of them"
+        )
+    if comma and not proven:
+        raise DataError(
+            f"{comma} may have a decimal comma or be thousands; add --decimal comma, or take "
+            "the commas out"
+        )
+    return "," if comma else "."

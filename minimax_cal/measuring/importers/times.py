@@ -1,0 +1,100 @@
+"""Time stamps and temperatures as trackers write them, in seconds and degrees Celsius."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.importers.reading import TIMES, Column, Reading
+
+STAMPED = "time stamps"
+CLOCKS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p")
+DAYS = {
+    "dmy": ("%d.%m.%Y ", "%d/%m/%Y ", "%d-%m-%Y "),
+    "mdy": ("%m/%d/%Y ", "%m-%d-%Y "),
+    "ymd": ("%Y-%m-%d ", "%Y-%m-%dT", "%Y/%m/%d ", "%Y.%m.%d "),
+    "": ("",),
+}
+START = datetime(1900, 1, 1)  # where a clock without a date starts
+COMPACT = "%Y%m%d%H%M%S"
+CELSIUS = {"C": (1.0, 0.0), "K": (1.0, -273.15), "F": (5.0 / 9.0, -160.0 / 9.0)}
+ROOM = {"C": (5.0, 45.0), "F": (50.0, 113.0), "K": (278.0, 318.0)}  # where people measure
+
+
+def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
+    """(m,) seconds, NaN where empty, and how they are known; of stamps, since 1900.
+
+    An empty array and a remark, where the column tells no time.  told: a unit (s, ms), or the
+    order of a date (dmy, mdy, ymd).  Raises DataError.
+    """
+    cells = [cell.strip().lstrip("'").replace(",", ".") for cell in column.cells]
+    filled = [cell for cell in cells if cell]
+    if len(set(filled)) < 2:
+        return np.empty(0), "the same in all rows"
+    if unit := told if told in TIMES else column.unit:
+        if unit not in TIMES:
+            raise DataError(
+                f"{reading.sheet.path}: column {column.name}: {unit} is no unit of time"
+            )
+        return reading.numbers(column) * TIMES[unit], "--units" if told else column.known
+    found: dict[tuple[float, ...], tuple[Array, str]] = {}
+    for order, days in DAYS.items():
+        if told and told != order:
+            continue
+        for form in (*(day + clock for day in days for clock in CLOCKS), COMPACT):
+            if (stamps := parsed(cells, form)) is not None:
+                since = np.nan_to_num(stamps - np.nanmin(stamps))
+                found.setdefault(tuple(since), (stamps, form.strip()))
+    if len(found) == 1:
+        stamps, form = next(iter(found.values()))
+        return stamps, f"{STAMPED} {form}"
+    if found:
+        raise DataError(
+            f"{reading.sheet.path}: column {column.name}: {filled[0]} may be day or month first; "
+            "add --units time=dmy or --units time=mdy"
+        )
+    if told:
+        raise DataError(
+            f"{reading.sheet.path}: column {column.name}: {filled[0]!r} is not a time as {told}"
+        )
+    return np.empty(0), "no time stamps that are understood; if seconds, add --units time=s"
+
+
+def parsed(cells: list[str], form: str) -> Array | None:
+    """Seconds since 1900 of stamps in a form, or None."""
+    out = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        if not cell:
+            continue
+        try:
+            stamp = datetime.strptime(cell, form)
+        except ValueError:
+            return None
+        out[i] = (stamp - START).total_seconds()
+    return out
+
+
+def celsius(reading: Reading, column: Column, told: str) -> tuple[Array, str, str]:
+    """(m,) temperatures in degrees Celsius, the unit found, and how.  Raises DataError."""
+    values = reading.numbers(column)
+    if not np.isfinite(values).any():
+        return np.empty(0), "", "empty"
+    unit, known = told or column.unit, "--units" if told else column.known
+    if not unit:
+        low, high = np.nanmin(values), np.nanmax(values)
+        fit = [name for name, (least, most) in ROOM.items() if least <= low and high <= most]
+        if len(fit) != 1:
+            raise DataError(
+                f"{reading.sheet.path}: column {column.name}: {low:g} to {high:g} may be in C, F "
+                "or K; add --units temperature=C"
+            )
+        unit, known = fit[0], "as rooms are"
+    if unit not in CELSIUS:
+        raise DataError(
+            f"{reading.sheet.path}: column {column.name}: {unit} is no unit of temperature"
+        )
+    factor, shift = CELSIUS[unit]
+    return values * factor + shift, unit, known

@@ -1,0 +1,114 @@
+"""Which units numbers are in: told, by the header, or proven by what an arm can be; never a guess.
+
+The lever is the largest ratio of how far a target moved to how far the joints turned: no longer
+than the arm with its tool, and not much shorter either.  Wrong units miss it by 57 or 1000 times.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS
+
+MOST_TURN = 4.0 * np.pi  # a joint that turned farther was not written in radians
+FARTHEST_POINT = 200.0  # farther than any tracker measures [m]
+SHORTEST, LONGEST = 0.02, 8.0  # lever of an arm [m]; real arms: 0.16 to 2.2
+APART = 0.05  # share of the largest turn; closer pairs show only noise
+LEAST_WAY = 0.05  # a target that moves less does not calibrate an arm [m]
+COMPARED = 300  # poses whose pairs are looked at
+BOTH = (("rad", "deg"), ("mm", "m"))
+
+
+def decide(
+    q: Array, y: Array, q_unit: str, y_unit: str, sliding: Array, where: tuple[Path, Path]
+) -> tuple[str, str, str, str]:
+    """Units of the joints and points, and how each is known beyond what was told.
+
+    q: (m, n), y: (m, k, 3) as in the files; q_unit, y_unit: '' where unknown.  where: the files of
+    the joints and of the points.  Raises DataError naming the option to add.
+    """
+    turned = np.abs(q[:, ~sliding]).max(initial=0.0)
+    far = np.nanmax(np.abs(y), initial=0.0)
+    if q_unit == "rad" and turned > MOST_TURN:
+        raise DataError(
+            f"{where[0]}: a joint at {turned:g} cannot be in rad; add --units q=deg if it is in "
+            "degrees"
+        )
+    if y_unit == "m" and far > FARTHEST_POINT:
+        raise DataError(
+            f"{where[1]}: a point {far:g} m away was not measured; add --units smr=mm if it is "
+            "in mm"
+        )
+    if q_unit and y_unit:
+        return q_unit, y_unit, "", ""
+    ways = spread(y)
+    q_able = [q_unit] if q_unit else [u for u in BOTH[0] if u == "deg" or turned <= MOST_TURN]
+    y_able = [y_unit] if y_unit else lengths(ways, far)
+    found = lever(q, y, sliding)
+    plausible = [
+        (a, b) for a, b in product(q_able, y_able) if possible(found * LENGTHS[b] / ANGLES[a])
+    ]
+    if len(plausible) != 1:
+        raise DataError(question(where, q_able, y_able or list(BOTH[1]), turned, far))
+    ((a, b),) = plausible
+    arm = f"else the arm would not be {found * LENGTHS[b] / ANGLES[a]:.2g} m long"
+    why_q = arm if len(q_able) > 1 else f"|q| up to {turned:.4g} is beyond 4 pi"
+    why_y = arm if len(y_able) > 1 else f"points over {ways:.4g}, up to {far:.4g} away"
+    return a, b, "" if q_unit else why_q, "" if y_unit else why_y
+
+
+def possible(length: float) -> bool:
+    """Whether an arm can have this lever; NaN tells nothing, so yes."""
+    return not (length < SHORTEST or length > LONGEST)
+
+
+def lengths(ways: float, far: float) -> list[str]:
+    """Units of length in which an arm can have moved a target so far.  ways: between the points."""
+    able = []
+    if not ways * LENGTHS["mm"] < LEAST_WAY:
+        able.append("mm")
+    if far <= FARTHEST_POINT and not ways > 2.0 * LONGEST:
+        able.append("m")
+    return able
+
+
+def spread(y: Array) -> float:
+    """Diagonal of the box around a target's points, the largest; NaN for a single pose."""
+    if len(y) < 2:
+        return float("nan")
+    given = np.where(np.isnan(y), np.nanmean(y, axis=(0, 1)), y)
+    return float(np.linalg.norm(np.ptp(given, axis=0), axis=-1).max())
+
+
+def question(
+    where: tuple[Path, Path], q_able: list[str], y_able: list[str], turned: float, far: float
+) -> str:
+    """What to ask, with the exact options."""
+    joints = f"{where[0]}: joints (up to {turned:.4g}) may be in {' or '.join(q_able)}"
+    points = f"{where[1]}: points (up to {far:.4g}) may be in {' or '.join(y_able)}"
+    add_q = " or ".join(f"--units q={unit}" for unit in q_able)
+    add_y = " or ".join(f"--units smr={unit}" for unit in y_able)
+    if len(y_able) == 1:
+        return f"{joints}; add {add_q}"
+    if len(q_able) == 1:
+        return f"{points}; add {add_y}"
+    return f"{joints}, and {points}; add {add_q}, and {add_y}"
+
+
+def lever(q: Array, y: Array, sliding: Array) -> float:
+    """Largest ratio of a target's way to the sum of the joints' ways; NaN if nothing tells."""
+    if sliding.any() or len(q) < 2:
+        return float("nan")
+    some = np.unique(np.linspace(0, len(q) - 1, COMPARED).astype(int))
+    q, y = q[some], y[some]
+    turn = np.abs(q[:, None] - q[None]).sum(axis=-1)
+    way = np.linalg.norm(y[:, None] - y[None], axis=-1)  # (m, m, k)
+    apart = turn > max(APART * turn.max(), 1e-12)
+    ratio = way[apart] / turn[apart][:, None]
+    ratio = ratio[np.isfinite(ratio)]
+    return float(ratio.max()) if len(ratio) else float("nan")

@@ -1,0 +1,296 @@
+"""Measurements: what a tracker saw at each pose; CSV in, CSV out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import write_whole
+from minimax_cal.measuring.columns import (
+    JOINT,
+    TARGET,
+    TEXT,
+    header_check,
+    near,
+    optional_kind,
+    read_rows,
+    whole_rows,
+)
+
+FARTHEST = 1e5  # no instrument measures farther [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Joint values and the targets seen at each of m poses.
+
+    q: (m, n) joint values as the controller gives them [rad, or m where `sliding`].
+    y: (m, k, 3) targets in the measurement frame, NaN where not measured [m].
+    targets: k names, as smr1.
+    sliding: (n,) True where the joint column has a unit of length.
+    line: (m,) line of the file, for messages.
+    columns: the optional columns by name; numbers in SI, labels as text.
+    unknown: columns that nothing uses, as text, by their name in the file.
+    notices: what the reader should know about the file.
+    source, digest: path and SHA-256 of the file.
+    """
+
+    q: Array
+    y: Array
+    targets: tuple[str, ...]
+    sliding: Array
+    line: Array
+    columns: Mapping[str, Array]
+    unknown: Mapping[str, Array] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()
+    source: str = "measurements"
+    digest: str = ""
+
+    @property
+    def poses(self) -> int:
+        """Number of rows."""
+        return len(self.q)
+
+    @property
+    def seen(self) -> Array:
+        """(m, k) True where a target was measured."""
+        return np.isfinite(self.y[:, :, 0])
+
+    def take(self, rows: Array) -> Measurements:
+        """The measurements at some rows only.  rows: indices or a mask."""
+        return replace(
+            self,
+            q=self.q[rows],
+            y=self.y[rows],
+            line=self.line[rows],
+            columns={name: column[rows] for name, column in self.columns.items()},
+            unknown={name: column[rows] for name, column in self.unknown.items()},
+        )
+
+    def keep(self, targets: Array) -> Measurements:
+        """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
+        names = tuple(name for name, kept in zip(self.targets, targets, strict=True) if kept)
+        some = replace(self, y=self.y[:, targets], targets=names)
+        return some.take(np.asarray(some.seen.any(axis=1)))
+
+    def only(self, target: int) -> Measurements:
+        """One target alone, at the poses where it was measured."""
+        alone = replace(self, y=self.y[:, [target]], targets=(self.targets[target],))
+        return alone.take(self.seen[:, target])
+
+    def with_y(self, y: Array) -> Measurements:
+        """The same poses with other measured points."""
+        return replace(self, y=y)
+
+
+def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
+    """Measurements from arrays.
+
+    q: (m, n) [rad, m].  y: (m, 3) or (m, k, 3), NaN where not measured [m].  columns: optional
+    columns by their file name without the unit (`order`, `u95`), in SI.
+    """
+    q, y = np.array(q, dtype=float), np.array(y, dtype=float)
+    y = y[:, None, :] if y.ndim == 2 else y
+    if q.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or len(q) != len(y):
+        raise DataError(f"q must be (m, n) and y (m, k, 3); got {q.shape} and {y.shape}")
+    names = tuple(f"smr{i + 1}" for i in range(y.shape[1]))
+    sliding = np.zeros(q.shape[1], dtype=bool)
+    extra = {name: np.asarray(column) for name, column in columns.items()}
+    for name, column in extra.items():
+        if len(column) != len(q):
+            raise DataError(
+                f"column {name} has {len(column)} entries, but there are {len(q)} poses"
+            )
+    return check_finite(Measurements(q, y, names, sliding, np.arange(len(q)) + 1, extra))
+
+
+def check_finite(data: Measurements) -> Measurements:
+    """The data, if every joint value is a number and every point whole.  Raises DataError."""
+    if not len(data.q):
+        raise DataError(f"{data.source}: holds no poses")
+    if not np.all(np.isfinite(data.q)):
+        row, joint = np.argwhere(~np.isfinite(data.q))[0]
+        raise DataError(f"{data.source}:{data.line[row]}: joint {joint + 1} is not a finite number")
+    broken = np.isinf(data.y).any(-1) | (np.isnan(data.y).any(-1) != np.isnan(data.y).all(-1))
+    if broken.any():
+        row, target = np.argwhere(broken)[0]
+        raise DataError(
+            f"{data.source}:{data.line[row]}: {data.targets[target]} has some of x, y, z only; "
+            "give all three, or leave all three empty where it was not measured"
+        )
+    if np.nanmax(np.abs(data.y), initial=0.0) > FARTHEST:
+        row, target, _ = np.argwhere(np.abs(data.y) > FARTHEST)[0]
+        raise DataError(
+            f"{data.source}:{data.line[row]}: {data.targets[target]} is more than "
+            f"{FARTHEST / 1e3:g} km away; check the number and its unit"
+        )
+    unmeasured = ~data.seen.any(axis=0)
+    if unmeasured.all():
+        raise DataError(f"{data.source}: no target was measured at any pose")
+    if unmeasured.any():
+        name = data.targets[int(np.argmax(unmeasured))]
+        raise DataError(f"{data.source}: {name} is measured at no pose; delete its columns")
+    for target, name in enumerate(data.targets):
+        points = data.y[data.seen[:, target], target]
+        if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
+            raise DataError(f"{data.source}: all points of {name} are the same")
+    return check_u95(data)
+
+
+def check_u95(data: Measurements) -> Measurements:
+    """The data, if every given `u95` is positive.  Raises DataError."""
+    if "u95" not in data.columns:
+        return data
+    u95 = data.columns["u95"]
+    wrong = u95 <= 0.0
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(
+            f"{data.source}:{data.line[row]}: column u95_mm: {1e3 * u95[row]:g} is not positive; "
+            "leave the cell empty where it is not known"
+        )
+    if not np.isfinite(u95).any():
+        columns = {name: column for name, column in data.columns.items() if name != "u95"}
+        notice = f"{data.source}: column u95_mm is empty and not used"
+        return replace(data, columns=columns, notices=(*data.notices, notice))
+    return data
+
+
+def read_measurements(path: Path | str) -> Measurements:
+    """Read a CSV file of measurements as the contract describes it.  Raises DataError."""
+    file = read_rows(path)
+    header = file.header
+    header_check(path, header)
+    q, sliding = whole_rows(file).joints()
+    found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})
+    y = np.full((len(q), len(found), 3), np.nan)
+    for name in header:
+        if m := TARGET.fullmatch(name):
+            y[:, found.index(int(m[1])), "xyz".index(m[2])] = file.number(
+                name, unit=m[3], empty=True
+            )
+    columns: dict[str, Array] = {}
+    unknown: dict[str, Array] = {}
+    for name in header:
+        kind, match = optional_kind(name)
+        if kind in TEXT:
+            columns[name] = np.array(file.text(name))
+        elif match:
+            unit = match[1] if match.re.groups else ""
+            stem = name.removesuffix(f"_{unit}")
+            columns[stem] = file.number(name, unit=unit, empty=True)
+        elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
+            unknown[name] = np.array(file.text(name))
+    notices = [f"{path}: column {name} is not used{near(name)}" for name in unknown]
+    data = Measurements(
+        q=q,
+        y=y,
+        targets=tuple(f"smr{i}" for i in found),
+        sliding=sliding,
+        line=file.line,
+        columns=columns,
+        unknown=unknown,
+        source=str(path),
+        digest=file.digest,
+    )
+    data = check_finite(data)
+    blind = np.asarray(~data.seen.any(axis=1))
+    if blind.any():
+        notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
+    return replace(data.take(~blind), notices=(*data.notices, *notices))
+
+
+def write_measurements(path: Path | str, data: Measurements) -> None:
+    """Write CSV as the contract describes it: radians (mm for slides) and millimetres."""
+    joints, k = data.q.shape[1], len(data.targets)
+    header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
+    header += [f"{name}_{axis}_mm" for name in data.targets for axis in "xyz"]
+    named = {name: file_column(name) for name in data.columns}
+    header += [name for name, _ in named.values()]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    for j in range(data.poses):
+        q = data.q[j] * np.where(data.sliding, 1e3, 1.0)
+        y = data.y[j].reshape(3 * k) * 1e3
+        row = [f"{value:.9f}" for value in q]
+        row += ["" if np.isnan(value) else f"{value:.6f}" for value in y]
+        for name, column in data.columns.items():
+            value = column[j]
+            if isinstance(value, str):
+                row.append(str(value))
+            else:
+                number = float(value) * named[name][1]
+                row.append("" if np.isnan(number) else f"{number:.9g}")
+        writer.writerow(row)
+    write_whole(path, stream.getvalue())
+
+
+def file_column(stem: str) -> tuple[str, float]:
+    """Name with its unit, and the factor from SI, of an optional column."""
+    exact = {"time": "_s", "temperature": "_C", "payload": "_kg"}
+    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]", stem):
+        return f"{stem}_mm", 1e3
+    if re.fullmatch(r"tau\d+", stem):
+        return f"{stem}_Nm", 1.0
+    if re.fullmatch(r"qread\d+", stem):
+        return f"{stem}_rad", 1.0
+    return stem + exact.get(stem, ""), 1.0
+
+
+def groups(data: Measurements) -> Array:
+    """(m,) a number for each pose: rows with the same joints or the same `pose` share it."""
+    _, group = np.unique(np.round(data.q, 9), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    if "pose" in data.columns:
+        labels = data.columns["pose"]
+        for label in np.unique(labels[labels != ""]):
+            same = np.isin(group, group[labels == label])
+            group[same] = group[same].min()
+    return np.asarray(group)
+
+
+def split(
+    data: Measurements, holdout: float, seed: int
+) -> tuple[Measurements, Measurements, tuple[str, ...]]:
+    """Training and held-out poses, and notices.
+
+    A `split` column decides where there is one; else a seeded random share of the poses is held
+    out, all rows of a pose together.  Raises OptionError, DataError.
+    """
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    if not 0.0 <= holdout < 1.0:
+        raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
+    if "split" in data.columns:
+        labels = np.char.lower(data.columns["split"].astype(str))
+        odd = ~np.isin(labels, ("train", "holdout"))
+        if odd.any():
+            row = int(np.argmax(odd))
+            label = str(data.columns["split"][row])
+            raise DataError(
+                f"{data.source}:{data.line[row]}: column split: {label!r} is neither train nor "
+                "holdout"
+            )
+        held = labels == "holdout"
+        if held.all():
+            raise DataError(f"{data.source}: column split leaves no row for training")
+        notices: tuple[str, ...] = ("the split column decides what is held out",)
+        shared = groups(data)
+        if np.isin(shared[held], shared[~held]).any():
+            notices += ("some poses stand both in training and in the held-out rows",)
+        return data.take(~held), data.take(held), notices
+    group = groups(data)
+    poses = np.unique(group)
+    count = round(holdout * len(poses))
+    chosen = np.random.default_rng(seed).permutation(poses)[:count]
+    held = np.isin(group, chosen)
+    return data.take(~held), data.take(held), ()

@@ -1,0 +1,82 @@
+"""Measured poses inside a result file: joints, points, errors, and which were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.history import numbered, visits
+from minimax_cal.measuring.measurements import Measurements, measurements
+
+LABELS = ("pose", "session")  # columns of text; all others hold numbers, in SI
+TOLD = ("split", "order")  # columns that stand under names of their own
+
+
+def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> dict[str, Any]:
+    """For JSON: every pose as measured, with its errors by name; null where not measured.
+
+    held: (m,) True where held out.  errors: (k, m, 3) measured minus predicted [m].
+    """
+    place = np.empty(data.poses, dtype=int)
+    place[visits(data)] = np.arange(1, data.poses + 1)
+    kept = {name: column for name, column in data.columns.items() if name not in TOLD}
+    return {
+        "source": data.source,
+        "line": data.line.tolist(),
+        "split": np.where(held, "holdout", "train").tolist(),
+        "visit": place.tolist(),
+        "visits_told": numbered(data),
+        "q": plain(data.q),
+        "q_units": ["m" if sliding else "rad" for sliding in data.sliding],
+        "targets": list(data.targets),
+        "measured_mm": plain(1e3 * data.y),
+        "errors_mm": {
+            name: plain(1e3 * np.moveaxis(error, 0, 1)) for name, error in errors.items()
+        },
+        "columns": {
+            name: column.tolist() if name in LABELS else plain(column.astype(float))
+            for name, column in kept.items()
+        },
+    }
+
+
+def plain(values: Array) -> Any:
+    """Nested lists, null where there is no number."""
+    out = values.astype(object)
+    out[~np.isfinite(values)] = None
+    return out.tolist()
+
+
+def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, Array]:
+    """Measurements and (m,) which are held out, from `pose_rows`.  Raises DataError."""
+    try:
+        columns = {
+            name: np.array(column) if name in LABELS else numbers(column)
+            for name, column in content["columns"].items()
+        }
+        columns["order"] = np.array(content["visit"], dtype=float)
+        data = measurements(numbers(content["q"]), 1e-3 * numbers(content["measured_mm"]))
+        held = np.array(content["split"]) == "holdout"
+        line = np.array(content["line"], dtype=int)
+        names = tuple(map(str, content["targets"]))
+        sliding = np.array(content["q_units"]) == "m"
+        short = [len(part) for part in (*columns.values(), held, line)]
+        if set(short) != {data.poses} or (len(names), len(sliding)) != (
+            data.y.shape[1], data.q.shape[1]
+        ):  # fmt: skip
+            raise ValueError("its parts differ in length")
+    except (KeyError, TypeError, ValueError, AttributeError, DataError) as error:
+        raise DataError(
+            f"{source}: its list of poses cannot be read ({error}); write the file again with "
+            "minimax-cal calibrate -o"
+        ) from error
+    return Measurements(data.q, data.y, names, sliding, line, columns, source=source), held
+
+
+def numbers(values: Any) -> Array:
+    """An array of floats, NaN for null."""
+    return np.array(values, dtype=float)

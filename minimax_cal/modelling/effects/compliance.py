@@ -1,0 +1,156 @@
+"""Joints that give way under gravity, and the spring that carries the upper arm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import (
+    Choice,
+    Columns,
+    Effect,
+    Scene,
+    joint_of,
+    mask_of,
+    one_joint,
+    principal,
+    unmasked,
+)
+
+FELT = 1e-3  # share of the largest torque's variation below which a joint carries nothing
+GROUPS = ("upper arm", "forearm", "wrist")  # two links each
+WHOLE = 3  # stands for all links together
+
+
+def varying(scene: Scene) -> Array:
+    """(n,) how much each joint's torque varies between the poses [N m]."""
+    return np.asarray(scene.gravity.std(axis=1))
+
+
+def loaded(scene: Scene) -> list[int]:
+    """Joints on which gravity's torque varies."""
+    size = varying(scene)
+    return [j for j in range(scene.joints) if size[j] > FELT * max(size.max(), 1e-9)]
+
+
+def places(scene: Scene) -> tuple[str, ...]:
+    """Loaded joints, and all of them together."""
+    joints = loaded(scene)
+    single = tuple(f"J{j + 1}" for j in joints)
+    return (*single, "all") if len(joints) > 1 else single
+
+
+def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
+    """Which torques are told apart: bit 4 j + g for group g at joint j, g = 3 for the whole.
+
+    With known masses or measured torques there is one torque a joint.  Without, the torques of
+    upper arm, forearm and wrist are taken apart, because their masses are free; one that another
+    explains as well is left out.
+    """
+    joints = loaded(scene) if place == "all" else [joint_of(place)]
+    if scene.known_masses or scene.measured_torques:
+        return ({"parts": mask_of([4 * j + WHOLE for j in joints])},)
+    chosen = []
+    for j in joints:
+        kept = np.ones((1, scene.poses))
+        for group in range(j // 2, len(GROUPS)):
+            torque = torque_of(scene, j, group)
+            basis = np.linalg.qr(kept.T)[0]
+            rest = torque - basis @ (basis.T @ torque)
+            if np.linalg.norm(rest) > 0.02 * np.linalg.norm(torque - torque.mean()) + 1e-9:
+                chosen.append(4 * j + group)
+                kept = np.concatenate([kept, torque[None]])
+    return ({"parts": mask_of(chosen)},) if chosen else ()
+
+
+def torque_of(scene: Scene, joint: int, group: int) -> Array:
+    """(m,) gravity's torque of some of the links about a joint [N m]."""
+    if group == WHOLE:
+        return np.asarray(scene.gravity[joint])
+    mass, com = scene.masses
+    groups = np.minimum(np.arange(scene.joints) // 2, len(GROUPS) - 1)
+    torque = scene.torque(np.where(groups == group, mass, 0.0), com)[joint]
+    return np.asarray(torque + scene.payload[joint] * (group == len(GROUPS) - 1))
+
+
+def columns(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = c_j tau_j."""
+    turns, names, doubts = [], [], []
+    for part in unmasked(choice["parts"]):
+        j, group = divmod(part, 4)
+        turns.append(one_joint(scene, j, torque_of(scene, j, group)[None]))
+        whole = group == WHOLE
+        names.append(f"c{j + 1}" + ("" if whole else f" ({GROUPS[group]})"))
+        shapes = principal(scene.gravity_parts[:, j]) if whole else np.zeros((0, scene.poses))
+        one = [one_joint(scene, j, shape[None]) for shape in shapes]
+        nothing = np.zeros((0, scene.joints, scene.poses))
+        doubts.append(np.concatenate([nothing, *one]))
+    units = ("rad/(N m)",) * len(names)
+    return Columns(tuple(names), units, np.concatenate(turns), doubt=tuple(doubts))
+
+
+JOINT_COMPLIANCE = Effect(
+    "joint_compliance",
+    "gearboxes wind up under gravity",
+    "dq_j = c_j tau_j(q)",
+    places,
+    columns,
+    choices=parts_of,
+    positive=True,
+)
+
+
+def lean(scene: Scene) -> Array:
+    """(m,) angle of the second link from the vertical about its joint's axis [rad]."""
+    up = np.broadcast_to(scene.robot.up[:, None], scene.links.z[1].shape)
+    axis, along = scene.links.z[1], scene.links.after[1] - scene.links.before[1]
+    side = np.cross(up, along, axis=0)
+    return np.asarray(np.arctan2((side * axis).sum(axis=0), (up * along).sum(axis=0)))
+
+
+def spring(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_2 = k sin(b) (1 - s0 / s), s^2 = a^2 + L^2 - 2 a L cos b.
+
+    b: lean of the upper arm less the spring's own zero.  Its eye sits at `eye` and its free length
+    is `rest`, both in units of the distance L from the joint to its anchor.
+    """
+    angle = lean(scene) - choice["zero"]
+    a, rest = choice["eye"], choice["rest"]
+    length = np.sqrt(1.0 + a * a - 2.0 * a * np.cos(angle))
+    pull = np.sin(angle) * (1.0 - rest / length)
+    return Columns(("k",), ("rad",), one_joint(scene, 1, pull[None]), fixed=dict(choice))
+
+
+def springs(zeros: Sequence[float], eyes: Sequence[float], rests: Sequence[float]) -> list[Choice]:
+    """Every combination."""
+    return [{"zero": z, "eye": e, "rest": r} for z in zeros for e in eyes for r in rests]
+
+
+def finer_spring(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Springs near one that was chosen."""
+    zeros = choice["zero"] + np.linspace(-0.2, 0.2, 5)
+    eyes = choice["eye"] + np.linspace(-0.1, 0.1, 3)
+    rests = choice["rest"] + np.linspace(-0.1, 0.1, 3)
+    return springs(zeros.tolist(), eyes.tolist(), rests.tolist())
+
+
+def spring_places(scene: Scene) -> tuple[str, ...]:
+    """Joint 2, where it swings in a vertical plane."""
+    if scene.joints < 3 or scene.robot.prismatic[1]:
+        return ()
+    level = np.abs((scene.links.z[1] * scene.robot.up[:, None]).sum(axis=0)).max() < 0.5
+    return ("J2",) if level and np.ptp(lean(scene)) > 0.1 else ()
+
+
+GRAVITY_COMPENSATOR = Effect(
+    "gravity_compensator",
+    "the spring that balances the upper arm",
+    "dq_2 = k a L sin(q_2 - phi) (1 - s_0/s)",
+    spring_places,
+    spring,
+    choices=lambda scene, place: springs((-0.25, 0.0, 0.25), (0.4, 0.55), (0.45, 0.65)),
+    finer=finer_spring,
+    typical=1e-2,
+)

@@ -1,0 +1,191 @@
+"""What gears and encoders do to a joint: waves, gain, coupling, play, and joints still moving."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import (
+    PLAIN,
+    Choice,
+    Columns,
+    Effect,
+    Scene,
+    joint_of,
+    mask_of,
+    one_joint,
+    turning,
+    unmasked,
+)
+
+LEAST_SWEEP = 0.5  # a joint must turn so far to show a gain or a slow wave [rad]
+
+
+def sweeping(scene: Scene) -> list[int]:
+    """Turning joints that move far enough to show what depends on their angle."""
+    return [j for j in turning(scene) if np.ptp(scene.q[j]) > LEAST_SWEEP]
+
+
+def swept_places(scene: Scene) -> tuple[str, ...]:
+    """Each such joint, and all together."""
+    joints = sweeping(scene)
+    each = tuple(f"J{j + 1}" for j in joints)
+    return (*each, "all") if len(joints) > 1 else each
+
+
+def joints_at(place: str, choice: Choice) -> list[int]:
+    """The joints that a place means: `all` those that the choice names."""
+    return unmasked(choice["joints"]) if place == "all" else [joint_of(place)]
+
+
+def at_all(place: str, joints: Sequence[int], choice: Choice = PLAIN[0]) -> Choice:
+    """A choice that remembers which joints `all` meant, for data on which others would move."""
+    return {**choice, "joints": mask_of(joints)} if place == "all" else choice
+
+
+def wave(scene: Scene, joint: int, turns: float) -> Array:
+    """(2, m) cos and sin of so many waves a turn."""
+    return np.stack([np.cos(turns * scene.q[joint]), np.sin(turns * scene.q[joint])])
+
+
+def waves(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = a cos(k q_j) + b sin(k q_j), k = turns."""
+    turns = choice["turns"]
+    joints = joints_at(place, choice)
+    parts = [one_joint(scene, j, wave(scene, j, turns)) for j in joints]
+    several = len(joints) > 1
+    names = tuple(f"{part}{j + 1 if several else ''}" for j in joints for part in ("cos", "sin"))
+    return Columns(
+        names, ("rad",) * len(names), np.concatenate(parts), fixed={"waves_per_turn": turns}
+    )
+
+
+GEAR_ERROR = Effect(
+    "gear_error",
+    "a gear or encoder disc that runs out of true, one to three times a turn",
+    "dq_j = a cos(k q_j) + b sin(k q_j), k = 1, 2, 3",
+    swept_places,
+    waves,
+    choices=lambda scene, place: [
+        at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)
+    ],
+    typical=5e-4,
+)
+
+
+def ratios(scene: Scene, place: str) -> Sequence[Choice]:
+    """The gear's ratio and twice that, where the robot file tells it."""
+    if place == "all":
+        return ()
+    ratio = scene.robot.ratio[joint_of(place)]
+    return ({"turns": abs(ratio)}, {"turns": 2.0 * abs(ratio)}) if np.isfinite(ratio) else ()
+
+
+GEAR_RIPPLE = Effect(
+    "gear_ripple",
+    "ripple of the gear's teeth or wave generator, many times a turn",
+    "dq_j = a cos(k q_j) + b sin(k q_j), k = gear ratio, twice that, or found by a periodogram",
+    lambda scene: tuple(f"J{j + 1}" for j in sweeping(scene)),
+    waves,
+    choices=ratios,
+    typical=5e-4,
+)
+
+
+def gain(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = g q_j."""
+    joints = joints_at(place, choice)
+    turn = np.concatenate([one_joint(scene, j, scene.q[j][None]) for j in joints])
+    return Columns(tuple(f"g{j + 1}" for j in joints), ("1",) * len(joints), turn)
+
+
+ENCODER_GAIN = Effect(
+    "encoder_gain",
+    "a wrong scale of the joint's encoder or gear ratio",
+    "dq_j = g q_j",
+    swept_places,
+    gain,
+    choices=lambda scene, place: [at_all(place, sweeping(scene))],
+    typical=1e-3,
+)
+
+
+def coupling(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = c q_i, i = source."""
+    j, i = joint_of(place), int(choice["source"]) - 1
+    turn = one_joint(scene, j, scene.q[i][None])
+    return Columns((f"c{j + 1}{i + 1}",), ("1",), turn, fixed={"source_joint": i + 1.0})
+
+
+def sources(scene: Scene, place: str) -> Sequence[Choice]:
+    """The joints up to two before it that move far enough."""
+    j = joint_of(place)
+    return tuple({"source": i + 1.0} for i in sweeping(scene) if j - 2 <= i < j)
+
+
+JOINT_COUPLING = Effect(
+    "joint_coupling",
+    "a joint's motor turns another joint too (wrist gears, linked arms)",
+    "dq_j = c q_i",
+    lambda scene: tuple(f"J{j + 1}" for j in turning(scene) if j and sources(scene, f"J{j + 1}")),
+    coupling,
+    choices=sources,
+    typical=1e-2,
+)
+
+
+def moved(scene: Scene, stem: str) -> list[int]:
+    """Turning joints whose column of the history varies."""
+    return [j for j in turning(scene) if scene.has(f"{stem}{j + 1}")]
+
+
+def moved_places(scene: Scene, stem: str) -> tuple[str, ...]:
+    """Each joint whose column of the history varies, and all together."""
+    joints = moved(scene, stem)
+    each = tuple(f"J{j + 1}" for j in joints)
+    return (*each, "all") if len(joints) > 1 else each
+
+
+def turns_by(
+    scene: Scene, joints: Sequence[int], history: Array, letter: str, unit: str
+) -> Columns:
+    """Each of some joints turns by a parameter of its own times its history (n, m)."""
+    turn = np.concatenate([one_joint(scene, j, history[j][None]) for j in joints])
+    return Columns(tuple(f"{letter}{j + 1}" for j in joints), (unit,) * len(joints), turn)
+
+
+def play(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = b/2 sign(last move of j)."""
+    return turns_by(scene, joints_at(place, choice), 0.5 * scene.each("approach"), "b", "rad")
+
+
+BACKLASH = Effect(
+    "backlash",
+    "play in the gear: the joint stops short on the side it came from",
+    "dq_j = b/2 sign(last move of j)",
+    lambda scene: moved_places(scene, "approach"),
+    play,
+    needs=lambda scene: ("" if moved(scene, "approach") else
+                         "columns approach1 ... or the visit order, joints moving both ways"),
+    choices=lambda scene, place: [at_all(place, moved(scene, "approach"))],
+    typical=1e-3,
+)  # fmt: skip
+
+
+def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = e (q_n - q_(n-1)), or the same moves counted up to a limit."""
+    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
+
+
+SETTLING = Effect(
+    "settling",
+    "the joint had not settled, or was read back before it had",
+    "dq_j = e (q_n - q_(n-1))",
+    lambda scene: moved_places(scene, "move"),
+    unsettled,
+    needs=lambda scene: "" if moved(scene, "move") else "the visit order (column order)",
+    choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
+    typical=1e-2,
+)

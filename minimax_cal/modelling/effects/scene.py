@@ -1,0 +1,301 @@
+"""What the law of an effect may look at, and what it answers with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import G, torques
+from minimax_cal.robots.kinematics import Chain
+from minimax_cal.robots.robot import Robot
+
+MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]
+MASS_DOUBT = 0.2  # relative sigma of the masses and centres of gravity in a robot file
+LEAST_ARM = 0.02  # sigma of a centre of gravity, where 20 % of it is less [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An arm at its measured poses, in its base frame.
+
+    robot: with the geometry at hand.  data: m poses with the columns of `with_history`.
+    links: the chain there.  spots: (k, 3) targets in the last frame [m].
+    points: (k, 3, m) the targets in the base frame [m].
+    rotation, origin: (3, 3), (3,) pose of the base in the measurement frame [m].
+    """
+
+    robot: Robot
+    data: Measurements
+    links: Chain
+    spots: Array
+    points: Array
+    rotation: Array
+    origin: Array
+
+    @staticmethod
+    def of(
+        robot: Robot, data: Measurements, base: tuple[Array, Array], spots: Array, q: Array
+    ) -> Scene:
+        """The scene of a cell.  base: its rotation and origin.  q: (m, n) signs applied."""
+        links = kinematics.chain(robot.mdh, q, robot.prismatic)
+        points = kinematics.points(links, spots)
+        return Scene(robot, with_history(data), links, spots, points, *base)
+
+    @property
+    def joints(self) -> int:
+        """n."""
+        return self.robot.joints
+
+    @property
+    def poses(self) -> int:
+        """m."""
+        return int(self.points.shape[-1])
+
+    @property
+    def targets(self) -> int:
+        """k."""
+        return len(self.points)
+
+    @cached_property
+    def q(self) -> Array:
+        """(n, m) joint values, signs applied [rad, m]."""
+        return np.ascontiguousarray((self.data.q * self.robot.sign).T)
+
+    @cached_property
+    def slope(self) -> Array:
+        """(n, k, 3, m) motion of every target per unit of every joint [m per rad or m]."""
+        z, o = self.links.z[:, None], self.links.before[:, None]
+        turned = kinematics.cross(np.broadcast_to(z, (self.joints, *self.points.shape)),
+                                  self.points[None] - o)  # fmt: skip
+        return np.where(self.robot.prismatic[:, None, None, None], z + 0.0 * turned, turned)
+
+    @property
+    def instrument(self) -> Array:
+        """(3,) where the instrument stands [m]: the origin of the measurement frame."""
+        return np.asarray(-self.origin @ self.rotation)
+
+    def column(self, stem: str) -> Array:
+        """(m,) an optional column; zeros where it is empty or absent."""
+        values = self.data.columns.get(stem)
+        return np.zeros(self.poses) if values is None else np.nan_to_num(values.astype(float))
+
+    def has(self, stem: str) -> bool:
+        """Whether an optional column is there and varies."""
+        values = self.column(stem)
+        return bool(np.ptp(values) > 0.0) if len(values) else False
+
+    @property
+    def measured_torques(self) -> bool:
+        """Whether the data hold measured torques."""
+        columns = self.data.columns
+        stems = [f"tau{j + 1}" for j in range(self.joints)]
+        return any(np.isfinite(columns[stem]).any() for stem in stems if stem in columns)
+
+    def each(self, stem: str) -> Array:
+        """(n, m) the optional columns stem1 ... stemn, in the sense of `q`."""
+        values = [self.column(f"{stem}{j + 1}") for j in range(self.joints)]
+        return np.array(values) * self.robot.sign[:, None]
+
+    @cached_property
+    def known_masses(self) -> bool:
+        """Whether the robot file tells the masses and centres of gravity of the moving links."""
+        mass, com = self.robot.mass, self.robot.com
+        return bool(np.isfinite(mass[1:]).all() and np.isfinite(com[1:]).all())
+
+    @cached_property
+    def masses(self) -> tuple[Array, Array]:
+        """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m].
+
+        Where the file does not tell them: a uniform tube along each link.
+        """
+        mdh = self.robot.mdh
+        length = np.hypot(mdh[:, 0], mdh[:, 1])
+        # back from frame i towards frame i-1: half of a along x, half of d along the old z
+        ca, sa = np.cos(mdh[:, 3]), np.sin(mdh[:, 3])
+        halfway = -0.5 * np.stack([mdh[:, 0], mdh[:, 1] * sa, mdh[:, 1] * ca], axis=1)
+        mass, com = self.robot.mass, self.robot.com
+        known = np.isfinite(mass) & np.isfinite(com).all(axis=1)
+        mass = np.where(known, mass, MASS_PER_METRE * length)
+        return mass, np.where(known[:, None], com, halfway)
+
+    def torque(self, mass: Array, com: Array) -> Array:
+        """(n, m) gravity's torque about each joint, 0 at slides [N m]."""
+        found = torques(self.links, mass, com, self.robot.up)
+        return np.where(self.robot.prismatic[:, None], 0.0, found)
+
+    @cached_property
+    def payload(self) -> Array:
+        """(n, m) torque of the payload, which hangs amid the targets [N m]."""
+        one = np.zeros(self.joints)
+        one[-1] = 1.0
+        com = np.zeros((self.joints, 3))
+        com[-1] = self.spots.mean(axis=0)
+        return self.torque(one, com) * self.column("payload")
+
+    @cached_property
+    def gravity(self) -> Array:
+        """(n, m) the joints' static torques: measured where they are, else computed [N m]."""
+        if self.measured_torques:
+            return self.each("tau")
+        return self.torque(*self.masses) + self.payload
+
+    @cached_property
+    def gravity_parts(self) -> Array:
+        """(l, n, m) change of `gravity` for one sigma of each mass and centre of gravity [N m]."""
+        if self.measured_torques:
+            return np.zeros((0, self.joints, self.poses))
+        whole = self.torque(*self.masses)
+        parts = [self.torque(*other) - whole for other in self.other_masses]
+        return np.array(parts)
+
+    @cached_property
+    def other_masses(self) -> list[tuple[Array, Array]]:
+        """Masses and centres of gravity, one of them off by its sigma each."""
+        out = []
+        mass, com = self.masses
+        for link in range(1, self.joints):
+            heavier = mass.copy()
+            heavier[link] *= 1.0 + MASS_DOUBT
+            out.append((heavier, com))
+            for axis in range(3):
+                moved = com.copy()
+                moved[link, axis] += max(MASS_DOUBT * abs(com[link, axis]), LEAST_ARM)
+                out.append((mass, moved))
+        return out
+
+    def load_beyond(self, link: int, mass: Array, com: Array) -> tuple[Array, Array]:
+        """Weight that hangs beyond the end of a link: its moment (3, m) about that end, and mass.
+
+        [N m, kg]
+        """
+        centre = centres(self.links, com)[link + 1 :]
+        beyond = mass[link + 1 :]
+        lever = (beyond[:, None, None] * (centre - self.links.after[link])).sum(axis=0)
+        total = float(beyond.sum())
+        moment = kinematics.cross(lever, np.broadcast_to(-G * self.robot.up[:, None], lever.shape))
+        tip = self.points.mean(axis=0) - self.links.after[link]
+        weight = -G * self.robot.up[:, None] * self.column("payload")
+        moment = moment + kinematics.cross(tip, weight)
+        return moment, np.full(self.poses, total) + self.column("payload")
+
+
+def centres(links: Chain, com: Array) -> Array:
+    """(n, 3, m) centres of gravity in the base frame [m].  com: (n, 3) in the link frames."""
+    z = np.concatenate([links.z[1:], links.axes[2:]])
+    axes = np.stack([kinematics.cross(links.y, z), links.y, z], axis=1)
+    return np.asarray(links.after + np.einsum("naim,na->nim", axes, com))
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """An effect at a place: how points move per unit of each of its d parameters.
+
+    names, units: d of each; units are SI.
+    turn: (d, n, m) by how much each joint turns or slides [rad or m per unit]; empty for none.
+    shift: (d, k, 3, m) by how much each target moves besides [m per unit]; empty for none.
+    doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
+    doubt_shift: for each parameter (r, k, 3, m) how `shift` may differ; empty for none.
+    fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    turn: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    shift: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    doubt: tuple[Array, ...] = ()
+    doubt_shift: tuple[Array, ...] = ()
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    def displacement(self, scene: Scene) -> Array:
+        """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
+        out = np.zeros((len(self.names), *scene.points.shape))
+        if self.turn.size:
+            out = out + np.einsum("dnm,nkcm->dkcm", self.turn, scene.slope, optimize=True)
+        if self.shift.size:
+            out = out + self.shift
+        return out
+
+    def doubts(self, scene: Scene) -> list[tuple[int, Array]]:
+        """Parameter and (r, k, 3, m) displacements that its field may differ by, one sigma each."""
+        turned = [
+            (owner, np.einsum("dnm,nkcm->dkcm", part, scene.slope, optimize=True))
+            for owner, part in enumerate(self.doubt)
+            if len(part)
+        ]
+        return turned + [(i, part) for i, part in enumerate(self.doubt_shift) if len(part)]
+
+
+DOUBTS = 3  # independent ways in which a law may differ from the one computed
+
+
+def principal(parts: Array) -> Array:
+    """The few independent directions that many one-sigma doubts (l, ...) add up to: (r, ...)."""
+    if not parts.size:
+        return parts
+    flat = parts.reshape(len(parts), -1)
+    values, vectors = np.linalg.eigh(flat @ flat.T)
+    kept = [i for i in range(len(values))[::-1] if values[i] > 1e-6 * values[-1]][:DOUBTS]
+    return np.asarray((vectors[:, kept].T @ flat).reshape(len(kept), *parts.shape[1:]))
+
+
+Choice = Mapping[str, float]  # what picks one variant of a law, as {"turns": 2}
+PLAIN: tuple[Choice, ...] = ({},)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A physical cause.
+
+    name: as in the contract.  cause: one line for people.  law: the formula.
+    places: where it may sit in a scene; empty if the data cannot test it.
+    columns: its `Columns` at a place, for a choice.  needs: what the data lack, '' if nothing.
+    choices: the variants of the law at a place that are worth trying.
+    finer: variants near one that was chosen, to try afterwards.
+    positive: whether its one parameter is a compliance, which cannot be negative.
+    typical: usual size of a parameter; far larger ones are believed less [SI].
+    """
+
+    name: str
+    cause: str
+    law: str
+    places: Callable[[Scene], Sequence[str]]
+    columns: Callable[[Scene, str, Choice], Columns]
+    needs: Callable[[Scene], str] = lambda scene: ""
+    choices: Callable[[Scene, str], Sequence[Choice]] = lambda scene, place: PLAIN
+    finer: Callable[[Scene, Choice], Sequence[Choice]] = lambda scene, choice: ()
+    positive: bool = False
+    typical: float = np.inf
+
+
+def joint_of(place: str) -> int:
+    """Index of the joint or link that a place names, J3 or L3."""
+    return int(place[1:]) - 1
+
+
+def mask_of(numbers: Sequence[int]) -> float:
+    """Small whole numbers as one number: bits.  So that a choice can hold a list of joints."""
+    return float(sum(1 << i for i in numbers))
+
+
+def unmasked(mask: float) -> list[int]:
+    """The numbers of `mask_of`."""
+    return [i for i in range(52) if int(mask) >> i & 1]
+
+
+def turning(scene: Scene) -> list[int]:
+    """The joints that turn."""
+    return [j for j in range(scene.joints) if not scene.robot.prismatic[j]]
+
+
+def one_joint(scene: Scene, joint: int, values: Array) -> Array:
+    """(d, n, m) turns of one joint.  values: (d, m)."""
+    out = np.zeros((len(values), scene.joints, scene.poses))
+    out[:, joint] = values
+    return out

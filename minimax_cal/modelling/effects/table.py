@@ -1,0 +1,249 @@
+"""Every effect that can be fitted and named, and effects by their written form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
+from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.gears import (
+    BACKLASH,
+    ENCODER_GAIN,
+    GEAR_ERROR,
+    GEAR_RIPPLE,
+    JOINT_COUPLING,
+    SETTLING,
+)
+from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
+from minimax_cal.modelling.effects.time import (
+    FRAME_DRIFT,
+    TARGET_OFFSET,
+    TARGET_SHIFT,
+    THERMAL_GROWTH,
+)
+from minimax_cal.robots import kinematics
+
+EFFECTS: dict[str, Effect] = {
+    effect.name: effect
+    for effect in (
+        JOINT_COMPLIANCE,
+        GRAVITY_COMPENSATOR,
+        LINK_BENDING,
+        BASE_FLEX,
+        TOOL_FLEX,
+        GEAR_ERROR,
+        GEAR_RIPPLE,
+        ENCODER_GAIN,
+        JOINT_COUPLING,
+        BACKLASH,
+        SETTLING,
+        THERMAL_GROWTH,
+        FRAME_DRIFT,
+        TARGET_SHIFT,
+        TARGET_OFFSET,
+    )
+}
+
+
+def register(effect: Effect) -> Effect:
+    """Add an effect of one's own to the library of this process."""
+    EFFECTS[effect.name] = effect
+    return effect
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """An effect at a place, one variant of its law chosen."""
+
+    effect: str
+    place: str
+    choice: Choice = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """As joint_compliance:J2."""
+        return f"{self.effect}:{self.place}"
+
+    @property
+    def text(self) -> str:
+        """As gear_error:J2:turns=2.0, with the whole choice."""
+        return ":".join([self.label, *(f"{k}={float(v)!r}" for k, v in self.choice.items())])
+
+    def columns(self, scene: Scene) -> Columns:
+        """How points move per unit of its parameters."""
+        return EFFECTS[self.effect].columns(scene, self.place, self.choice)
+
+
+def parse(text: str) -> tuple[str, str, dict[str, float]]:
+    """``effect:place`` or ``effect:place:turns=17``.  Raises OptionError."""
+    name, _, rest = text.strip().partition(":")
+    place, _, more = rest.partition(":")
+    choice: dict[str, float] = {}
+    for part in filter(None, more.split(":")):
+        key, equals, value = part.partition("=")
+        try:
+            choice[key] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise OptionError(f"effect {text!r}: write {part!r} as a name and number, turns=17")
+    if name not in EFFECTS:
+        raise OptionError(f"no effect {name!r}; choose {', '.join(EFFECTS)}")
+    return name, place, choice
+
+
+Pick = Callable[[Sequence[Term], Sequence[Term]], Term]  # one of several, beside those chosen
+
+
+def terms(
+    scene: Scene, texts: Sequence[str | Term], pick: Pick = lambda chosen, several: several[0]
+) -> tuple[Term, ...]:
+    """The effects that texts name.
+
+    A text without a place means `all`, or the only place there is.  pick: chooses among the
+    variants of a law that a text leaves open.  Raises OptionError.
+    """
+    out: list[Term] = []
+    for text in texts:
+        if isinstance(text, Term):
+            out.append(text)
+            continue
+        name, place, given = parse(text)
+        effect = EFFECTS[name]
+        if missing := effect.needs(scene):
+            raise OptionError(f"effect {name}: {scene.data.source} lacks {missing}")
+        places = tuple(effect.places(scene))
+        if not place:
+            place = "all" if "all" in places or len(places) != 1 else places[0]
+        if place not in places:
+            here = ", ".join(places) or "none with these data"
+            raise OptionError(f"effect {name}: no place {place!r}; choose {here}")
+        choices = variants(text, effect.choices(scene, place), given)
+        if name == "gear_ripple" and "turns" not in choices[0]:
+            raise OptionError(
+                f"effect {text!r}: the robot file gives no ratio; write {name}:{place}:turns=17"
+            )
+        several = [Term(name, place, choice) for choice in choices]
+        try:
+            term = pick(out, several) if len(several) > 1 else several[0]
+            term.columns(scene)
+        except KeyError as error:
+            key = str(error.args[0])
+            raise OptionError(
+                f"effect {text!r}: these data suggest no {key}; write {name}:{place}:{key}=NUMBER"
+            ) from error
+        out.append(term)
+    return tuple(out)
+
+
+FREE = frozenset({"turns", "constant", "since", "zero", "eye", "rest"})  # any number will do
+
+
+def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choice, ...]:
+    """The variants that a text leaves open.  Raises OptionError for one its law does not have."""
+    known = {key for choice in choices for key in choice}
+    for key, value in given.items():
+        if key not in known and (choices or key not in FREE):
+            said = f"choose {', '.join(sorted(known))}" if known else "its law has none"
+            raise OptionError(f"effect {text!r}: no choice {key!r}; {said}")
+        listed = sorted({choice[key] for choice in choices if key in choice})
+        if key in known - FREE and value not in listed:
+            offer = ", ".join(f"{number:g}" for number in listed)
+            raise OptionError(f"effect {text!r}: no {key} {value:g}; choose {offer}")
+        low = 0.0 if key == "constant" else -np.inf
+        if not (value > low and (np.isfinite(value) or key == "constant")):
+            raise OptionError(f"effect {text!r}: {key} {value:g} is not possible")
+    fitting = [c for c in choices if given.keys() <= c.keys()] if choices else [{}]
+    if not fitting:
+        raise OptionError(f"effect {text!r}: no variant has {' and '.join(given)}")
+    asked = [tuple(sorted({**choice, **given}.items())) for choice in fitting]
+    return tuple(dict(one) for one in dict.fromkeys(asked))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Effects with the values of their parameters: what a calibrated cell predicts with.
+
+    values: d for each term, in the order of its columns.
+    """
+
+    terms: tuple[Term, ...]
+    values: tuple[Array, ...]
+
+    def turn(self, scene: Scene) -> Array:
+        """(m, n) by how much the joints turn, signs applied [rad, m]."""
+        out = np.zeros((scene.joints, scene.poses))
+        for term, value in zip(self.terms, self.values, strict=True):
+            columns = term.columns(scene)
+            if columns.turn.size:
+                out += np.einsum("d,dnm->nm", value, columns.turn)
+        return out.T
+
+    def shift(self, scene: Scene) -> Array:
+        """(k, 3, m) by how much the targets move besides, in base axes [m]."""
+        out = np.zeros(scene.points.shape)
+        for term, value in zip(self.terms, self.values, strict=True):
+            columns = term.columns(scene)
+            if columns.shift.size:
+                out += np.einsum("d,dkcm->kcm", value, columns.shift)
+        return out
+
+    def points(self, scene: Scene) -> Array:
+        """(k, 3, m) the targets in the base frame with all effects, whatever their size [m]."""
+        if not self.terms:
+            return scene.points
+        links = kinematics.chain(
+            scene.robot.mdh, scene.q.T + self.turn(scene), scene.robot.prismatic
+        )
+        return kinematics.points(links, scene.spots) + self.shift(scene)
+
+    def to_list(self) -> list[dict[str, object]]:
+        """For JSON, in SI; an infinite time constant is null."""
+        return [
+            {
+                "effect": term.effect,
+                "place": term.place,
+                "choice": {k: v if np.isfinite(v) else None for k, v in term.choice.items()},
+                "values": [float(v) for v in value],
+            }
+            for term, value in zip(self.terms, self.values, strict=True)
+        ]
+
+
+NOTHING = Fitted((), ())
+
+
+def fitted_from_list(content: Sequence[Mapping[str, Any]]) -> Fitted:
+    """Effects from the JSON of a calibration.  Raises KeyError, TypeError, ValueError."""
+    terms, values = [], []
+    for entry in content:
+        name = str(entry["effect"])
+        if name not in EFFECTS:
+            raise ValueError(f"effect {name!r} is not known here")
+        choice = {str(k): float("inf") if v is None else float(v)
+                  for k, v in entry["choice"].items()}  # fmt: skip
+        terms.append(Term(name, str(entry["place"]), choice))
+        values.append(np.array(entry["values"], dtype=float).reshape(-1))
+    return Fitted(tuple(terms), tuple(values))
+
+
+def names_of(terms: Sequence[Term], scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names, as joint_compliance:J2.c2, and units of all parameters."""
+    names: list[str] = []
+    units: list[str] = []
+    for term in terms:
+        columns = term.columns(scene)
+        names += [f"{term.label}.{name}" for name in columns.names]
+        units += columns.units
+    return tuple(names), tuple(units)
+
+
+def fields_of(terms: Sequence[Term], scene: Scene) -> Array:
+    """(e, k, 3, m) motion of the points in base axes per unit of each parameter."""
+    return np.concatenate([term.columns(scene).displacement(scene) for term in terms])

@@ -1,0 +1,167 @@
+"""What changes as the measurement goes on: warm links, a creeping base, a nest that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
+from minimax_cal.robots.kinematics import cross
+
+CONSTANTS = (0.15, 0.5, np.inf)  # of the session; infinite is a straight line
+FINER = np.array([0.5, 0.65, 0.8, 0.9, 1.1, 1.25, 1.5, 2.0])
+ROOM = 20.0  # temperature at which lengths are what they are called [C]
+STEPS = 12  # moments at which a nest may have moved
+
+
+def course(scene: Scene, choice: Choice) -> Array:
+    """(m,) how far a change has gone: 1 - exp(-t/tau) over the session, or the temperature.
+
+    Where the temperature was not read it is the mean of those that were, or that of the room.
+    """
+    if "temperature" in choice:
+        warm = scene.data.columns.get("temperature", np.zeros(0)).astype(float)
+        known = warm[np.isfinite(warm)]
+        if not len(known):
+            return np.zeros(scene.poses)
+        return np.where(np.isfinite(warm), warm, known.mean()) - ROOM
+    clock, constant = scene.column("clock"), choice["constant"]
+    return clock if np.isinf(constant) else np.asarray(1.0 - np.exp(-clock / constant))
+
+
+def courses(scene: Scene, place: str) -> Sequence[Choice]:
+    """Time courses worth trying."""
+    found: list[Choice] = [{"constant": c} for c in CONSTANTS] if scene.has("clock") else []
+    return (*found, {"temperature": 1.0}) if scene.has("temperature") else tuple(found)
+
+
+def finer(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Time constants, or moments, near one that was chosen."""
+    if "since" in choice:
+        clock = np.sort(scene.column("clock"))
+        at = int(np.searchsorted(clock, choice["since"]))
+        step = max(1, len(clock) // STEPS)
+        near = clock[max(at - step, 3) : max(min(at + step, len(clock) - 3), 0)]
+        return tuple({**choice, "since": float(t)} for t in near)
+    if "constant" not in choice:
+        return ()
+    constant = choice["constant"]
+    values = (1.0, 1.5, 2.5, 5.0) if np.isinf(constant) else constant * FINER
+    return tuple({**choice, "constant": float(value)} for value in values)
+
+
+def told(choice: Choice) -> dict[str, float]:
+    """The choice for the report."""
+    constant = choice.get("constant", np.nan)
+    return {"time_constant_of_session": constant} if np.isfinite(constant) else {}
+
+
+def growth(scene: Scene, place: str, choice: Choice) -> Columns:
+    """The long lengths grow: together by one strain, or each by its own."""
+    a, d = scene.robot.mdh[:, 0], scene.robot.mdh[:, 1]
+    along = np.stack([a[:, None, None] * scene.links.x, d[:, None, None] * scene.links.z], axis=1)
+    size = np.stack([np.abs(a), np.abs(d)], axis=1)
+    grown = course(scene, choice) * along
+    if not choice.get("apart"):
+        common = grown[size > 0.1 * scene.robot.reach()].sum(axis=0)
+        shift = np.broadcast_to(common, (1, *scene.points.shape))
+        return Columns(("strain",), ("1",), shift=shift, fixed=told(choice))
+    chosen = sorted(np.argsort(-size.reshape(-1))[:3].tolist())
+    names = tuple(f"strain {'ad'[i % 2]}{i // 2 + 1}" for i in chosen)
+    parts = grown.reshape(-1, *grown.shape[2:])[chosen]
+    shift = np.broadcast_to(parts[:, None], (len(chosen), *scene.points.shape))
+    return Columns(names, ("1",) * len(names), shift=shift, fixed=told(choice))
+
+
+THERMAL_GROWTH = Effect(
+    "thermal_growth",
+    "links grow as the arm warms up",
+    "dl = l s (1 - exp(-t/tau)), or l s (T - 20 C)",
+    lambda scene: ("all",) if courses(scene, "all") else (),
+    growth,
+    finer=finer,
+    needs=lambda scene: "" if courses(scene, "all") else "columns time_s, order or temperature_C",
+    choices=lambda scene, place: tuple(
+        {**choice, "apart": apart} for choice in courses(scene, place) for apart in (0.0, 1.0)
+    ),
+    typical=1e-3,
+)
+
+
+def drift(scene: Scene, place: str, choice: Choice) -> Columns:
+    """The base moves and turns with time."""
+    f = course(scene, choice)
+    eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
+    turned = cross(eye, np.broadcast_to(scene.points, eye.shape))
+    return Columns(
+        ("x", "y", "z", "rx", "ry", "rz"),
+        ("m",) * 3 + ("rad",) * 3,
+        shift=f * np.concatenate([eye, turned]),
+        fixed=told(choice),
+    )
+
+
+FRAME_DRIFT = Effect(
+    "frame_drift",
+    "robot base or instrument creeps during the session",
+    "the base moves by (t, r) (1 - exp(-t/tau))",
+    lambda scene: ("frame",) if scene.has("clock") else (),
+    drift,
+    finer=finer,
+    needs=lambda scene: "" if scene.has("clock") else "column order or time_s",
+    choices=lambda scene, place: tuple(c for c in courses(scene, place) if "constant" in c),
+    typical=1e-2,
+)
+
+
+def nest(scene: Scene, place: str, choice: Choice) -> Columns:
+    """One target sits elsewhere on the flange from a moment on."""
+    target = scene.data.targets.index(place)
+    after = (scene.column("clock") >= choice["since"]).astype(float)
+    shift = np.zeros((3, *scene.points.shape))
+    shift[:, target] = after * scene.links.axes
+    return Columns(("x", "y", "z"), ("m",) * 3, shift=shift, fixed={"since": choice["since"]})
+
+
+def moments(scene: Scene, place: str) -> Sequence[Choice]:
+    """Moments spread over the session, with poses enough on both sides."""
+    clock = np.sort(scene.column("clock"))
+    if len(clock) < 12:
+        return ()
+    at = np.unique(np.linspace(5, len(clock) - 5, STEPS).astype(int))
+    return tuple({"since": float(clock[i])} for i in at)
+
+
+TARGET_SHIFT = Effect(
+    "target_shift",
+    "a reflector's nest moved during the session",
+    "the target sits elsewhere after row k",
+    lambda scene: scene.data.targets if scene.targets > 1 and scene.has("clock") else (),
+    nest,
+    finer=finer,
+    needs=lambda scene: "" if scene.targets > 1 else "a second target",
+    choices=moments,
+    typical=5e-3,
+)
+
+
+def sight(scene: Scene, place: str, choice: Choice) -> Columns:
+    """The distance reads r too far along the line of sight."""
+    seen = scene.points - scene.instrument[:, None]
+    unit = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    shift = np.zeros((1, *scene.points.shape))
+    chosen = slice(None) if place == "all" else scene.data.targets.index(place)
+    shift[0, chosen] = unit[chosen]
+    return Columns(("r",), ("m",), shift=shift)
+
+
+TARGET_OFFSET = Effect(
+    "target_offset",
+    "a reflector's offset or the instrument's zero is wrong along the line of sight",
+    "dp = r u, u from the instrument to the point",
+    lambda scene: (*scene.data.targets, "all") if scene.targets > 1 else ("all",),
+    sight,
+    typical=5e-3,
+)

@@ -1,0 +1,86 @@
+"""Geometry and effects in one model: the effects' fields become columns beside the geometry's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of
+from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares
+
+
+def scene_of(robot: Robot, data: Measurements, model: Model, state: State) -> Scene:
+    """What effects look at, with the geometry of a state."""
+    base = (state.rotation, state.origin)
+    return Scene.of(robot.with_mdh(state.mdh), data, base, state.targets, model.q)
+
+
+def fitted(terms: Sequence[Term], scene: Scene, values: Array) -> Fitted:
+    """Effects with their values from one array of all parameters."""
+    sizes = [len(term.columns(scene).names) for term in terms]
+    return Fitted(tuple(terms), tuple(np.split(values, np.cumsum(sizes)[:-1])) if terms else ())
+
+
+def extended(
+    model: Model, robot: Robot, data: Measurements, state: State, terms: Sequence[Term]
+) -> tuple[Model, State]:
+    """The geometric model with the effects' columns at a state, and the state with their values.
+
+    Columns are constant; what finite turns add to them is taken from the state's values, so that
+    a second pass at the fit of the first is exact to second order.
+    """
+    scene = scene_of(robot, data, model, state)
+    fields = fields_of(terms, scene)
+    names, _ = names_of(terms, scene)
+    values = state.effects if len(state.effects) else np.zeros(len(names))
+    moved = np.zeros((0, 0, 0))
+    if values.any():
+        exact = fitted(terms, scene, values).points(scene)
+        moved = exact - scene.points - np.tensordot(values, fields, 1)
+    count, more = model.names.geometric, len(names)
+    prior = model.prior
+    return replace(
+        model,
+        names=replace(model.names, effects=names),
+        fields=fields,
+        moved=moved,
+        active=np.concatenate([model.active[:count], np.ones(more, dtype=bool)]),
+        prior=Prior(*(np.concatenate([part[:count], np.zeros(more)])
+                      for part in (prior.mean, prior.weight))),
+    ), replace(state, effects=values)  # fmt: skip
+
+
+def refitted(
+    robot: Robot,
+    data: Measurements,
+    start: State,
+    active: Array,
+    terms: Sequence[Term],
+    usual: Array,
+) -> tuple[State, Fitted]:
+    """Least squares from a fit that is near: geometry on some poses, jointly with effects.
+
+    start: of the geometry.  active: (p,) the geometric parameters that are free.  usual: (e,) size
+    of the effects' parameters, a prior where the poses do not tell them; empty for none.
+    """
+    model, state = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    points, method = float(model.counts.sum()), least_squares.METHODS["snllm"]
+    for _ in range(2 if terms else 1):
+        wide, begin = extended(model, robot, data, state, terms) if terms else (model, state)
+        if len(usual):
+            spread = float(model.cost(replace(state, effects=np.zeros(0))).sum()) / (3.0 * points)
+            weight = np.concatenate([np.zeros(len(active)), spread / np.maximum(usual, 1e-30) ** 2])
+            wide = wide.with_prior(Prior(np.zeros(len(weight)), weight))
+        found = least_squares.solve(
+            SumOfSquares(wide), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
+        )
+        state = found.x.take(np.array(0))
+    return state, fitted(terms, scene_of(robot, data, model, state), state.effects)

@@ -1,0 +1,480 @@
+"""The bridge from robot and measurements to numbers: errors, normal equations, separable split.
+
+The Jacobian of all points is never stored: poses are taken in blocks that fit the cache, and each
+block adds to the normal equations of its target.  Sums over thousands of poses then cost what the
+arithmetic costs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.parameters import Names, State, links_of
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import Chain, hat
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.least_squares import solve_normal
+
+HEAVIEST = 100.0  # no u95 counts as more than so many times better than the typical one
+BLOCK = 768  # points a block: its Jacobian then fits the second-level cache
+
+
+NO_MIX: Array = np.zeros((0, 0, 0))
+NO_FIELDS: Array = np.zeros((0, 0, 0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Sums of squares and their normal equations, for each target.
+
+    cost: (..., k) F_i = sum_j w_ij |e_ij|^2 [m^2].
+    slope: (..., k, p) J_i' W e_i, so that the gradient of F_i is -2 slope_i.
+    gram: (..., k, p, p) J_i' W J_i.
+    """
+
+    cost: Array
+    slope: Array
+    gram: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some poses and the chain of the arm there."""
+
+    rows: slice
+    links: Chain
+
+    @cached_property
+    def screws(self) -> tuple[Array, Array]:
+        """See `kinematics.screws`."""
+        return kinematics.screws(self.links)
+
+    def stretched(self, state: State, model: Model) -> Block:
+        """The same poses with other lengths, angles as they were."""
+        q = model.q[self.rows]
+        return Block(self.rows, kinematics.stretch(self.links, state.mdh, q, model.prismatic))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian knowledge about parameters: mean (p,) and weight (p,) = noise^2 / sigma^2."""
+
+    mean: Array
+    weight: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot at given poses, and what was measured there.
+
+    q: (m, n) joint values with signs applied.  prismatic: (n,).
+    y: (k, 3, m) measured points, 0 where not measured [m].
+    weight: (k, m) weight of each point, 0 where not measured.
+    names: the parameters.  active: (p,) True where a parameter is free.
+    prior: on the parameters, in the order of `names`.
+    mix: (m, 3k, 3k) matrices that each pose's errors (all targets, measurement axes) are multiplied
+    by, so that the sum of squares weighs position and orientation; empty for plain points.
+    fields: (e, k, 3, m) motion of the points, in base axes, per unit of each effect's parameter.
+    moved: (k, 3, m) by how much more they are known to move [m]; empty for not at all.
+    """
+
+    q: Array
+    prismatic: Array
+    y: Array
+    weight: Array
+    names: Names
+    active: Array
+    prior: Prior
+    mix: Array = field(default_factory=lambda: NO_MIX)
+    fields: Array = field(default_factory=lambda: NO_FIELDS)
+    moved: Array = field(default_factory=lambda: NO_MIX)
+
+    @property
+    def counts(self) -> Array:
+        """(k,) at how many poses each target was measured."""
+        return np.asarray(np.count_nonzero(self.weight, axis=1))
+
+    @cached_property
+    def seen(self) -> Array:
+        """(k, m) True where a target was measured."""
+        return np.asarray(self.weight > 0.0)
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether every weight is one."""
+        return bool(np.all(self.weight == 1.0))
+
+    def only(self, active: Array) -> Model:
+        """The same model with other free parameters."""
+        return replace(self, active=active)
+
+    def with_prior(self, prior: Prior) -> Model:
+        """The same model with another prior."""
+        return replace(self, prior=prior)
+
+    def emphasise(self, share: Array) -> Model:
+        """The same model with the points of target i weighted by share_i too.  share: (k,)."""
+        return replace(self, weight=self.weight * share[:, None])
+
+    def error(self, state: State) -> Array:
+        """Measured minus predicted, in base axes: (..., k, m, 3), NaN where not measured [m]."""
+        links = kinematics.chain(state.mdh, self.q, self.prismatic)
+        point = self.displaced(state, kinematics.points(links, state.targets), slice(None))
+        error = np.swapaxes(in_base(state, self.y) - point, -1, -2)
+        error[..., ~self.seen, :] = np.nan
+        return np.asarray(error)
+
+    def jacobian(self, state: State) -> Array:
+        """Derivative of every point, in base axes, by every parameter: (..., k, m, 3, p)."""
+        links = kinematics.chain(state.mdh, self.q, self.prismatic)
+        point = kinematics.points(links, state.targets)
+        every = np.ones(self.names.count, dtype=bool)
+        block = Block(slice(len(self.q)), links)
+        swung = self.displaced(state, point, slice(None))
+        turned = Columns.of(self.names, every).jacobian(block, point, swung, self.fields)
+        return np.asarray(np.swapaxes(np.moveaxis(turned, -3, -1), -3, -2))
+
+    def blocks(self, state: State) -> list[Block]:
+        """The poses cut into blocks that fit the cache, each with its chain."""
+        robots = int(np.prod(state.mdh.shape[:-2]))
+        m = len(self.q)
+        parts = -(-m * robots * len(self.y) // BLOCK)
+        edges = np.linspace(0, m, min(parts, m) + 1).astype(int)
+        rows = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
+        q, flat = self.q, self.prismatic
+        return [Block(part, kinematics.chain(state.mdh, q[part], flat)) for part in rows]
+
+    def error_of(self, state: State, block: Block) -> tuple[Array, Array]:
+        """Weighted errors and predicted points of one block: (..., k, 3, c) each [m]."""
+        point = kinematics.points(block.links, state.targets)
+        error = in_base(state, self.y[..., block.rows]) - self.displaced(state, point, block.rows)
+        if not self.even:
+            error *= np.sqrt(self.weight[:, None, block.rows])
+        return self.mixed(state, error, block.rows), point
+
+    def displaced(self, state: State, point: Array, poses: slice) -> Array:
+        """Points (..., k, 3, c) moved by the effects at the state's values."""
+        if len(self.moved):
+            point = point + self.moved[..., poses]
+        if len(self.fields):
+            point = point + np.tensordot(state.effects, self.fields[..., poses], 1)
+        return point
+
+    def mixed(self, state: State, rows: Array, poses: slice) -> Array:
+        """Rows (..., k, 3, c) in base axes times the mix, if there is one."""
+        if not len(self.mix):
+            return rows
+        turned = state.rotation[..., None, :, :] @ rows
+        *batch, k, _, c = rows.shape
+        flat = turned.reshape(*batch, 3 * k, c)
+        mixed = np.einsum("cab,...bc->...ac", self.mix[poses], flat)
+        return np.asarray(mixed.reshape(rows.shape))
+
+    def pulled(self, state: State, error: Array, poses: slice) -> Array:
+        """Weighted errors times the transposed weight, in base axes: what pulls at each point."""
+        if len(self.mix):
+            *batch, k, _, c = error.shape
+            flat = error.reshape(*batch, 3 * k, c)
+            back = np.einsum("cba,...bc->...ac", self.mix[poses], flat).reshape(error.shape)
+            error = np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ back
+        if not self.even:
+            error = error * np.sqrt(self.weight[:, None, poses])
+        return error
+
+    def cost(self, state: State) -> Array:
+        """F_i: (..., k) [m^2], the prior left out."""
+        total = np.zeros(1)
+        for block in self.blocks(state):
+            error, _ = self.error_of(state, block)
+            total = total + np.einsum("...kcm,...kcm->...k", error, error)
+        return np.asarray(total)
+
+    def normal(self, state: State, active: Array) -> Normal:
+        """Normal equations for the parameters that are True in active (p,), at a state."""
+        return self.normal_on(state, active, self.blocks(state))
+
+    def normal_on(self, state: State, active: Array, blocks: list[Block]) -> Normal:
+        """`normal` with the chains at hand."""
+        select = Columns.of(self.names, active)
+        cost, slope, gram = np.zeros((3, 1))
+        for block in blocks:
+            error, turned = self.rows_of(state, block, select)
+            *batch, k, p, _, c = turned.shape
+            flat = turned.reshape(*batch, k, p, 3 * c)
+            cost = cost + np.einsum("...kcm,...kcm->...k", error, error)
+            slope = slope + (flat @ error.reshape(*batch, k, 3 * c, 1))[..., 0]
+            gram = gram + flat @ np.swapaxes(flat, -1, -2)
+        return Normal(np.asarray(cost), np.asarray(slope), np.asarray(gram))
+
+    def weighted_rows(self, state: State, block: Block, active: Array) -> tuple[Array, Array]:
+        """Weighted errors (..., k, 3, c) and transposed Jacobian (..., k, p, 3, c) of one block."""
+        return self.rows_of(state, block, Columns.of(self.names, active))
+
+    def rows_of(self, state: State, block: Block, select: Columns) -> tuple[Array, Array]:
+        """`weighted_rows` with the choice of columns at hand."""
+        error, point = self.error_of(state, block)
+        swung = self.displaced(state, point, block.rows)
+        turned = select.jacobian(block, point, swung, self.fields)
+        if not self.even:
+            turned *= np.sqrt(self.weight[:, None, None, block.rows])
+        if len(self.mix):  # parameter by parameter, the targets of a pose together
+            axis = turned.ndim - 4
+            one = replace(state, rotation=state.rotation[..., None, :, :])
+            turned = self.mixed(one, np.moveaxis(turned, axis, axis + 1), block.rows)
+            turned = np.ascontiguousarray(np.moveaxis(turned, axis + 1, axis))
+        return error, turned
+
+    def coupling_on(self, state: State, blocks: list[Block]) -> Array:
+        """M = sum of w e . d2x/(dr domega) for free lengths r and angles omega: (..., r, omega).
+
+        The part of the variable-projection Jacobian that Kaufman leaves out [paper S, eq. 24].
+        """
+        names, active = self.names, self.active
+        n, k = names.joints, len(names.targets)
+        linear = names.linear
+        total = np.zeros(1)
+        for block in blocks:
+            links = block.links
+            error = self.pulled(state, self.error_of(state, block)[0], block.rows)
+            *batch, _, _, c = error.shape
+            axis, _ = block.screws
+            base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
+            axis = np.concatenate([axis, base], axis=-3)  # theta, alpha, beta, base rotation
+            fields = self.fields[..., block.rows].reshape(len(self.fields), k, 3 * c)
+            part = np.zeros((*batch, 2 * n + 3 + 3 * k + len(fields), 3 * n + 3))
+            pull = kinematics.cross(error.sum(-3)[..., None, :, :], axis)
+            flat = np.swapaxes(pull.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
+            lengths = np.concatenate([links.x, links.z], axis=-3)
+            part[..., : 2 * n, :] = lengths.reshape(*batch, 2 * n, 3 * c) @ flat
+            turned = links.axes.reshape(*batch, 3, 3 * c)
+            for i in range(k):
+                own = kinematics.cross(error[..., i, None, :, :], axis)
+                flat = np.swapaxes(own.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
+                part[..., 2 * n + 3 + 3 * i : 2 * n + 6 + 3 * i, :] = turned @ flat
+                if len(fields):
+                    part[..., 2 * n + 3 + 3 * k :, :] += fields[:, i] @ flat
+            total = total + part
+        coupled = total * precedes(n, k, len(self.fields))
+        return np.asarray(coupled[..., active[linear], :][..., active[~linear]])
+
+    def values(self, state: State) -> Array:
+        """(..., p) the parameters' values; base rotation entries are 0 (they are steps only)."""
+        *batch, n, _ = state.mdh.shape
+        k = state.targets.shape[-2]
+        links = np.swapaxes(state.mdh, -1, -2).reshape(*batch, 5 * n)
+        base = np.concatenate([state.origin, np.zeros((*batch, 3))], axis=-1)
+        spots = state.targets.reshape(*batch, 3 * k)
+        more = np.broadcast_to(state.effects, (*batch, len(self.fields)))
+        return np.concatenate([links, base, spots, more], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SumOfSquares:
+    """The sum of F_i over all targets, plus the prior: separable in the free parameters."""
+
+    model: Model
+
+    @property
+    def linear(self) -> Array:
+        """(free,) True for lengths."""
+        return np.asarray(self.model.names.linear[self.model.active])
+
+    def normal(self, x: State) -> tuple[Array, Array, Array]:
+        """Cost (...), slope (..., free) and Gram matrix (..., free, free)."""
+        return self.normal_on(x, self.model.active, self.model.blocks(x))
+
+    def normal_on(self, x: State, active: Array, blocks: list[Block]) -> tuple[Array, Array, Array]:
+        """The same over any choice of parameters, with the chains at hand."""
+        normal, prior = self.model.normal_on(x, active, blocks), self.model.prior
+        off = prior.mean - self.model.values(x)
+        weight = prior.weight[active]
+        cost = normal.cost.sum(-1) + (prior.weight * off**2).sum(-1)
+        slope = normal.slope.sum(-2) + weight * off[..., active]
+        return cost, slope, normal.gram.sum(-3) + np.diag(weight)
+
+    def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
+        """The states with their best free lengths [paper S, eq. 18], `normal` there, and M.
+
+        full: whether to compute the coupling M (..., r, omega); zeros otherwise.
+        """
+        model = self.model
+        lengths = model.active & model.names.linear
+        blocks = model.blocks(x)
+        _, slope, gram = self.normal_on(x, lengths, blocks)
+        dx = np.zeros((*slope.shape[:-1], model.names.count))
+        dx[..., lengths] = solve_normal(gram, slope[..., None])[..., 0]
+        x = x.step(dx)
+        blocks = [block.stretched(x, model) for block in blocks]
+        found = self.normal_on(x, model.active, blocks)
+        free = self.linear
+        nothing = np.zeros((*slope.shape[:-1], free.sum(), (~free).sum()))
+        return x, *found, model.coupling_on(x, blocks) if full else nothing
+
+    def cost(self, x: State) -> Array:
+        """The sum alone: (...)."""
+        off = self.model.prior.mean - self.model.values(x)
+        return np.asarray(self.model.cost(x).sum(-1) + (self.model.prior.weight * off**2).sum(-1))
+
+    def step(self, x: State, dx: Array) -> State:
+        """The states moved by a step in the free parameters."""
+        full = np.zeros((*dx.shape[:-1], self.model.names.count))
+        full[..., self.model.active] = dx
+        return x.step(full)
+
+
+def in_base(state: State, y: Array) -> Array:
+    """Measured points in base axes: (..., k, 3, m).  y: (k, 3, m) in the measurement frame."""
+    centred = y - state.origin[..., None, :, None]
+    return np.asarray(np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ centred)
+
+
+def precedes(n: int, k: int, effects: int) -> Array:
+    """(r, omega) True where turning angle omega turns the direction of length r.
+
+    The fields of effects are held fixed in base axes: only the base turns them.
+    """
+    link = np.arange(n)
+    spots, fields = np.full(3 * k, 3 * n), np.full(effects, -1)
+    length = np.concatenate([3 * link + 1, 3 * link, np.full(3, -9), spots, fields])
+    angle = np.concatenate([3 * link, 3 * link + 1, 3 * link + 2, np.full(3, -1)])
+    return np.asarray(angle[None, :] <= length[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Which columns a Jacobian has and where they come from."""
+
+    count: int
+    lengths: Array
+    angles: Array
+    base: Array
+    targets: Array
+    effects: Array
+    targets_at: int
+    angles_at: int
+    joints: int
+
+    @staticmethod
+    def of(names: Names, active: Array) -> Columns:
+        """The columns of the active parameters, in order."""
+        n = names.joints
+        base = np.flatnonzero(active[5 * n : 5 * n + 3])
+        turns = np.flatnonzero(active[5 * n + 3 : 5 * n + 6])
+        lengths = np.flatnonzero(active[: 2 * n])
+        angles = np.flatnonzero(active[2 * n : 5 * n])
+        targets = np.flatnonzero(active[5 * n + 6 : names.geometric])
+        effects = np.flatnonzero(active[names.geometric :])
+        count = sum(map(len, (lengths, angles, base, turns, targets, effects)))
+        return Columns(
+            count,
+            lengths,
+            np.concatenate([angles, 3 * n + turns]),
+            base,
+            targets,
+            effects,
+            count - len(targets) - len(effects),
+            len(lengths),
+            len(angles),
+        )
+
+    def jacobian(self, block: Block, point: Array, swung: Array, fields: Array) -> Array:
+        """Transposed derivative of points (..., k, 3, c): (..., k, p, 3, c), base axes.
+
+        swung: the points where effects have moved them to: a turn of the base takes both along.
+        fields: (e, k, 3, m) of the effects, at all poses.
+        """
+        *batch, k, _, c = point.shape
+        links = block.links
+        n = links.x.shape[-3]
+        out = np.empty((*batch, k, self.count, 3, c), dtype=point.dtype)
+        for column, which in enumerate(self.lengths):
+            source = links.x if which < n else links.z
+            out[..., column, :, :] = source[..., None, which % n, :, :]
+        if len(self.angles):
+            axis, moment = block.screws
+            turns = self.angles[: self.joints]
+            axis, moment = axis[..., turns, :, :], moment[..., turns, :, :]
+            at = self.angles_at
+            out[..., at : at + self.joints, :, :] = moment[..., None, :, :, :] - kinematics.cross(
+                point[..., None, :, :], axis[..., None, :, :, :]
+            )
+            at += self.joints + len(self.base)
+            own = np.eye(3)[self.angles[self.joints :] - 3 * n, :, None]
+            out[..., at : self.targets_at, :, :] = kinematics.cross(own, swung[..., None, :, :])
+        at = self.angles_at + self.joints
+        out[..., at : at + len(self.base), :, :] = np.eye(3)[self.base][..., None]
+        out[..., self.targets_at :, :, :] = 0.0
+        for column, which in enumerate(self.targets, start=self.targets_at):
+            target, axis_number = divmod(int(which), 3)
+            out[..., target, column, :, :] = links.axes[..., axis_number, :, :]
+        if len(self.effects):
+            chosen = fields[self.effects][..., block.rows]
+            out[..., self.targets_at + len(self.targets) :, :, :] = np.moveaxis(chosen, 0, 1)
+        return out
+
+
+def model_of(robot: Robot, data: Measurements) -> Model:
+    """The model of a robot at the measured poses, all parameters free, no prior.
+
+    Points are weighted by (typical u95 / u95)^2 where the data have a `u95` column.
+    """
+    seen = data.seen.T
+    weight = seen.astype(float)
+    if "u95" in data.columns:
+        u95 = data.columns["u95"]
+        usual = np.nanmedian(u95)
+        least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
+        weight = weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
+    names = Names(robot.joints, data.targets)
+    mean = np.zeros(names.count)
+    mean[names.links] = links_of(robot.mdh)
+    return Model(
+        q=data.q * robot.sign,
+        prismatic=robot.prismatic,
+        y=np.where(seen[:, None], np.moveaxis(data.y, 0, 2), 0.0),
+        weight=weight,
+        names=names,
+        active=np.ones(names.count, dtype=bool),
+        prior=Prior(mean, np.zeros(names.count)),
+    )
+
+
+def pose_weights(data: Measurements, lever: float) -> Array:
+    """W (m, 3k, 3k) that turns the errors of three or more targets into pose errors, squared.
+
+    e'We = k |e_c|^2 + k lever^2 |e_w|^2 + stiffness |e_s|^2 per pose: e_c is the error of the
+    targets' centroid, e_w the small turn that fits their errors best, e_s what no rigid motion
+    explains.  e_s depends on the targets' places alone, and must weigh as much as the turn: a
+    smaller triangle would turn errors into small ones.  lever: metres that a radian counts as; NaN
+    for the targets' own, with which W is nearly the plain sum.  Rows where a target is missing
+    are zero.
+    """
+    k = len(data.targets)
+    whole = np.asarray(data.seen.all(axis=1))
+    arm = np.where(whole[:, None, None], data.y - data.y.mean(axis=1, keepdims=True), 0.0)
+    inertia = (arm**2).sum((1, 2))[:, None, None] * np.eye(3) - np.swapaxes(arm, 1, 2) @ arm
+    inertia[~whole] = np.eye(3)
+    own = float(np.sqrt(np.trace(inertia[whole].mean(axis=0)) / 3.0 / k))
+    lever = lever if np.isfinite(lever) else own
+    centre = np.tile(np.eye(3) / k, k)
+    turned = np.concatenate(np.moveaxis(hat(arm), 1, 0), axis=-1)
+    turn = np.linalg.solve(inertia, turned)
+    back = np.swapaxes(turn, 1, 2)
+    shape = np.eye(3 * k) - k * (centre.T @ centre) - np.swapaxes(turned, 1, 2) @ turn
+    weight = k * (centre.T @ centre + lever**2 * back @ turn) + max(1.0, lever / own) ** 2 * shape
+    weight = 0.5 * (weight + np.swapaxes(weight, 1, 2)) + 1e-12 * np.eye(3 * k)
+    return np.where(whole[:, None, None], weight, 0.0)
+
+
+def with_poses(model: Model, weight: Array) -> Model:
+    """The model whose sum of squares is that of pose errors.  weight: as `pose_weights`."""
+    mix = np.zeros_like(weight)
+    whole = np.asarray(weight.any(axis=(1, 2)))
+    mix[whole] = np.swapaxes(np.linalg.cholesky(weight[whole]), 1, 2)
+    return replace(model, mix=mix)

@@ -1,0 +1,162 @@
+"""Which numbers describe a calibrated cell: names, kinds, units, and how a step changes them.
+
+The order is fixed: all a, all d, all theta, all alpha, all beta, the base frame's translation and
+rotation, then the targets.  Base steps are taken in the base's own axes, so that nothing depends on
+where the measuring instrument stands.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import MDH_NAMES
+
+BASE_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A geometry, the base in the measurement frame, and the targets; ``...`` is a batch.
+
+    mdh: (..., n, 5) [m, rad].  rotation: (..., 3, 3), origin: (..., 3) [m], pose of the base.
+    targets: (..., k, 3) in the last frame [m].
+    effects: (..., e) parameters of effects beyond geometry, in their own units; (0,) without any.
+    """
+
+    mdh: Array
+    rotation: Array
+    origin: Array
+    targets: Array
+    effects: Array = field(default_factory=lambda: np.zeros(0))
+
+    def step(self, dx: Array) -> State:
+        """The state moved by dx (..., p), all parameters in the order of `Names`."""
+        n, k = self.mdh.shape[-2], self.targets.shape[-2]
+        batch = dx.shape[:-1]
+        links = np.swapaxes(dx[..., : 5 * n].reshape(*batch, 5, n), -1, -2)
+        move, turn, shift, more = np.split(dx[..., 5 * n :], (3, 6, 6 + 3 * k), axis=-1)
+        return State(
+            mdh=self.mdh + links,
+            rotation=self.rotation @ kinematics.rotation(turn),
+            origin=self.origin + (self.rotation @ move[..., None])[..., 0],
+            targets=self.targets + shift.reshape(*batch, k, 3),
+            effects=self.effects + more,
+        )
+
+    def take(self, rows: Array) -> State:
+        """Some members of a batch."""
+        some = self.effects[rows] if self.effects.ndim > 1 else self.effects
+        return State(
+            self.mdh[rows], self.rotation[rows], self.origin[rows], self.targets[rows], some
+        )
+
+    def put(self, rows: Array, other: State) -> State:
+        """The batch with some members replaced."""
+        out = replace(
+            self,
+            mdh=self.mdh.copy(),
+            rotation=self.rotation.copy(),
+            origin=self.origin.copy(),
+            targets=self.targets.copy(),
+            effects=self.effects.copy(),
+        )
+        out.mdh[rows], out.rotation[rows] = other.mdh, other.rotation
+        out.origin[rows], out.targets[rows] = other.origin, other.targets
+        if self.effects.ndim > 1:
+            out.effects[rows] = other.effects
+        return out
+
+    def batch(self) -> State:
+        """A single state as a batch of one."""
+        return State(
+            self.mdh[None],
+            self.rotation[None],
+            self.origin[None],
+            self.targets[None],
+            self.effects[None],
+        )
+
+    def repeat(self, count: int) -> State:
+        """A single state, count times."""
+        return self.batch().take(np.zeros(count, dtype=int))
+
+
+@dataclass(frozen=True)
+class Names:
+    """The parameters of an arm with n joints seen through some targets, and of its effects."""
+
+    joints: int
+    targets: tuple[str, ...]
+    effects: tuple[str, ...] = ()
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..., effects."""
+        links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
+        spots = [f"{target}_{axis}" for target in self.targets for axis in "xyz"]
+        return (*links, *BASE_NAMES, *spots, *self.effects)
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+        return self.geometric + len(self.effects)
+
+    @property
+    def geometric(self) -> int:
+        """Number of parameters that are not of effects; those come first."""
+        return 5 * self.joints + 6 + 3 * len(self.targets)
+
+    @property
+    def linear(self) -> Array:
+        """(p,) True for lengths and effects: positions are affine in them [paper S, eq. 11]."""
+        n = self.joints
+        mask = np.ones(self.count, dtype=bool)
+        mask[2 * n : 5 * n] = False
+        mask[5 * n + 3 : 5 * n + 6] = False
+        return mask
+
+    @property
+    def links(self) -> Array:
+        """(p,) True for the robot's own parameters, False for base and targets."""
+        return np.arange(self.count) < 5 * self.joints
+
+    def index(self, name: str) -> int:
+        """Place of a name."""
+        return self.all.index(name)
+
+    def match(self, patterns: Iterable[str], option: str) -> Array:
+        """(p,) True where the name of a link parameter matches.  Raises OptionError.
+
+        ``a*`` is every a (not alpha), ``*2`` all of joint 2, ``*`` every link parameter.
+        """
+        names, chosen = self.all, np.zeros(self.count, dtype=bool)
+        kinds = np.array([name.rstrip("0123456789") for name in names])
+        for pattern in patterns:
+            hits = np.array([fnmatchcase(name, pattern) for name in names])
+            if pattern.endswith("*") and pattern[:-1] in MDH_NAMES:
+                hits = kinds == pattern[:-1]
+            if "*" in pattern:
+                hits &= self.links
+            if (hits & ~self.links).any():
+                raise OptionError(
+                    f"{option} {pattern}: base and targets have no nominal value to keep"
+                )
+            if not hits.any():
+                close = difflib.get_close_matches(pattern, names, 1)
+                hint = f"did you mean {close[0]}?" if close else "try a1, theta2, beta*, base_z"
+                raise OptionError(f"{option}: no parameter called {pattern!r}; {hint}")
+            chosen |= hits
+        return chosen
+
+
+def links_of(mdh: Array) -> Array:
+    """Link parameters of an MDH table in the order of `Names`: (5n,)."""
+    return np.asarray(mdh.T.reshape(-1))

@@ -1,0 +1,123 @@
+"""Simulated measurements of a robot that is not quite its drawing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import torques
+from minimax_cal.robots.robot import Robot
+
+MOST_POSES, MOST_TARGETS = 1_000_000, 20
+MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
+
+
+@dataclass(frozen=True)
+class Truth:
+    """How far the simulated arm is from nominal, and how well it is measured.
+
+    length, angle: standard deviation of the errors of a, d [m] and theta, alpha, beta [rad].
+    compliance: turn of every joint per gravity torque [rad/(N m)].  noise, noise_per_metre:
+    standard deviation of each coordinate, and its growth with range [m, -].  distance: of the
+    instrument from the robot [m].  circle: radius on which the targets sit on the flange [m].
+    """
+
+    length: float = 0.5e-3
+    angle: float = 1.0e-3
+    compliance: float = 3.0e-7
+    noise: float = 10e-6
+    noise_per_metre: float = 2.5e-6
+    distance: float = 3.0
+    circle: float = 0.1
+    span: float = np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """data: the measurements.  cell: the true robot, base and targets (without its compliance)."""
+
+    data: Measurements
+    cell: Cell
+
+
+def simulate(
+    robot: Robot,
+    poses: int = 100,
+    targets: int = 3,
+    seed: int = 0,
+    truth: Truth = Truth(),
+) -> Simulation:
+    """Measure an imperfect copy of a robot at random poses, from a random place.
+
+    Raises OptionError for counts that make no sense.
+    """
+    if not (1 <= poses <= MOST_POSES and 1 <= targets <= MOST_TARGETS):
+        raise OptionError(
+            f"simulate needs at least one pose and one target, at most {MOST_POSES} and "
+            f"{MOST_TARGETS}"
+        )
+    if seed < 0:
+        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    for name, value in vars(truth).items():
+        if not (np.isfinite(value) and value >= 0.0):
+            raise OptionError(f"simulate: {name} {value:g} must be a finite number, 0 or more")
+    rng = np.random.default_rng(seed)
+    n = robot.joints
+    errors = rng.normal(size=(n, 5)) * ([truth.length] * 2 + [truth.angle] * 3)
+    real = robot.with_mdh(robot.mdh + errors)
+    base = np.eye(4)
+    base[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    aside = rng.normal(size=3)
+    base[:3, 3] = truth.distance * aside / np.linalg.norm(aside)
+    angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets
+    spots = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0.0 * angle], axis=1) * truth.circle
+    cell = Cell(real, base, tuple(f"smr{i + 1}" for i in range(targets)), spots)
+    q = random_poses(robot, poses, rng, truth.span)
+    y = cell.predict(q + truth.compliance * gravity(real, q))
+    spread = truth.noise + truth.noise_per_metre * np.linalg.norm(y, axis=-1, keepdims=True)
+    y = y + spread * rng.normal(size=y.shape)
+    data = Measurements(
+        q=q,
+        y=y,
+        targets=cell.targets,
+        sliding=robot.prismatic,
+        line=np.arange(poses) + 2,
+        columns={"order": np.arange(poses)},
+        source=f"simulated {robot.name}",
+    )
+    return Simulation(data, cell)
+
+
+def random_poses(robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi) -> Array:
+    """Joint values (count, n) within the limits and one turn, the flange above the floor."""
+    most = np.where(robot.prismatic, 0.5, span)
+    lower, upper = np.maximum(robot.lower, -most), np.minimum(robot.upper, most)
+    chosen = np.empty((0, robot.joints))
+    for _ in range(100):
+        q = rng.uniform(lower, upper, (4 * count, robot.joints))
+        high = robot.pose(q)[:, :3, 3] @ robot.up > 0.1 * robot.reach()
+        chosen = np.concatenate([chosen, q[high]])[:count]
+        if len(chosen) == count:
+            return chosen
+    # an arm that hangs below its base: every pose is as good as another
+    return rng.uniform(lower, upper, (count, robot.joints))
+
+
+def gravity(robot: Robot, q: Array) -> Array:
+    """Gravity torques (m, n), in the controller's sense [N m]; assumed masses where unknown."""
+    links = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic)
+    known = np.isfinite(robot.mass) & np.isfinite(robot.com).all(axis=1)
+    length = np.hypot(robot.mdh[:, 0], robot.mdh[:, 1])
+    halfway = np.zeros((robot.joints, 3))
+    halfway[:, 0] = -0.5 * robot.mdh[:, 0]
+    mass = np.where(known, robot.mass, MASS_PER_METRE * length)
+    com = np.where(known[:, None], robot.com, halfway)
+    bend = torques(links, mass, com, robot.up).T * robot.sign
+    return np.where(robot.prismatic, 0.0, bend)

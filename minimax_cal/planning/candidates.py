@@ -1,0 +1,181 @@
+"""Candidate poses: a quasi-random sequence within the limits, less what cannot be taken or seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Table
+from minimax_cal.planning.visibility import ARM, TRACKER, Room, Sight, View
+from minimax_cal.robots.robot import Robot
+
+SLIDE = 0.5  # how far a slide without limits goes to either side [m]
+BATCH, VAIN, MOST = 2**13, 2**16, 2**19  # poses drawn at a time, in vain, and at most
+Conditions = Mapping[str, Callable[[View], Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """q: (c, n) joint values as the controller gives them [rad, m].
+
+    seen: (c, k) which targets the instrument sees.  tested: how many poses were drawn.
+    rejected: share of those drawn that each condition alone would reject.
+    drawn: how many of q, the first, are of the sequence; the others were looked for near some.
+    """
+
+    q: Array
+    seen: Array
+    tested: int
+    rejected: Mapping[str, float]
+    drawn: int
+
+    def table(self) -> Table:
+        """What each condition rejects."""
+        rows = tuple((name, 100.0 * share) for name, share in self.rejected.items())
+        title = f"{self.drawn} candidates of {self.tested} poses drawn"
+        if len(self.q) > self.drawn:
+            title += f", and {len(self.q) - self.drawn} near those that told most"
+        return Table(title, ("condition", "rejects alone %"), rows, ("", ".1f"))
+
+    def join(self, q: Array, seen: Array) -> Poses:
+        """With further candidates."""
+        both = np.concatenate([self.q, q]), np.concatenate([self.seen, seen])
+        return Poses(*both, self.tested, self.rejected, self.drawn)
+
+
+def limits_of(
+    robot: Robot, narrow: Mapping[int, tuple[float, float]]
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """(n,) lower and upper limits [rad, m], and a notice where the robot file has none.
+
+    A joint turns at most once round.  narrow: limits by joint index that cut these.
+    Raises OptionError.
+    """
+    most = np.where(robot.prismatic, SLIDE, np.pi)
+    known = np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    lower = np.where(np.isfinite(robot.lower), robot.lower, -most)
+    upper = np.where(np.isfinite(robot.upper), robot.upper, most)
+    once = known & ~robot.prismatic & (np.maximum(lower, -np.pi) < np.minimum(upper, np.pi))
+    lower = np.where(once, np.maximum(lower, -np.pi), lower)
+    upper = np.where(once, np.minimum(upper, np.pi), upper)
+    for joint, (least, largest) in narrow.items():
+        lower[joint], upper[joint] = max(lower[joint], least), min(upper[joint], largest)
+        if not lower[joint] < upper[joint]:
+            raise OptionError(
+                f"joint {joint + 1}: no range is left within the limits of {robot.name}; "
+                "give low:high, low below high, in deg (slides: mm)"
+            )
+    open_ones = [i for i in np.flatnonzero(~known) if i not in narrow]
+    notices = []
+    if open_ones:
+        names = ", ".join(str(i + 1) for i in open_ones)
+        notices.append(
+            f"{robot.name} has no limits for joint {names}: +-180 deg are taken (slides +-500 mm); "
+            "narrow them with --joint"
+        )
+    return lower, upper, tuple(notices)
+
+
+def free_poses(room: Room, count: int, seed: int) -> Array:
+    """(count, n) poses anywhere that the arm can take, seen or not: where it may be put to work.
+
+    The box does not count.  Raises OptionError where there are hardly any.
+    """
+    nowhere = Sight(np.zeros(3), room.robot.up)
+    conditions = {name: ARM[name] for name in ("floor", "self-collision")}
+    found = drawn(room, nowhere, count, seed, conditions, {})
+    return found.q
+
+
+def candidates(room: Room, sight: Sight, count: int, seed: int) -> Poses:
+    """Poses that the arm can take and the instrument sees: the first `count` of a Sobol sequence.
+
+    Fewer where they are rare.  Raises OptionError where there is none, with what rejects most.
+    """
+    return drawn(room, sight, count, seed, ARM, TRACKER)
+
+
+def near(
+    room: Room, sight: Sight, q: Array, each: int, step: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Poses around some (m, n) that can be taken and seen: their joints, and what is seen.
+
+    each: how many are tried around one.  step: standard deviation, as a share of the joint's range;
+    what goes beyond a limit stays at it.
+    """
+    spread = step * (room.upper - room.lower)
+    around = np.repeat(q, each, axis=0)
+    tried = np.clip(around + spread * rng.normal(size=around.shape), room.lower, room.upper)
+    good, seen, _ = judged(room, sight, tried, ARM, TRACKER)
+    return tried[good], seen[good]
+
+
+def drawn(
+    room: Room, sight: Sight, count: int, seed: int, arm: Conditions, tracker: Conditions
+) -> Poses:
+    """Poses of the sequence that meet the conditions.  Raises OptionError where there is none."""
+    sequence = qmc.Sobol(len(room.lower), scramble=True, rng=np.random.default_rng(seed))
+    kept_q, kept_seen, tested, found = [], [], 0, 0
+    total = dict.fromkeys((*arm, *tracker), 0)
+    while found < count and tested < (MOST if found else VAIN):
+        q = qmc.scale(sequence.random(BATCH), room.lower, room.upper)
+        good, seen, against = judged(room, sight, q, arm, tracker)
+        total = {name: number + against[name] for name, number in total.items()}
+        tested += len(q)
+        found += int(good.sum())
+        kept_q.append(q[good])
+        kept_seen.append(seen[good])
+    rejected = {name: number / tested for name, number in total.items()}
+    if not found:
+        raise OptionError(no_pose(room, tested, rejected))
+    q, seen = np.concatenate(kept_q)[:count], np.concatenate(kept_seen)[:count]
+    return Poses(q, seen, tested, rejected, len(q))
+
+
+def judged(
+    room: Room, sight: Sight, q: Array, arm: Conditions, tracker: Conditions
+) -> tuple[Array, Array, dict[str, int]]:
+    """Which poses (m, n) meet all conditions (m,), the targets seen (m, k), and who rejects.
+
+    A pose counts if one target is seen, or all of them where the room says so.
+    """
+    view, enough = View(room, sight, q), np.all if room.whole else np.any
+    good, seen = np.ones(len(q), dtype=bool), np.ones((len(room.spots), len(q)), dtype=bool)
+    against = {}
+    for name, holds in arm.items():
+        meets = holds(view)
+        against[name] = int((~meets).sum())
+        good &= meets
+    for name, sees in tracker.items():
+        meets = sees(view)
+        against[name] = int((~enough(meets, axis=0)).sum())
+        seen &= meets
+    good &= enough(seen, axis=0)
+    return good, seen.T, against
+
+
+MENDS = {
+    "floor": "give --floor where it is lower",
+    "volume": "make --volume larger",
+    "self-collision": "give a thinner body with --body",
+    "acceptance": "give another --tracker, --normals or a wider --acceptance",
+    "range": "give another --tracker or --range",
+    "elevation": "give another --tracker or --elevation",
+    "line of sight": "give another --tracker or a thinner body with --body",
+}
+
+
+def rarest(found: Mapping[str, float]) -> str:
+    """What rejects most poses, and what to do about it."""
+    worst = max(found, key=lambda name: found[name])
+    return f"{worst} rejects most ({100.0 * found[worst]:.1f} %): {MENDS[worst]}"
+
+
+def no_pose(room: Room, tested: int, rejected: Mapping[str, float]) -> str:
+    """What to say where no pose is left."""
+    return f"{room.robot.name}: none of {tested} poses can be taken and seen; {rarest(rejected)}"

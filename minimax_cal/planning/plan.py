@@ -1,0 +1,166 @@
+"""Plan a measurement: which poses tell most, in which order, and how accurate they will make it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.fitting.calibrate import silent
+from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.planning.candidates import Poses, candidates, near, rarest
+from minimax_cal.planning.designs.criteria import Criterion, inverse
+from minimax_cal.planning.designs.exchange import Menu, exchange, polar
+from minimax_cal.planning.designs.relaxation import highest
+from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
+from minimax_cal.planning.options import Wishes, check_wishes, settings_of
+from minimax_cal.planning.outlook import grown, indices, remarks, separated
+from minimax_cal.planning.result import POWER, Plan
+from minimax_cal.planning.route import shortest, travel, visits
+from minimax_cal.planning.setting import ground_of, surroundings
+from minimax_cal.planning.task import CRITERIA, Task, task_of
+from minimax_cal.robots.robot import Robot, load_robot
+
+STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the joints' ranges
+AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
+Report = Callable[[str], None]
+
+
+def plan(
+    robot: Robot | str | Path,
+    poses: int,
+    *,
+    fit: Calibration | Cell | str | Path = "",
+    data: Measurements | str | Path = "",
+    report: Report = silent,
+    **options: object,
+) -> Plan:
+    """Which poses of a robot to measure next.
+
+    fit: a calibration whose robot, base, targets and poses are the start.  data: poses measured
+    already; without a fit they are calibrated first.  options: the fields of `Wishes`.
+    Raises CalibrationError for wrong input.
+    """
+    began = time.perf_counter()
+    wish = Wishes(**options)  # type: ignore[arg-type]
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    if wish.criterion not in CRITERIA:
+        raise OptionError(f"no criterion {wish.criterion!r}; choose {', '.join(CRITERIA)}")
+    check_wishes(wish, poses, robot)
+    report("start")
+    ground = ground_of(robot, fit, data, wish)
+    room, sight, said = surroundings(ground.cell, wish)
+    report("candidate poses")
+    found = candidates(room, sight, wish.candidates, wish.seed)
+    if len(found.q) < poses:
+        raise OptionError(
+            f"only {len(found.q)} of {found.tested} poses can be taken and seen, but {poses} are "
+            f"asked for; {rarest(found.rejected)}"
+        )
+    task = task_of(robot, ground, room, sight, found, wish)
+    found, first = refined(task, found, poses, report)
+    aim = task.aim(found)
+    best = best_design(*aim, first, report)
+    report("comparison")
+    notices = (*ground.notices, *said, *remarks(task, found, best))
+    return assembled(task, found, aim, best, notices, began)
+
+
+def refined(task: Task, found: Poses, poses: int, report: Report) -> tuple[Poses, Array]:
+    """More candidates around those that tell most, and a first choice.
+
+    Where poses that can be seen are rare, the best of a sequence lie inside of what is allowed;
+    better ones lie at its edge.
+    """
+    report("first poses")
+    menu, criterion = task.aim(found)
+    chosen = first_design(menu, criterion, poses, task.wish.seed)
+    rng = np.random.default_rng(task.wish.seed)
+    for step in STEPS:
+        report(f"poses within {100.0 * step:g} % around them")
+        each = -(-AROUND // poses)
+        more, seen = near(task.room, task.sight, found.q[chosen], each, step, rng)
+        menu, criterion = task.aim(found.join(more, seen))
+        cov = inverse(menu.of(chosen))
+        fresh = menu.scores(polar(cov, criterion.mix(cov)))[len(found.q) :]
+        kept = np.sort(highest(fresh, KEPT))
+        old = len(found.q)
+        found = found.join(more[kept], seen[kept])
+        menu = menu.take(np.concatenate([np.arange(old), old + kept]))
+        among = np.union1d(np.arange(old, menu.count), chosen)
+        chosen = exchange(menu, criterion, chosen, among, ROUGH).chosen
+    return found, chosen
+
+
+def assembled(
+    task: Task,
+    found: Poses,
+    aim: tuple[Menu, Criterion],
+    best: Found,
+    notices: tuple[str, ...],
+    began: float,
+) -> Plan:
+    """The plan, in a short order, compared with random poses.  began: by `time.perf_counter`."""
+    cell, wish = task.ground.cell, task.wish
+    robot, poses = cell.robot, len(best.design.chosen)
+    menu = task.menu(found)
+    chosen = ordered(best.design.chosen, found.q, robot)
+    q, seen = found.q[chosen], found.seen[chosen]
+    growth = grown(task, menu, aim, best, found.drawn)
+    here = next(row for row in growth if row.poses == poses)
+    stops = visits(
+        q,
+        robot.prismatic,
+        task.room.lower,
+        task.room.upper,
+        wish.revisit,
+        aside=wish.approach == "both",
+    )
+    separation = tuple(
+        separated(one, contest, stops, seen[:, task.named(one)])
+        for one, contest in zip(task.asked, task.contests(found), strict=True)
+    )
+    some = np.arange(found.drawn)
+    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, wish.seed)
+
+    return Plan(
+        cell=cell,
+        criterion=POWER if task.asked else wish.criterion,
+        q=q,
+        seen=seen,
+        expected=np.where(seen[..., None], cell.predict(q), np.nan),
+        visits=stops,
+        size=best.design.size,
+        bound=best.bound,
+        random=here.size[1],
+        equal=equal,
+        names=task.ahead.names,
+        sigma=np.sqrt(np.diag(inverse(menu.of(chosen)))) / task.ahead.scale,
+        indices=indices(task.ahead, found, chosen, wish.seed),
+        growth=growth,
+        separation=separation,
+        candidates=found,
+        instrument=task.ground.instrument,
+        place=task.sight.place,
+        travel=(
+            travel(q, robot.prismatic),
+            travel(found.q[best.design.chosen], robot.prismatic),
+        ),
+        at_hand=sum(one.poses for one in task.ground.measured),
+        solver=best.relaxed.solver,
+        settings=settings_of(wish, poses),
+        notices=notices,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def ordered(chosen: Array, q: Array, robot: Robot) -> Array:
+    """The chosen poses in a short order, from joint values 0 or as near as the limits let them."""
+    home = np.clip(np.zeros(robot.joints), robot.lower, robot.upper)
+    return np.asarray(chosen[shortest(q[chosen], robot.prismatic, home)])

@@ -1,0 +1,276 @@
+"""The result of planning: which poses to measure, in which order, and what they will tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.calibration import finite
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.planning.candidates import Poses
+from minimax_cal.planning.observability import INDICES
+from minimax_cal.planning.promise import Growth, Separation
+from minimax_cal.planning.prospect import Instrument
+from minimax_cal.planning.route import Visits
+from minimax_cal.planning.stops import csv_text, stops
+
+SCHEMA = 1
+POWER = "separate"  # the criterion that is a power: the larger the better
+MEANINGS = {
+    "D": "geometric mean of the parameters' sigma, each as motion of a target",
+    "A": "mean of the parameters' sigma, each as motion of a target",
+    "E": "largest sigma of any combination of parameters, as motion of a target",
+    "G": "largest sigma of a position in the workspace",
+    "I": "mean sigma of a position in the workspace",
+    POWER: "power to tell the effects apart",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Poses to measure.
+
+    cell: the robot, its base and targets as assumed.  criterion: a key of MEANINGS.
+    q: (N, n) the poses in the order of visiting [rad, m].  seen: (N, k) targets seen there.
+    expected: (N, k, 3) where [m].  visits: every stop, revisits included.
+    size: of the criterion, a variance [m^2] (one over the power).  bound: no N candidates are
+    below it.  random: median of random candidates.  equal: how many random ones tell as much.
+    names, sigma: identifiable parameters and their predicted sigma [m, rad].
+    indices: observability, planned and random.  growth: with the number of poses.
+    candidates: what was chosen from.  instrument: noise that was assumed, place: (3,) where it
+    stands in base axes [m].  travel: of the largest joint moves, as ordered and as chosen [rad].
+    at_hand: number of poses measured before, which count.  solver: of the relaxation.
+    """
+
+    cell: Cell
+    criterion: str
+    q: Array
+    seen: Array
+    expected: Array
+    visits: Visits
+    size: float
+    bound: float
+    random: float
+    equal: float
+    names: tuple[str, ...]
+    sigma: Array
+    indices: Mapping[str, tuple[float, float]]
+    growth: tuple[Growth, ...]
+    separation: tuple[Separation, ...]
+    candidates: Poses
+    instrument: Instrument
+    place: Array
+    travel: tuple[float, float]
+    at_hand: int
+    solver: str
+    settings: Mapping[str, object]
+    notices: tuple[str, ...]
+    seconds: float
+
+    @property
+    def poses(self) -> int:
+        """N."""
+        return len(self.q)
+
+    @property
+    def efficiency(self) -> float:
+        """Bound over size: so much of the best possible is sure."""
+        return min(1.0, self.bound / self.size)
+
+    @property
+    def here(self) -> Growth:
+        """The row of `growth` with as many poses as planned."""
+        return next(row for row in self.growth if row.poses == self.poses)
+
+    def shown(self, size: float) -> float:
+        """A size as people read it: a power, or a sigma [um]."""
+        return 1.0 / size if self.criterion == POWER else 1e6 * float(np.sqrt(size))
+
+    def headline(self) -> str:
+        """The plan in a few sentences."""
+        robot, here = self.cell.robot.name, self.here
+        more = f" beside {self.at_hand} at hand" if self.at_hand else ""
+        out = [
+            f"{robot}: {self.poses} poses{more}, at least {100.0 * self.efficiency:.1f} % as good "
+            f"as the best {self.poses} of {len(self.candidates.q)} candidates.",
+            f"Predicted sigma of a position over the workspace: mean {1e6 * here.mean[0]:.1f} um, "
+            f"worst {1e6 * here.worst[0]:.1f} um; {self.poses} random poses: "
+            f"{1e6 * here.mean[1]:.1f} and {1e6 * here.worst[1]:.1f} um.",
+        ]
+        if np.isfinite(self.equal):
+            out.append(f"By the criterion they are worth {self.equal:.0f} random poses.")
+        elif 4 * self.poses <= self.candidates.drawn:
+            out.append(f"By the criterion they are worth more than {4 * self.poses} random poses.")
+        out += [separation.headline() for separation in self.separation]
+        return " ".join(out)
+
+    # ---- tables --------------------------------------------------------------------------------
+
+    def criterion_table(self) -> Table:
+        """The criterion: planned, random, and what no choice of candidates beats."""
+        power = self.criterion == POWER
+        here = self.here
+        rows: list[tuple[TableCell, ...]] = [
+            (
+                f"{self.criterion}: {MEANINGS[self.criterion]}",
+                "" if power else "um",
+                *(self.shown(value) for value in (self.size, self.random, self.bound)),
+            ),
+        ]
+        for name, both in (("I", here.mean), ("G", here.worst)):
+            if name != self.criterion:
+                rows.append((MEANINGS[name], "um", *(1e6 * sigma for sigma in both), float("nan")))
+        return Table(
+            f"{self.poses} poses by criterion {self.criterion}",
+            ("what", "unit", "planned", "random (median)", "no choice is better than"),
+            tuple(rows),
+            ("", "", ".4g", ".4g", ".4g"),
+        )
+
+    def growth_table(self) -> Table:
+        """How accuracy grows with the number of poses."""
+        more = self.criterion not in ("G", "I")
+        rows = tuple(
+            (
+                g.poses,
+                *(1e6 * sigma for sigma in (*g.mean, *g.worst)),
+                *(map(self.shown, g.size) if more else ()),
+            )
+            for g in self.growth
+        )
+        name = "power" if self.criterion == POWER else f"{self.criterion} um"
+        last = (f"{name}, planned", f"{name}, random") if more else ()
+        return Table(
+            "predicted sigma of a position over the workspace",
+            ("poses", "mean um, planned", "mean um, random", "worst um, planned",
+             "worst um, random", *last),
+            rows,
+            ("d", *[".4g"] * (4 + len(last))),
+        )  # fmt: skip
+
+    def index_table(self) -> Table:
+        """Observability indices of the poses."""
+        rows = tuple((name, INDICES[name], *values) for name, values in self.indices.items())
+        return Table(
+            "observability indices of these poses alone (parameters by the motion they give)",
+            ("index", "what", "planned", "random (median)"),
+            rows,
+            ("", "", ".4g", ".4g"),
+        )
+
+    def pose_table(self, unit: str = "deg") -> Table:
+        """Every stop, in order."""
+        header, rows = stops(self.visits, self.cell, self.expected, unit)
+        return Table(
+            f"stops in order, travel {self.travel[0]:.1f} rad",
+            tuple(header[: 2 + self.q.shape[1]]),
+            tuple(tuple(row[: 2 + self.q.shape[1]]) for row in rows),
+            ("d", "", *[".3f"] * self.q.shape[1]),
+        )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table but the poses themselves."""
+        return (
+            self.criterion_table(),
+            self.growth_table(),
+            self.index_table(),
+            self.candidates.table(),
+        )
+
+    def summary(self, width: int = 110) -> str:
+        """The plan as plain text."""
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+    # ---- files ---------------------------------------------------------------------------------
+
+    def csv(self, unit: str = "deg") -> str:
+        """The stops as CSV.  unit: of turning joints."""
+        return csv_text(*stops(self.visits, self.cell, self.expected, unit))
+
+    def save_csv(self, path: Path | str, unit: str = "deg") -> None:
+        """Write the stops; never a half-written file."""
+        write_whole(path, self.csv(unit))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: sigmas of positions in micrometres."""
+        power = self.criterion == POWER
+        name = "power" if power else "sigma_um"
+        return {
+            "schema": SCHEMA,
+            "kind": "plan",
+            "robot": self.cell.robot.name,
+            "criterion": self.criterion,
+            "poses": self.poses,
+            "at_hand": self.at_hand,
+            "targets": list(self.cell.targets),
+            "q": self.q.tolist(),
+            "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
+            "seen": self.seen.tolist(),
+            "visits": {
+                "pose": (self.visits.pose + 1).tolist(),
+                "q": self.visits.q.tolist(),
+                "via": self.visits.via.tolist(),
+                "approach": self.visits.approach.astype(int).tolist(),
+            },
+            "value": {
+                key: finite(self.shown(size))
+                for key, size in (
+                    (f"planned_{name}", self.size),
+                    (f"random_{name}", self.random),
+                    (f"bound_{name}", self.bound),
+                )
+            },
+            "efficiency_at_least": finite(self.efficiency),
+            "worth_random_poses": finite(self.equal),
+            "growth": [
+                {
+                    "poses": g.poses,
+                    "mean_um": {"planned": finite(1e6 * g.mean[0]),
+                                "random": finite(1e6 * g.mean[1])},
+                    "worst_um": {"planned": finite(1e6 * g.worst[0]),
+                                 "random": finite(1e6 * g.worst[1])},
+                }
+                for g in self.growth
+            ],
+            "observability": {
+                key: {"planned": finite(one), "random": finite(other)}
+                for key, (one, other) in self.indices.items()
+            },
+            "parameters": [
+                {"name": key, "sigma": finite(float(value))}
+                for key, value in zip(self.names, self.sigma, strict=True)
+            ],
+            "separation": [separation.to_dict() for separation in self.separation],
+            "candidates": {
+                "count": len(self.candidates.q),
+                "tested": self.candidates.tested,
+                "rejected": dict(self.candidates.rejected),
+            },
+            "instrument": {
+                "place_in_base_mm": [1e3 * float(v) for v in self.place],
+                "noise_um": 1e6 * self.instrument.noise,
+                "noise_um_per_m": 1e6 * self.instrument.per_metre,
+                "jitter_urad": 1e6 * self.instrument.jitter,
+            },
+            "travel_rad": {"ordered": self.travel[0], "as_chosen": self.travel[1]},
+            "solver": self.solver,
+            "settings": dict(self.settings),
+            "notices": list(self.notices),
+            "seconds": self.seconds,
+        }  # fmt: skip
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())

@@ -1,0 +1,127 @@
+"""A short way through joint space past all poses, and going back to some of them.
+
+How long a move takes is told by the joint that has to go farthest; speeds are not known, and a
+slide's metre counts as a turn of two radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+
+SLIDE = 0.5  # metres of a slide that count as a radian
+STEP = np.radians(5.0)  # a pose is approached from its other side by a move of so much [rad]
+
+
+def lengths(q: Array, sliding: Array) -> Array:
+    """(m, m) lengths of the moves between poses (m, n) [rad]."""
+    scaled = q / np.where(sliding, SLIDE, 1.0)
+    return np.asarray(np.abs(scaled[:, None] - scaled[None]).max(axis=-1))
+
+
+def travel(q: Array, sliding: Array) -> float:
+    """Length of the way through poses (m, n) as they come [rad]."""
+    scaled = q / np.where(sliding, SLIDE, 1.0)
+    return float(np.abs(np.diff(scaled, axis=0)).max(axis=1).sum()) if len(q) > 1 else 0.0
+
+
+def shortest(q: Array, sliding: Array, begin: Array) -> Array:
+    """(m,) an order of poses (m, n) with a short way from `begin` (n,): nearest first, then 2-opt.
+
+    2-opt turns a stretch of the way round wherever that makes it shorter [Croes 1958].
+    """
+    away = lengths(np.concatenate([begin[None], q]), sliding)
+    m = len(q)
+    order, left = [0], np.ones(m + 1, dtype=bool)
+    left[0] = False
+    for _ in range(m):
+        here = np.where(left, away[order[-1]], np.inf)
+        order.append(int(np.argmin(here)))
+        left[order[-1]] = False
+    way = np.array(order)
+    while True:
+        one, other, gain = best_turn(away, way)
+        if gain <= 1e-12:
+            return way[1:] - 1
+        way[one : other + 1] = way[one : other + 1][::-1].copy()
+
+
+def best_turn(away: Array, way: Array) -> tuple[int, int, float]:
+    """Which stretch of an open way to turn round, and by how much it gets shorter."""
+    m = len(way)
+    if m < 3:
+        return 0, 0, 0.0
+    before, first = way[:-1], way[1:]  # stretch i..j begins at way[i], i >= 1, and ends at way[j]
+    now = away[before, first]
+    last, after = way[1:], np.append(way[2:], -1)
+    follows = after >= 0
+    out = np.where(follows, away[last, after], 0.0)
+    joined = away[np.ix_(before, last)] + np.where(
+        follows[None], away[np.ix_(first, np.maximum(after, 0))], 0.0
+    )
+    gain = np.triu(now[:, None] + out[None] - joined, 1)
+    one, other = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    return int(one) + 1, int(other) + 1, float(gain[one, other])
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """Where the arm goes, stop by stop.
+
+    pose: (v,) which pose, counted from 0.  q: (v, n) joints [rad, m].
+    via: (v,) True at a stop on the way, where nothing is measured.
+    approach: (v, n) sign of each joint's last move, 0 before the first.
+    """
+
+    pose: Array
+    q: Array
+    via: Array
+    approach: Array
+
+
+def visits(
+    q: Array,
+    sliding: Array,
+    lower: Array,
+    upper: Array,
+    again: int = 0,
+    *,
+    aside: bool = False,
+) -> Visits:
+    """Poses (m, n) as they come, then `again` of them, spread evenly, once more in a short order.
+
+    aside: come to them from the other side than the first time, by a short move of all joints from
+    a stop on the way.  A joint at its limit, where there is no room for that, keeps its side.
+    """
+    m, n = q.shape
+    stops, pose, via = list(q), list(range(m)), [False] * m
+    side = last_signs(q)
+    picked = np.linspace(0, m, again, endpoint=False).astype(int)  # the last few just were
+    if len(picked):
+        picked = picked[shortest(q[picked], sliding, q[-1])]
+    step = STEP * np.where(sliding, SLIDE, 1.0)
+    for one in picked:
+        if aside:
+            came = np.where(side[one] == 0.0, -1.0, side[one])
+            there = q[one] + came * step
+            room = (there >= lower) & (there <= upper)
+            stops.append(np.where(room, there, q[one] - came * step))
+            pose.append(int(one))
+            via.append(True)
+        stops.append(q[one])
+        pose.append(int(one))
+        via.append(False)
+    path = np.array(stops).reshape(-1, n)
+    return Visits(np.array(pose), path, np.array(via), last_signs(path))
+
+
+def last_signs(q: Array) -> Array:
+    """(v, n) sign of each joint's last move along a way (v, n), 0 before its first."""
+    out = np.zeros_like(q)
+    for row in range(1, len(q)):
+        move = q[row] - q[row - 1]
+        out[row] = np.where(np.abs(move) > 1e-9, np.sign(move), out[row - 1])
+    return out

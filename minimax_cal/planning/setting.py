@@ -1,0 +1,164 @@
+"""What a plan starts from: a cell, poses at hand, noise, and where the arm may go."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.evidence.noise import Noise, linearised, restricted
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import read_text
+from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.pose_rows import read_poses
+from minimax_cal.modelling.cell import Cell, load_cell
+from minimax_cal.modelling.effects.table import fields_of
+from minimax_cal.modelling.joint_fit import scene_of
+from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.planning.candidates import limits_of
+from minimax_cal.planning.options import Wishes
+from minimax_cal.planning.prospect import Instrument, cell_ahead, front, ring
+from minimax_cal.planning.visibility import THICK, Room, Sight, normals_of
+from minimax_cal.robots.robot import Robot
+
+APART = 3.0  # where the tracker stands unless told: so far off, or the arm's reach [m]
+EXACT = 1e-7  # noise below which data were computed, not measured [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What a plan starts from.  measured: poses at hand, none or one set."""
+
+    cell: Cell
+    measured: tuple[Measurements, ...]
+    instrument: Instrument
+    notices: tuple[str, ...]
+
+
+def ground_of(
+    robot: Robot,
+    fit: Calibration | Cell | str | Path,
+    data: Measurements | str | Path,
+    wish: Wishes,
+) -> Ground:
+    """Cell, poses at hand and noise.  Raises CalibrationError."""
+    notices: list[str] = []
+    own: tuple[Measurements, ...] = ()
+    if isinstance(fit, Calibration):
+        cells, own = [fit.cell], (fit.data,)
+    elif isinstance(fit, Cell):
+        cells = [fit]
+    elif fit:
+        cells, own = [load_cell(fit)], stored(fit)
+    else:
+        cells = []
+    if isinstance(data, Measurements):
+        own = (data,)
+    elif data:
+        own = (read_measurements(data),)
+    notices += [notice for one in own for notice in one.notices]
+    if cells and cells[0].robot.joints != robot.joints:
+        raise OptionError(
+            f"the fit's robot has {cells[0].robot.joints} joints, but {robot.name} has "
+            f"{robot.joints}"
+        )
+    if own and not cells:
+        cells = [calibrate(robot, own[0], "sum", holdout=0.0).cell]
+        notices.append("the poses at hand were calibrated first, geometry alone: give --fit else")
+    if cells:
+        if len(wish.tracker) or len(wish.spots):
+            raise OptionError(
+                "the fit tells where tracker and targets are: leave --tracker and --target out"
+            )
+        for one in own:
+            check_joints(robot, one)
+            strange = [name for name in one.targets if name not in cells[0].targets]
+            if strange:
+                raise OptionError(f"{one.source}: target {strange[0]} is not one of the fit's")
+        if not own:
+            notices.append("the fit tells no poses: none count as measured; give --data")
+        noise, text = shown_noise(cells[0], own, wish)
+        return Ground(cells[0], own, noise, (*notices, text))
+    cell, text = assumed(robot, wish)
+    notices += [text] if text else []
+    noise, text = shown_noise(cell, (), wish)
+    return Ground(cell, (), noise, (*notices, text))
+
+
+def stored(fit: str | Path) -> tuple[Measurements, ...]:
+    """The poses that a file of a calibration holds, none where it is an old one."""
+    content = json.loads(read_text(fit))
+    if "poses" not in content:
+        return ()
+    return (read_poses(content["poses"], str(fit))[0],)
+
+
+def assumed(robot: Robot, wish: Wishes) -> tuple[Cell, str]:
+    """A nominal robot before a tracker, and a notice where nobody said where that is."""
+    spots = np.array(wish.spots, dtype=float).reshape(-1, 3)
+    spots = spots if len(spots) else ring(wish.targets)
+    names = tuple(f"smr{i + 1}" for i in range(len(spots)))
+    cell = Cell(robot, np.eye(4), names, spots)
+    if len(wish.tracker):
+        return cell_ahead(cell, np.array(wish.tracker, dtype=float)), ""
+    away = max(APART, robot.reach())
+    place = front(cell, away)
+    where = ", ".join(f"{1e3 * value:.0f}" for value in place)
+    text = f"the tracker is taken to stand at {where} mm in base axes; say where with --tracker"
+    return cell_ahead(cell, place), text
+
+
+def shown_noise(
+    cell: Cell, measured: Sequence[Measurements], wish: Wishes
+) -> tuple[Instrument, str]:
+    """The noise to plan with, and where it is from."""
+    given = {name: getattr(wish, name) for name in ("noise", "per_metre", "jitter")}
+    told = {name: float(value) for name, value in given.items() if np.isfinite(value)}
+    base, source = Instrument(), "assumed"
+    if measured and not told:
+        noise = noise_of(cell, measured[0])
+        if np.sqrt(noise.variance) > EXACT:
+            source = "as the poses at hand show it"
+            base = Instrument(float(np.sqrt(noise.variance)), 0.0, noise.jitter)
+    out = replace(base, **told)
+    text = (
+        f"noise of a coordinate {1e6 * out.noise:.3g} um + {1e6 * out.per_metre:.3g} um/m, jitter "
+        f"of a joint {1e6 * out.jitter:.3g} urad, {'as given' if told else source}"
+    )
+    return out, text
+
+
+def noise_of(cell: Cell, data: Measurements) -> Noise:
+    """Noise of instrument and joints in the errors of a cell."""
+    chosen = [cell.targets.index(name) for name in data.targets]
+    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots[chosen])
+    model = model_of(cell.robot, data)
+    scene = scene_of(cell.robot, data, model, state)
+    rows = linearised(model, state, scene.slope)
+    terms = cell.effects.terms
+    fields = fields_of(terms, scene) if terms else np.zeros((0, *scene.points.shape))
+    return restricted(rows, rows.of(fields))
+
+
+def surroundings(cell: Cell, wish: Wishes) -> tuple[Room, Sight, tuple[str, ...]]:
+    """Where the arm may go and what the instrument sees."""
+    robot = cell.robot
+    lower, upper, notices = limits_of(robot, wish.joints)
+    radius = THICK * robot.reach() if np.isnan(wish.body) else wish.body
+    room = Room(
+        robot, cell.spots, normals_of(cell.spots, wish.normals), lower, upper, radius,
+        floor=wish.floor, whole=wish.whole,
+    )  # fmt: skip
+    if len(wish.volume):
+        low, high = np.array(wish.volume, dtype=float)
+        room = replace(room, low=low, high=high)
+    place = -cell.base[:3, 3] @ cell.base[:3, :3]
+    sight = Sight(place, robot.up, wish.acceptance, *wish.reach, *wish.elevation)
+    return room, sight, notices

@@ -1,0 +1,145 @@
+"""From result files to a report: its title block, verdict, sections and provenance."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from importlib.metadata import version
+
+from minimax_cal.ground.tables import Table
+from minimax_cal.reporting.html.content import Block, Note, Report, Section, text
+from minimax_cal.reporting.html.fit_sections import (
+    accuracy_section,
+    correlation_section,
+    iso_section,
+    joints_section,
+    parameter_section,
+    solution_section,
+    suspects_section,
+    workspace_section,
+)
+from minimax_cal.reporting.html.fit_tables import glance_table, settings_table
+from minimax_cal.reporting.html.gap_sections import (
+    causes_section,
+    gap_section,
+    untestable_section,
+    where_section,
+)
+from minimax_cal.reporting.html.schema import FitFile, GapFile, Provenance
+from minimax_cal.reporting.html.sources import Sources, visible
+from minimax_cal.reporting.html.verdict import fit_verdict, gap_verdict
+
+SECTIONS = (
+    accuracy_section,
+    workspace_section,
+    joints_section,
+    gap_section,
+    causes_section,
+    where_section,
+    untestable_section,
+    suspects_section,
+    parameter_section,
+    correlation_section,
+    iso_section,
+    solution_section,
+)
+HEX = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Wording:
+    """What the user says of a report, empty where nothing.  date: of the report, ISO 8601."""
+
+    date: str
+    title: str = ""
+    customer: str = ""
+    author: str = ""
+
+
+def compose(sources: Sources, wording: Wording) -> Report:
+    """The whole report.  Raises CalibrationError for a part of a file that cannot be read."""
+    told = provenance_of(sources)
+    both = "Calibration" if sources.fits else "Diagnosis"
+    if sources.fits and sources.gaps:
+        both = "Calibration and diagnosis"
+    facts = [("Robot", sources.robot)]
+    facts += [("Customer", visible(wording.customer))] if wording.customer else []
+    facts += [("Author", visible(wording.author))] if wording.author else []
+    facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
+    facts += [("Measurements", told.data or "not named")]
+    facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
+    sections = (verdict_section(sources), *(make(sources) for make in SECTIONS))
+    return Report(
+        title=visible(wording.title) or f"{both} of {sources.robot}",
+        robot=sources.robot,
+        facts=tuple(facts),
+        signatures=signers(visible(wording.author), visible(wording.customer)),
+        sections=(*sections, provenance_section(sources)),
+        digest=told.data_sha256 if HEX.fullmatch(told.data_sha256) else "",
+    )  # fmt: skip
+
+
+def signers(author: str, customer: str) -> tuple[tuple[str, str], ...]:
+    """Who signs: role, and name where it is known."""
+    accepted = f"Accepted for {customer}" if customer else "Accepted"
+    return (("Measured and evaluated", author), ("Checked", ""), (accepted, ""))
+
+
+def counted(sources: Sources) -> str:
+    """How many poses and targets there are."""
+    if sources.fits:
+        a = sources.fits[0].content.accuracy
+        held, train = a.holdout.poses, a.train.poses
+    else:
+        first = sources.gaps[0].content.gap.ladder[0]
+        held, train = first.holdout.poses, first.train.poses
+    targets = len(sources.cells[0].targets) if sources.cells else 0
+    seen = f", {targets} target{'s' if targets > 1 else ''}" if targets else ""
+    return f"{train} training, {held} held out{seen}"
+
+
+def provenance_of(sources: Sources) -> Provenance:
+    """Of the calibration, or else of the diagnosis."""
+    return (sources.fits[0] if sources.fits else sources.gaps[0]).content.provenance
+
+
+def verdict_section(sources: Sources) -> Section:
+    """The result in words and in four numbers."""
+    blocks: list[Block] = [Note(notice, "warning") for notice in sources.notices]
+    for fit in sources.fits:
+        blocks += fit_verdict(fit)
+    table = glance_table(sources)
+    blocks += [table] if table.rows else []
+    for gap in sources.gaps:
+        blocks += gap_verdict(gap)
+    return Section("verdict", "Verdict", tuple(blocks))
+
+
+def provenance_section(sources: Sources) -> Section:
+    """Files, settings, versions and notices: what it takes to have the numbers again."""
+    files: list[tuple[str, str, str]] = []
+    settings: list[Table] = []
+    notices: list[Block] = []
+    contents: list[tuple[str, str, str, FitFile | GapFile]] = []
+    contents += [("calibration", part.path, part.digest, part.content) for part in sources.fits]
+    contents += [("diagnosis", part.path, part.digest, part.content) for part in sources.gaps]
+    for kind, path, digest, content in contents:
+        files.append((kind, visible(path), digest))
+        told = content.provenance
+        if (row := ("measurements", told.data, told.data_sha256 or "not recorded")) not in files:
+            files.append(row)
+        settings.append(settings_table(f"Settings of the {kind}", told.settings))
+        settings.append(Table(f"Versions used by the {kind}", ("package", "version"),
+                              tuple(told.versions.items())))  # fmt: skip
+        notices += [Note(f"{kind}: {notice}", "notice") for notice in content.notices]
+    made = (("minimax-cal", version("minimax-cal")), ("plotly", version("plotly")))
+    settings.append(Table("This report was made by", ("package", "version"), made))
+    return Section(
+        "provenance",
+        "Provenance",
+        (
+            Table("Files", ("what", "file", "SHA-256"), tuple(files)),
+            *(table for table in settings if table.rows),
+            *(notices or [text("The programs gave no notices.")]),
+        ),
+    )

@@ -1,0 +1,260 @@
+"""How the errors are distributed, and what they go with: before and after, held out or not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.reporting.html.charts import (
+    LOOKS,
+    axis,
+    figure,
+    frame,
+    heading,
+    is_wide,
+    key,
+    line,
+    log_axis,
+    long_key,
+    span,
+    two_looks,
+)
+from minimax_cal.reporting.html.content import Figure, label, plain, some
+from minimax_cal.reporting.html.sources import Poses
+
+BINS = 30
+LEVELS = 400  # steps of a distribution that are drawn
+TREND = 12  # bins of a running median
+FEWEST = 5  # poses of a bin of it
+COLUMNS = 3
+FAR = 100.0  # ratio of the largest to the smallest error that asks for a logarithmic axis
+FINE = 1e-7  # errors below are rounding [mm]
+
+Names = tuple[str, str]
+HELD, TRAIN = "held-out poses", "training poses"
+
+
+def distances(error: Array) -> Array:
+    """(k, m) sizes of errors (k, m, 3), NaN where not measured."""
+    return np.asarray(np.linalg.norm(error, axis=-1))
+
+
+def of_poses(error: Array) -> Array:
+    """(m,) RMS of the targets of each pose."""
+    square = distances(error) ** 2
+    seen = np.isfinite(square)
+    return np.asarray(np.sqrt(np.nansum(square, axis=0) / np.maximum(seen.sum(axis=0), 1)))
+
+
+def groups(poses: Poses) -> list[tuple[str, Array, Array]]:
+    """Held-out and training poses, those that there are, each with sizes before and after."""
+    before, after = distances(poses.before), distances(poses.after)
+    parts = ((HELD, poses.held), (TRAIN, ~poses.held))
+    seen = np.isfinite(after).any(axis=0)
+    return [(name, before[:, rows], after[:, rows]) for name, rows in parts if (rows & seen).any()]
+
+
+def known(values: Array) -> Array:
+    """The numbers among values, rounding lifted to `FINE` so that a logarithm exists."""
+    return np.asarray(np.maximum(values[np.isfinite(values)], FINE))
+
+
+def histogram(poses: Poses, names: Names) -> Figure:
+    """Shares of points by size of error, held-out and training poses each in a panel."""
+    found = groups(poses)
+    every = np.concatenate([known(v) for _, *pair in found for v in pair])
+    edges = (
+        np.geomspace(every.min(), every.max() * 1.001, BINS + 1)
+        if is_wide(every, ratio=FAR)
+        else np.linspace(0.0, every.max() * 1.001, BINS + 1)
+    )
+    traces: list[dict[str, Any]] = []
+    layout = frame(annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)])
+    for i, (_, *pair) in enumerate(found):
+        for look, name, values in zip(LOOKS, names, pair, strict=False):
+            count = np.histogram(known(values), edges)[0]
+            share = 100.0 * np.append(count, 0) / max(count.sum(), 1)
+            area = {"fill": "tozeroy", "fillcolor": LOOKS[look][3], "showlegend": i == 0}
+            traces.append(line(look, name, edges, share, panel=i, step=True, **area))
+        layout |= panel_axes(i, len(found), log_axis("position error (mm)", every, ratio=FAR),
+                             axis("points (%)" if i == 0 else ""))  # fmt: skip
+    says = f"Histograms of the position error, {names[0]} and {names[1]}. {medians(found, names)}"
+    return figure("histogram", "How large the errors are", says, traces, layout)
+
+
+def panel_axes(number: int, of: int, x: dict[str, Any], y: dict[str, Any]) -> dict[str, Any]:
+    """The axes of one panel beside others."""
+    x, y = {**x, "domain": span(number, of)}, {**y}
+    if number:
+        x["anchor"], y["anchor"] = key("y", number), key("x", number)
+        y["matches"] = "y"
+    return {long_key("x", number): x, long_key("y", number): y}
+
+
+def medians(found: list[tuple[str, Array, Array]], names: Names) -> str:
+    """The medians in words."""
+    return " ".join(
+        f"On {name}, half of the points lie within {np.median(known(one)):.3f} mm ({names[0]}) and "
+        f"{np.median(known(other)):.3f} mm ({names[1]})."
+        for name, one, other in found
+    )
+
+
+def cumulative(poses: Poses, names: Names) -> Figure:
+    """Which share of the points has less error than x."""
+    found = groups(poses)
+    every = np.concatenate([known(v) for _, *pair in found for v in pair])
+    traces: list[dict[str, Any]] = []
+    layout = frame(annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)])
+    for i, (_, *pair) in enumerate(found):
+        for look, name, values in zip(LOOKS, names, pair, strict=False):
+            size = np.sort(known(values))
+            at = np.unique(np.linspace(0, len(size) - 1, min(len(size), LEVELS)).astype(int))
+            share = 100.0 * (at + 1) / len(size)
+            traces.append(line(look, name, size[at], share, panel=i, step=True, showlegend=i == 0))
+        layout |= panel_axes(i, len(found), log_axis("position error (mm)", every, ratio=FAR),
+                             axis("points with less error (%)" if i == 0 else ""))  # fmt: skip
+    p95 = " ".join(
+        f"On {name}, 95 % of the points lie within {np.percentile(known(one), 95):.3f} mm "
+        f"({names[0]}) and {np.percentile(known(other), 95):.3f} mm ({names[1]})."
+        for name, one, other in found
+    )
+    says = f"Cumulative distribution of the position error. {p95}"
+    return figure("cumulative", "Which share of the points is better than a limit", says, traces,
+                  layout)  # fmt: skip
+
+
+def boxes(poses: Poses, names: Names) -> Figure:
+    """Quartiles and extremes of each target."""
+    found = groups(poses)
+    targets = [label(name) for name in poses.data.targets]
+    every = np.concatenate([known(v) for _, *pair in found for v in pair])
+    traces: list[dict[str, Any]] = []
+    layout = frame(
+        annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)],
+        boxmode="group",
+    )
+    for i, (_, *pair) in enumerate(found):
+        for look, name, values in zip(LOOKS, names, pair, strict=False):
+            traces.append(box(look, name, targets, values, panel=i))
+        size = log_axis("position error (mm)" if i == 0 else "", every)
+        layout |= panel_axes(i, len(found), axis("") | {"type": "category"}, size)
+    says = (
+        f"Box charts of the position error of each target, {names[0]} and {names[1]}: median, "
+        "quartiles, smallest and largest error."
+    )
+    return figure("boxes", "Target by target", says, traces, layout)
+
+
+def box(look: str, name: str, targets: list[str], values: Array, *, panel: int) -> dict[str, Any]:
+    """Boxes of one look: quartiles, and whiskers to the extremes; none where nothing was seen."""
+    seen = [i for i, row in enumerate(values) if np.isfinite(row).any()]
+    at = np.array([np.percentile(known(values[i]), [0, 25, 50, 75, 100]) for i in seen])
+    low, q1, median, q3, high = at.reshape(-1, 5).T
+    colour, symbol, _, soft = LOOKS[look]
+    fill = "back" if symbol.endswith("open") else soft
+    return {
+        "type": "box", "name": label(name), "legendgroup": name, "offsetgroup": name,
+        "x": [targets[i] for i in seen], "lowerfence": plain(low), "q1": plain(q1),
+        "median": plain(median), "q3": plain(q3), "upperfence": plain(high),
+        "line": {"color": colour, "width": 2}, "fillcolor": fill, "showlegend": panel == 0,
+        "xaxis": key("x", panel), "yaxis": key("y", panel),
+    }  # fmt: skip
+
+
+def shown(poses: Poses) -> tuple[Array, str]:
+    """Indices of the poses drawn one by one, and what to say if these are not all."""
+    chosen = some(of_poses(poses.after))
+    all_of_them = len(chosen) == len(poses.held)
+    return chosen, "" if all_of_them else (
+        f"{len(chosen)} of {len(poses.held)} poses are drawn: the worst, and an even choice of the "
+        "others; lines are of all."
+    )
+
+
+def hover(poses: Poses, chosen: Array) -> Array:
+    """What a pose is called: its line in the file."""
+    return np.array([f"line {poses.data.line[i]}" for i in chosen])
+
+
+def trend(x: Array, y: Array) -> tuple[Array, Array]:
+    """Running median of y in bins of x that hold equally many poses."""
+    order = np.argsort(x, kind="stable")
+    bins = np.array_split(order, min(TREND, max(len(x) // FEWEST, 1)))
+    return (np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins]))
+
+
+def joint_names(poses: Poses) -> list[str]:
+    """Joints with the unit in which people read them."""
+    return [f"joint {j + 1} ({'mm' if s else 'deg'})" for j, s in enumerate(poses.data.sliding)]
+
+
+def joint_values(poses: Poses) -> Array:
+    """(m, n) joint values as people read them."""
+    return np.asarray(poses.data.q * np.where(poses.data.sliding, 1e3, 180.0 / np.pi))
+
+
+def against_joints(poses: Poses, names: Names) -> Figure:
+    """The error of each pose against each joint."""
+    sizes = [np.maximum(of_poses(e), FINE) for e in (poses.before, poses.after)]
+    chosen, cut = shown(poses)
+    q, titles = joint_values(poses), joint_names(poses)
+    columns = min(len(titles), COLUMNS)
+    rows = -(-len(titles) // columns)
+    traces: list[dict[str, Any]] = []
+    layout = frame(grid={"rows": rows, "columns": columns, "pattern": "independent",
+                         "xgap": 0.16, "ygap": 0.36})  # fmt: skip
+    for j, title in enumerate(titles):
+        views = [(look, name, size[chosen])
+                 for look, name, size in zip(LOOKS, names, sizes, strict=False)]  # fmt: skip
+        traces += two_looks(q[chosen, j], views, poses.held[chosen], panel=j,
+                            text=hover(poses, chosen))  # fmt: skip
+        for look, name, size in zip(LOOKS, names, sizes, strict=False):
+            traces.append(line(look, f"{name}, median", *trend(q[:, j], size), panel=j,
+                               showlegend=j == 0))  # fmt: skip
+        more: dict[str, Any] = {"matches": "y"} if j else {}
+        layout[long_key("x", j)] = axis(title, nticks=5)
+        layout[long_key("y", j)] = log_axis(
+            "error (mm)" if j % columns == 0 else "", *sizes, **more
+        )
+    says = (
+        "The error of each pose (RMS of its targets) against each joint; a line that rises or "
+        f"waves speaks of a cause in that joint. Lines are running medians. {cut}"
+    ).strip()
+    return figure("joints", "Error against each joint", says, traces, layout, 90 + 230 * rows)
+
+
+def against(poses: Poses, names: Names, what: tuple[str, str, str], x: Array) -> Figure:
+    """The error of each pose against something else.  what: name, title, label of the axis."""
+    name, title, xlabel = what
+    sizes = [np.maximum(of_poses(e), FINE) for e in (poses.before, poses.after)]
+    chosen, cut = shown(poses)
+    views = [(look, n, s[chosen]) for look, n, s in zip(LOOKS, names, sizes, strict=False)]
+    traces = two_looks(x[chosen], views, poses.held[chosen], text=hover(poses, chosen))
+    seen = np.isfinite(x)
+    for look, view, size in zip(LOOKS, names, sizes, strict=False):
+        traces.append(line(look, f"{view}, median", *trend(x[seen], size[seen])))
+    layout = frame(xaxis=axis(xlabel), yaxis=log_axis("error of a pose (mm)", *sizes))
+    says = (
+        f"The error of each pose (RMS of its targets) against {xlabel}. Lines are running "
+        f"medians. {cut}"
+    ).strip()
+    return figure(name, title, says, traces, layout)
+
+
+def over_time(poses: Poses, names: Names) -> tuple[Figure, ...]:
+    """Against visit order, and against time, temperature and load where these were written down."""
+    told = ("Error by visit order", "visit (first to last)") if poses.told else (
+        "Error by row", "row of the file (it tells no visit order)")  # fmt: skip
+    out = [against(poses, names, ("order", *told), poses.data.columns["order"])]
+    for column, name, title, xlabel in (
+        ("time", "time", "Error over time", "time (s)"),
+        ("temperature", "temperature", "Error against temperature", "temperature (°C)"),
+        ("payload", "payload", "Error against payload", "payload (kg)"),
+    ):
+        values = poses.data.columns.get(column, np.zeros(0))
+        if np.isfinite(values).any() and np.ptp(values[np.isfinite(values)]) > 0.0:
+            out.append(against(poses, names, (name, title, xlabel), values))
+    return tuple(out)

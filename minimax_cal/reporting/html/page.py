@@ -1,0 +1,93 @@
+"""A report as one HTML file that needs nothing else: no network, no other file.
+
+The page's own Content-Security-Policy forbids every request, and every script but the two whose
+SHA-256 it names: that of this package and plotly.js.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+from importlib import import_module, resources
+from typing import Any
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Table
+from minimax_cal.reporting.html.charts import PALETTE
+from minimax_cal.reporting.html.content import Block, Figure, Note, Report, View
+
+KINDS = {Note: "note", Table: "table", Figure: "figure", View: "view"}
+UNSAFE = {letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"}
+
+
+def render(report: Report, *, paper: bool = False) -> str:
+    """The page.  paper: for the printer, with its charts drawn while it is read, none to turn."""
+    try:
+        from jinja2 import Environment, StrictUndefined
+        from markupsafe import Markup
+
+        offline = import_module("plotly.offline")
+    except ModuleNotFoundError as error:
+        raise OptionError(
+            f"a report needs {error.name}: pip install minimax-cal[report]"
+        ) from error
+    pages = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    own, plotly = part("page.js"), str(offline.get_plotlyjs())
+    return pages.from_string(part("page.html.jinja")).render(
+        report=report,
+        policy=policy(own, plotly),
+        style=Markup(part("page.css")),
+        script=Markup(own),
+        packed=Markup("" if paper else pack(plotly)),
+        library=Markup(plotly if paper else ""),
+        palette=" ".join(PALETTE),
+        sections=[(s, [(kind_of(block), block) for block in s.blocks]) for s in report.sections],
+        table=lambda table: Markup(table.html()),
+        still=lambda view: Markup(view.still),
+        data=lambda figure: Markup(script_json(figure_data(figure))),
+    )  # fmt: skip
+
+
+def part(name: str) -> str:
+    """A file of this package."""
+    return (resources.files("minimax_cal.reporting.html") / name).read_text("utf-8")
+
+
+def kind_of(block: Block) -> str:
+    """How the template calls a block."""
+    return KINDS[type(block)]
+
+
+def policy(*scripts: str) -> str:
+    """No request to anywhere, and no script but these."""
+    hashes = " ".join(f"'sha256-{digest(script)}'" for script in scripts)
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
+        "img-src data: blob:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def digest(script: str) -> str:
+    """SHA-256 as a policy wants it."""
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def pack(script: str) -> str:
+    """A script compressed, as letters; the same script gives the same letters."""
+    return base64.b64encode(gzip.compress(script.encode(), 9, mtime=0)).decode()
+
+
+def figure_data(figure: Figure) -> dict[str, Any]:
+    """What the page draws."""
+    out = {"traces": figure.traces, "layout": figure.layout, "height": figure.height}
+    return out | ({"arms": figure.arms} if isinstance(figure, View) else {})
+
+
+def script_json(content: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    out = json.dumps(content, allow_nan=False, separators=(",", ":"))
+    for letter, code in UNSAFE.items():
+        out = out.replace(letter, code)
+    return out

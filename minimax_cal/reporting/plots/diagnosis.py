@@ -1,0 +1,181 @@
+"""The picture of a diagnosis (needs matplotlib: pip install minimax-cal[plot])."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.diagnosing.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+
+COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
+
+
+# ---- drawing -----------------------------------------------------------------------------------
+
+
+def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
+    """The gap as a waterfall, from the nominal robot down to the noise."""
+    steps = diagnosis.ladder
+    held = np.array([step.holdout.rms_mm for step in steps])
+    train = np.array([step.train.rms_mm for step in steps])
+    worst = np.array([step.holdout.max_mm for step in steps])
+    at = np.arange(len(steps))
+    low, high = np.minimum(held[1:], held[:-1]), np.maximum(held[1:], held[:-1])
+    colours = [AFTER if fell else BEFORE for fell in held[1:] <= held[:-1]]
+    axes.barh(at[1:], high - low, left=low, height=0.5, color=colours, alpha=0.25)
+    axes.plot(held, at, "o", color="black", label="held-out RMS")
+    axes.plot(train, at, "o", color="black", mfc="none", ms=9, label="training RMS")
+    axes.plot(worst, at, "|", color="black", ms=11, mew=2, label="largest, held out")
+    if diagnosis.floor > 0.0:
+        axes.axvline(diagnosis.floor, color="grey", ls="--", label="noise floor")
+    numbers = np.concatenate([held, train, worst, [diagnosis.floor]])
+    numbers = numbers[np.isfinite(numbers)]
+    if numbers.min() > 0.0 and numbers.max() > 10.0 * numbers.min():
+        axes.set_xscale("log")
+        plain_ticks(axes.xaxis, numbers)
+    else:
+        axes.set_xlim(left=0.0)
+    axes.set_yticks(at, [textwrap.fill(step.name, 24) for step in steps])
+    axes.set_ylim(len(steps) - 0.5, -0.5)
+    right = axes.secondary_yaxis("right")
+    right.set_yticks(at, [f"{value:.3f}" for value in held])
+    right.tick_params(length=0)
+    axes.set_xlabel("error (mm); on the right: held-out RMS")
+    axes.grid(visible=True, axis="x", alpha=0.3)
+    outside(axes, 4)
+
+
+def plain_ticks(axis: Any, values: Array) -> None:
+    """Labels 0.1 0.2 0.5 1 on a logarithmic axis; the powers of ten alone where those are many."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    many = np.nanmax(values) > 200.0 * np.nanmin(values)
+    axis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def outside(axes: Any, columns: int) -> None:
+    """The legend above the axes, where no point can lie under it."""
+    axes.legend(
+        frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small",
+        handletextpad=0.2, columnspacing=1.0, borderaxespad=0.1,
+    )  # fmt: skip
+
+
+def draw_curve(axes: Any, left: Leftover, curve: Curve, *, log: bool = False) -> None:
+    """Points of training poses small and pale, of held-out poses large."""
+    held = np.broadcast_to(left.held, curve.x.shape)
+    for number, (y, (name, colour)) in enumerate(zip(curve.y, COLOURS.items(), strict=False)):
+        depth = 2.0 + number % 2  # the last view lies under the others
+        axes.plot(curve.x[~held], y[~held], ".", color=colour, ms=4, alpha=0.5, zorder=depth)
+        axes.plot(curve.x[held], y[held], "o", color=colour, ms=5, label=name, zorder=depth)
+    axes.plot([], [], ".", color="black", ms=4, label="small: fitted")
+    if log and all(np.nanmin(y) > 0.0 for y in curve.y):
+        axes.set_yscale("log")
+        plain_ticks(axes.yaxis, np.concatenate(curve.y))
+    elif not log:
+        axes.axhline(0.0, color="grey", lw=0.8)
+    axes.set(xlabel=curve.xlabel, ylabel=curve.ylabel)
+    axes.grid(visible=True, alpha=0.3)
+    outside(axes, 4)
+
+
+def room(values: Array, widest: float) -> tuple[float, float]:
+    """Limits of an axis that hold the values, a third as wide as the widest at least."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    half = 0.55 * max(high - low, widest / 3.0)
+    return (low + high) / 2.0 - half, (low + high) / 2.0 + half
+
+
+def draw_maps(part: Any, left: Leftover) -> None:
+    """The errors over the workspace from above and from the side, all on one colour scale."""
+    from matplotlib.colors import LogNorm
+
+    sizes = left.distances()
+    seen = np.concatenate([size[np.isfinite(size)] for size in sizes])
+    seen = seen[seen > 0.0] if (seen > 0.0).any() else np.ones(1)
+    low, high = float(np.quantile(seen, 0.05)), float(seen.max())
+    scale = LogNorm(low, max(high, 1.5 * low))
+    up = left.scene.robot.up
+    tall = int(np.argmax(np.abs(up)))
+    first, second = (axis for axis in range(3) if axis != tall)
+    height = left.points @ up
+    views = (("top", left.points[..., second], f"{'xyz'[second]} (m)"),
+             ("side", height, "height (m)"))  # fmt: skip
+    spans = [np.nanmax(p) - np.nanmin(p) for p in
+             (left.points[..., first], left.points[..., second], height)]  # fmt: skip
+    widest = float(max(spans))
+    wide = len(sizes) > 1  # one view stands beside the other; two above each other
+    grid = part.subplots(
+        len(sizes), 2, squeeze=False, sharex=True, sharey="row" if wide else "none"
+    )
+    panels = [(view, *each) for view in views for each in zip(sizes, COLOURS, strict=False)]
+    for axes, ((view, down, label), size, name) in zip(grid.flat, panels, strict=True):
+        order = np.argsort(np.nan_to_num(size), axis=None)  # the worst on top
+        shown = axes.scatter(
+            left.points[..., first].ravel()[order], down.ravel()[order],
+            c=size.ravel()[order], norm=scale, cmap="cividis_r", s=9,
+        )  # fmt: skip
+        axes.set_aspect("equal", adjustable="box")
+        axes.set(xlim=room(left.points[..., first], widest), ylim=room(down, widest))
+        axes.set_title(f"{name}, {view}", fontsize="medium")
+        axes.grid(visible=True, alpha=0.3)
+        if axes in grid[:, 0] or not wide:
+            axes.set_ylabel(label)
+        if axes in grid[-1]:
+            axes.set_xlabel(f"{'xyz'[first]} (m)")
+    place = "right" if wide else "bottom"
+    bar = part.colorbar(
+        shown, ax=grid, label="error of a point (mm)", extend="min", location=place, shrink=0.8
+    )
+    plain_ticks(bar.ax.yaxis if wide else bar.ax.xaxis, np.array([low, high]))
+
+
+def verdict_of(diagnosis: Diagnosis) -> str:
+    """The verdict in a few words."""
+    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.findings]
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    found = ", ".join(names[:3]) + more
+    return {
+        "none": "nothing beyond geometry and noise was found",
+        "named": found,
+        "one_of": f"{found} (or what looks like it)",
+        "unknown": f"cause not known; best guess {found}" if found else "cause not known",
+        "not_repeatable": "does not return to the same place",
+    }[diagnosis.verdict]
+
+
+def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
+    """The gap step by step, what is left against its cause, by visit order, and in the workspace.
+
+    path: its suffix, one of `figures.PICTURES`, chooses the format.
+    """
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
+    left = diagnosis.leftover()
+    residual, order = residual_curve(left), order_curve(left)
+    figure = Figure(figsize=(12.5, 10), layout="constrained")
+    title = textwrap.fill(f"{diagnosis.robot}: {verdict_of(diagnosis)}", 110)
+    figure.suptitle(title, fontweight="bold")
+    parts: Any = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)
+    titles = ("a  the gap, step by step", f"b  {residual.title}", f"c  {order.title}",
+              "d  errors over the workspace (base frame)")  # fmt: skip
+    for part, title in zip(parts.flat, titles, strict=True):
+        part.suptitle(title, x=0.01, ha="left")
+    draw_ladder(parts[0, 0].subplots(), diagnosis)
+    draw_curve(parts[0, 1].subplots(), left, residual)
+    draw_curve(parts[1, 0].subplots(), left, order, log=True)
+    draw_maps(parts[1, 1], left)
+    save(figure, Path(path))

@@ -1,0 +1,94 @@
+"""The picture of a plan (needs matplotlib: pip install minimax-cal[plot])."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.planning.result import POWER, Plan
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+
+GREY = "#bbbbbb"
+
+
+def save_plan(plan: Plan, path: Path) -> None:
+    """Where the flange goes, from the side and from above, and what other numbers would tell."""
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
+    figure = Figure(figsize=(13.5, 4.4), layout="constrained")
+    side, above, growth = figure.subplots(1, 3, width_ratios=(1.0, 1.2, 1.1))
+    views(plan, side, above)
+    grown(plan, growth)
+    figure.suptitle(
+        f"{plan.cell.robot.name}: {plan.poses} poses by criterion {plan.criterion}, at least "
+        f"{100.0 * plan.efficiency:.0f} % of the best possible",
+        fontweight="bold",
+    )
+    save(figure, path)
+
+
+def axes_of(up: Array) -> Array:
+    """(3, 3) two level directions and the vertical, as rows."""
+    level = np.eye(3)[int(np.argmin(np.abs(up)))]
+    level = level - up * (up @ level)
+    level = level / np.linalg.norm(level)
+    return np.stack([level, np.cross(up, level), up])
+
+
+def views(plan: Plan, side: Any, above: Any) -> None:
+    """The flange at the candidates and at the poses chosen, the way, and the tracker."""
+    robot, axes = plan.cell.robot, axes_of(plan.cell.robot.up)
+    everywhere, chosen = (robot.pose(q)[:, :3, 3] @ axes.T for q in (plan.candidates.q, plan.q))
+    eye = axes @ plan.place
+
+    def out(points: Array) -> Array:
+        return np.asarray(np.hypot(points[..., 0], points[..., 1]))
+
+    for points, colour, size, name in (
+        (everywhere, GREY, 1.0, "candidates"),
+        (chosen, AFTER, 18.0, "chosen"),
+    ):
+        side.scatter(out(points), points[:, 2], s=size, color=colour, label=name)
+        above.scatter(points[:, 0], points[:, 1], s=size, color=colour)
+    above.plot(chosen[:, 0], chosen[:, 1], color=AFTER, linewidth=0.6, alpha=0.7)
+    side.plot(out(eye), eye[2], "^", color=BEFORE, label="tracker")
+    above.plot(eye[0], eye[1], "^", color=BEFORE)
+    side.set(xlabel="flange, distance from the base's vertical (m)", ylabel="height (m)")
+    above.set(xlabel="flange, from above (m)", ylabel="(m)")
+    for one in (side, above):
+        one.set_aspect("equal", adjustable="datalim")
+        one.grid(visible=True, alpha=0.3)
+    side.legend(frameon=False, fontsize="small")
+
+
+def grown(plan: Plan, axes: Any) -> None:
+    """Sigma of a position, or power, against the number of poses."""
+    poses = [row.poses for row in plan.growth]
+    power = plan.criterion == POWER
+    curves = (
+        {"power": [row.size for row in plan.growth]}
+        if power
+        else {
+            "mean": [row.mean for row in plan.growth],
+            "worst": [row.worst for row in plan.growth],
+        }
+    )
+    for (name, pairs), style in zip(curves.items(), ("-", "--"), strict=False):
+        for place, colour, who in ((0, AFTER, "planned"), (1, BEFORE, "random")):
+            values = [1.0 / pair[place] if power else 1e6 * pair[place] for pair in pairs]
+            axes.plot(poses, values, style, marker="o", ms=4, color=colour, label=f"{name}, {who}")
+    if power:
+        axes.axhline(plan.separation[0].needed, color="black", linewidth=0.8, label="enough")
+    ylabel = "power" if power else "predicted sigma of a position (µm)"
+    axes.set(xlabel="poses", ylabel=ylabel, ylim=(0.0, None))
+    axes.set_xticks(poses)
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend(frameon=False, fontsize="small")

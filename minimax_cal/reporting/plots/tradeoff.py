@@ -1,0 +1,41 @@
+"""The curve between the least RMS and the least worst error, drawn."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.judging.tradeoff import Tradeoff
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+
+
+def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
+    """The curve, training and held out.
+
+    path: its suffix, one of `figures.PICTURES`, chooses the format.
+    """
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError as error:
+        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    parts = {"training poses": [c.train for c in found.choices]}
+    if found.choices[0].holdout.poses:
+        parts["held-out poses"] = [c.holdout for c in found.choices]
+    panels = figure.subplots(1, len(parts), squeeze=False)[0]
+    for axes, (name, judged), colour in zip(panels, parts.items(), (BEFORE, AFTER), strict=False):
+        axes.plot([a.rms_mm for a in judged], [a.max_mm for a in judged], "o-", color=colour)
+        for number, a in enumerate(judged):
+            text = {0: "sum", len(judged) - 1: "point"}.get(number, str(number))
+            spot = (a.rms_mm, a.max_mm)
+            axes.annotate(text, spot, xytext=(5, 5), textcoords="offset points")
+        axes.set(xlabel="RMS error (mm)", ylabel="largest error (mm)")
+        axes.set_title(f"{judged[0].poses} {name}")
+        axes.margins(0.1)
+        axes.grid(visible=True, alpha=0.3)
+    title = textwrap.fill(f"{found.robot}: RMS against the largest error", 80)
+    figure.suptitle(title, fontweight="bold")
+    save(figure, Path(path))

@@ -1,0 +1,260 @@
+"""A robot: nominal or calibrated geometry, limits, masses; JSON, TOML, YAML, URDF in, JSON out."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.files import json_text, read_text, write_whole
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.urdf import is_urdf, load_urdf
+
+CONVENTION = "Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
+METRES = {"mm": 1e-3, "m": 1.0}
+RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
+Vector = tuple[Finite, Finite, Finite]
+
+
+class UnitsSchema(BaseModel):
+    """Units of a robot file."""
+
+    length: Literal["mm", "m"]
+    angle: Literal["rad", "deg"]
+
+
+class JointSchema(BaseModel):
+    """One joint of a robot file, in the file's units."""
+
+    model_config = ConfigDict(extra="allow")
+
+    a: Finite
+    d: Finite
+    theta: Finite
+    alpha: Finite
+    beta: Finite = 0.0
+    sign: Literal[1, -1] = 1
+    type: Literal["revolute", "prismatic"] = "revolute"
+    lower: Finite | None = None
+    upper: Finite | None = None
+    ratio: Finite | None = None
+    mass_kg: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None
+    com_mm: Vector | None = None
+    name: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def no_slip(cls, given: object) -> object:
+        """A key that is nearly a known one is a slip of the pen; other keys are notes."""
+        for key in given if isinstance(given, Mapping) else ():
+            near = difflib.get_close_matches(str(key), cls.model_fields, 1, cutoff=0.7)
+            if key not in cls.model_fields and near:
+                raise ValueError(f"unknown key {key!r}; did you mean {near[0]!r}?")
+        return given
+
+
+class RobotSchema(BaseModel):
+    """A robot file.  Other top-level keys are allowed: they are notes."""
+
+    name: str
+    convention: str = CONVENTION
+    units: UnitsSchema
+    joints: Annotated[list[JointSchema], Field(min_length=1)]
+    up: Vector = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial arm.
+
+    mdh: (n, 5) a, d, theta, alpha, beta [m, rad].
+    sign: (n,) +1 or -1, the controller's sense of each joint.
+    prismatic: (n,) True where the joint slides.
+    lower, upper: (n,) joint limits, infinite where unknown [rad, m].
+    ratio: (n,) gear ratio, NaN where unknown.
+    mass: (n,) mass of the link that joint i moves, NaN where unknown [kg].
+    com: (n, 3) its centre of gravity in frame i, NaN where unknown [m].
+    up: (3,) vertical in the base frame.
+    """
+
+    name: str
+    mdh: Array
+    sign: Array
+    prismatic: Array
+    lower: Array
+    upper: Array
+    ratio: Array
+    mass: Array
+    com: Array
+    up: Array
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.mdh)
+
+    def pose(self, q: Array) -> Array:
+        """Pose of the last frame in the base: (..., 4, 4) [m].  q: (..., n) [rad, m]."""
+        q = np.asarray(q)
+        flat = q.reshape(-1, self.joints)
+        pose = kinematics.forward(self.mdh, flat * self.sign, self.prismatic)
+        return pose.reshape(*q.shape[:-1], 4, 4)
+
+    def reach(self) -> float:
+        """Length of the stretched arm without its slides, at least 0.1: a scale for errors [m]."""
+        return max(0.1, float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The robot in the file schema, in millimetres and radians."""
+
+        def joint(i: int) -> dict[str, Any]:
+            a, d, theta, alpha, beta = map(float, self.mdh[i])
+            scale = 1e3 if self.prismatic[i] else 1.0
+            optional = {
+                "lower": self.lower[i] * scale,
+                "upper": self.upper[i] * scale,
+                "ratio": self.ratio[i],
+                "mass_kg": self.mass[i],
+            }
+            out: dict[str, Any] = dict(a=a * 1e3, d=d * 1e3, theta=theta, alpha=alpha, beta=beta)
+            out["sign"] = int(self.sign[i])
+            if self.prismatic[i]:
+                out["type"] = "prismatic"
+            out |= {key: float(value) for key, value in optional.items() if np.isfinite(value)}
+            if np.all(np.isfinite(self.com[i])):
+                out["com_mm"] = [float(c) * 1e3 for c in self.com[i]]
+            return out
+
+        return {
+            "name": self.name,
+            "convention": CONVENTION,
+            "units": {"length": "mm", "angle": "rad"},
+            "up": [float(u) for u in self.up],
+            "joints": [joint(i) for i in range(self.joints)],
+        }
+
+    def save(self, path: Path | str) -> None:
+        """Write the robot as JSON."""
+        write_whole(path, json_text(self.to_dict()))
+
+    def with_mdh(self, mdh: Array) -> Robot:
+        """The same robot with another geometry."""
+        return replace(self, mdh=np.array(mdh))
+
+
+def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
+    """A robot from the file schema.  source: what messages call it.  Raises RobotError."""
+    try:
+        schema = RobotSchema.model_validate(content)
+    except ValidationError as error:
+        raise RobotError(f"{source}: {explain(error)}") from error
+    if "".join(schema.convention.split()) != "".join(CONVENTION.split()):
+        raise RobotError(
+            f"{source}: convention {schema.convention!r} is not known; use {CONVENTION!r}"
+        )
+    metre, radian = METRES[schema.units.length], RADIANS[schema.units.angle]
+    joints = schema.joints
+    prismatic = np.array([joint.type == "prismatic" for joint in joints])
+    unit = np.where(prismatic, metre, radian)
+
+    def optional(values: list[float | None], default: float) -> Array:
+        return np.array([default if value is None else value for value in values], dtype=float)
+
+    lower = optional([j.lower for j in joints], -np.inf) * unit
+    upper = optional([j.upper for j in joints], np.inf) * unit
+    if np.any(lower >= upper):
+        number = int(np.argmax(lower >= upper)) + 1
+        raise RobotError(f"{source}: joint {number}: lower must be less than upper")
+    scale = np.array([metre, metre, radian, radian, radian])
+    mdh = np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in joints]) * scale
+    huge = np.abs(mdh) > [LONGEST, LONGEST, TURNED, TURNED, TURNED]
+    if huge.any():
+        joint, column = np.argwhere(huge)[0]
+        raise RobotError(
+            f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
+        )
+    up = np.array(schema.up)
+    if np.linalg.norm(up) < 1e-9:
+        raise RobotError(f"{source}: up: is a zero vector; give the vertical, e.g. [0, 0, 1]")
+    return Robot(
+        name=schema.name,
+        mdh=mdh,
+        sign=np.array([float(j.sign) for j in joints]),
+        prismatic=prismatic,
+        lower=lower,
+        upper=upper,
+        ratio=optional([j.ratio for j in joints], np.nan),
+        mass=optional([j.mass_kg for j in joints], np.nan),
+        com=np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3,
+        up=up / np.linalg.norm(up),
+    )
+
+
+def explain(error: ValidationError) -> str:
+    """The first complaint of the schema, in one line: where and what."""
+    first = error.errors(include_url=False)[0]
+    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+    text = first["msg"].removeprefix("Value error, ")
+    message = f"{place.lstrip('.') or 'file'}: {text[0].lower()}{text[1:]}"
+    more = error.error_count() - 1
+    return message + (f" (and {more} more)" if more else "")
+
+
+def builtin_robots() -> tuple[str, ...]:
+    """Names of the robots that come with the package."""
+    folder = resources.files("minimax_cal.robots") / "builtin"
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
+
+
+PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
+    ".json": (json.loads, json.JSONDecodeError),
+    ".toml": (tomllib.loads, tomllib.TOMLDecodeError),
+    ".yaml": (yaml.safe_load, yaml.YAMLError),
+    ".yml": (yaml.safe_load, yaml.YAMLError),
+}
+
+
+def load_robot(source: Path | str) -> Robot:
+    """A built-in robot by name, or a robot file (.json, .toml, .yaml, .urdf).
+
+    ``robot.urdf#link`` names the last link of a chain.  Raises RobotError.
+    """
+    path = Path(source)
+    if str(source) in builtin_robots():
+        builtin = resources.files("minimax_cal.robots") / "builtin" / f"{source}.json"
+        text = builtin.read_text("utf-8")
+        return robot_from_dict(json.loads(text), str(source))
+    if is_urdf(source):
+        return robot_from_dict(load_urdf(source).content, str(source))
+    if path.suffix.lower() not in PARSERS:
+        if len(str(source)) < 200 and path.exists():
+            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}, .urdf")
+        near = difflib.get_close_matches(str(source), builtin_robots(), 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
+        raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")
+    parse, failure = PARSERS[path.suffix.lower()]
+    text = read_text(path, kind=RobotError)
+    try:
+        content = parse(text)
+    except (failure, RecursionError, ValueError) as error:
+        raise RobotError(f"{path}: cannot be parsed: {' '.join(str(error).split())}") from error
+    if not isinstance(content, Mapping):
+        raise RobotError(f"{path}: holds no robot; expected keys name, units, joints")
+    if isinstance(content.get("robot"), Mapping):  # a saved calibration holds its robot whole
+        content = content["robot"]
+    return robot_from_dict(content, str(path))

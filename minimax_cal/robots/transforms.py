@@ -1,0 +1,175 @@
+"""Rigid transforms: roll, pitch, yaw; and the link that leads from one joint axis to the next.
+
+A link ``Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)`` puts the z axis of its last frame on any given
+line.  Between axes that are not parallel it takes the common normal (beta = 0); between nearly
+parallel ones, whose common normal is nowhere, it keeps d = 0 and uses beta [Hayati 1983].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.kinematics import hat
+
+PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count as parallel
+ON_AXIS = 1e-5  # a tip this near to the last axis is meant to lie on it [m]
+SAME = 1e-12  # transforms that differ by less are equal to rounding [m, rad]
+
+
+def transform(rotation: Array, origin: Array) -> Array:
+    """A pose (..., 4, 4) of a rotation (..., 3, 3) and an origin (..., 3) [m]."""
+    shape = np.broadcast_shapes(rotation.shape[:-2], origin.shape[:-1])
+    pose = np.zeros((*shape, 4, 4))
+    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, origin, 1.0
+    return pose
+
+
+def inverse(pose: Array) -> Array:
+    """The inverse of a rigid transform (4, 4)."""
+    turned = pose[:3, :3].T
+    return transform(turned, -turned @ pose[:3, 3])
+
+
+def turn(axis: int, angle: float) -> Array:
+    """Rotation about x, y or z by an angle: (4, 4)."""
+    out, (i, j) = np.eye(4), ((axis + 1) % 3, (axis + 2) % 3)
+    out[i, i] = out[j, j] = np.cos(angle)
+    out[j, i], out[i, j] = np.sin(angle), -np.sin(angle)
+    return out
+
+
+def shift(x: float, y: float, z: float) -> Array:
+    """Translation: (4, 4) [m]."""
+    return transform(np.eye(3), np.array([x, y, z]))
+
+
+def head(row: Array) -> Array:
+    """The part of a link that lies along its joint axis: Rz(theta) Tz(d).  row: (5,)."""
+    return turn(2, row[2]) @ shift(0.0, 0.0, row[1])
+
+
+def tail(row: Array) -> Array:
+    """The rest of the link: Tx(a) Rx(alpha) Ry(beta).  row: (5,) a, d, theta, alpha, beta."""
+    return shift(row[0], 0.0, 0.0) @ turn(0, row[3]) @ turn(1, row[4])
+
+
+def link(row: Array) -> Array:
+    """A link at joint value 0.  row: (5,) a, d, theta, alpha, beta [m, rad]."""
+    return head(row) @ tail(row)
+
+
+def from_rpy(xyz: Array, rpy: Array) -> Array:
+    """A URDF origin: Txyz Rz(yaw) Ry(pitch) Rx(roll).  xyz [m], rpy [rad]."""
+    roll, pitch, yaw = rpy
+    return shift(*xyz) @ turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+
+
+def to_rpy(pose: Array, near: Array | None = None) -> Array:
+    """Roll, pitch, yaw of a pose [rad]; of the two ways to write them, the one nearer to near."""
+    near = np.zeros(3) if near is None else near
+    r = pose[:3, :3]
+    steep = np.hypot(r[0, 0], r[1, 0]) < 1e-14  # then only roll - yaw or roll + yaw counts
+    yaw = near[2] if steep else np.arctan2(r[1, 0], r[0, 0])
+    rest = turn(2, -yaw)[:3, :3] @ r  # = Ry(pitch) Rx(roll): well conditioned everywhere
+    one = np.array([np.arctan2(-rest[1, 2], rest[1, 1]), np.arctan2(-rest[2, 0], rest[0, 0]), yaw])
+    other = np.array([one[0] + np.pi, np.pi - one[1], one[2] + np.pi])
+    both = [near + np.remainder(way - near + np.pi, 2 * np.pi) - np.pi for way in (one, other)]
+    best = both[int(np.abs(both[1] - near).sum() < np.abs(both[0] - near).sum() - 1e-9)]
+    return np.asarray(np.where(np.abs(best) < 1e-17, 0.0, best))
+
+
+def difference(one: Array, other: Array) -> float:
+    """The largest difference between the entries of two transforms [m, rad]."""
+    return float(np.abs(one - other).max(initial=0.0))
+
+
+def along(direction: Array) -> Array:
+    """The smallest rotation that takes z to a direction: (3, 3)."""
+    c = float(direction[2])
+    if c < -1.0 + 1e-12:
+        return turn(0, np.pi)[:3, :3]
+    v = hat(np.cross([0.0, 0.0, 1.0], direction))
+    return np.asarray(np.eye(3) + v + v @ v / (1.0 + c))
+
+
+def link_to(point: Array, direction: Array) -> Array:
+    """The link (5,) whose last z axis is the line through point along direction.
+
+    Both in the frame before the link, whose z is the joint axis [m].
+    """
+    w = direction / np.linalg.norm(direction)
+    if np.hypot(w[0], w[1]) < PARALLEL:
+        spot = point - w * point[2] / w[2]
+        a = float(np.hypot(spot[0], spot[1]))
+        a, theta = upright(a, float(np.arctan2(spot[1], spot[0]))) if a > SAME else (0.0, 0.0)
+        v = turn(2, -theta)[:3, :3] @ w
+        return np.array([a, 0.0, theta, *tilts(v)])
+    theta = float(np.arctan2(w[0], -w[1]))  # x along the common normal z x w
+    a, theta = upright(float(point @ [np.cos(theta), np.sin(theta), 0.0]), theta)
+    y = np.array([-np.sin(theta), np.cos(theta), 0.0])
+    d = point[2] - w[2] * (point @ y) / (w @ y)
+    return np.array([a, d, theta, np.arctan2(-(w @ y), w[2]), 0.0])
+
+
+def upright(a: float, theta: float) -> tuple[float, float]:
+    """The same offset with theta within a quarter turn, a negative if need be."""
+    quarter = np.pi / 2
+    if abs(theta) > quarter + 1e-6 or (abs(theta) > quarter - 1e-6 and a < -1e-9):
+        return -a, float(theta - np.copysign(np.pi, theta))
+    return a, theta
+
+
+def tilts(v: Array) -> tuple[float, float]:
+    """alpha and beta with Rx(alpha) Ry(beta) z = v."""
+    return float(np.arctan2(-v[1], v[2])), float(np.arctan2(v[0], np.hypot(v[1], v[2])))
+
+
+def link_to_tip(tip: Array) -> Array:
+    """The last link (5,), to a tip (4, 4) in the frame before it.
+
+    A tip on the axis is reached whole.  Elsewhere the link reaches its origin and z axis; a turn
+    about that z remains, for a link has five numbers and a pose six.
+    """
+    point, r = tip[:3, 3], tip[:3, :3]
+    a = float(np.hypot(point[0], point[1]))
+    if a > ON_AXIS:
+        theta = float(np.arctan2(point[1], point[0]))
+        ways = [(a, theta), (-a, theta - float(np.copysign(np.pi, theta)))]
+        rows = [
+            np.array([size, point[2], way, *tilts(turn(2, -way)[:3, :3] @ r[:, 2])])
+            for size, way in ways
+        ]
+        return max(rows, key=lambda row: float(np.trace(link(row)[:3, :3].T @ r)))
+    level = np.hypot(r[2, 0], r[2, 2])
+    beta = float(np.arctan2(-r[2, 0], r[2, 2])) if level > 1e-14 else 0.0
+    rest = r @ turn(1, -beta)[:3, :3]  # = Rz(theta) Rx(alpha)
+    theta, alpha = np.arctan2(rest[1, 0], rest[0, 0]), np.arctan2(rest[2, 1], rest[2, 2])
+    return np.array([0.0, point[2], theta, alpha, beta])
+
+
+def shared_base(one: Array, other: Array) -> Array:
+    """The transform B (4, 4) for which one = B other B^-1 as nearly as possible.
+
+    one, other: (m, 4, 4) what the same moves of two arms do to space.  Linear least squares
+    [AX = XB of hand-eye calibration]; what no move tells (along axes that are all parallel) is 0.
+    """
+    eye, rows, right = np.eye(3), [], []
+    for a, b in zip(one, other, strict=True):
+        # vec by rows: vec(A R - R B) = (A x I - I x B') vec(R)
+        turning = np.kron(a[:3, :3], eye) - np.kron(eye, b[:3, :3].T)
+        moving = np.kron(eye, b[:3, 3][None])
+        rows += [np.hstack([turning, np.zeros((9, 3))]), np.hstack([moving, eye - a[:3, :3]])]
+        right += [np.zeros(9), a[:3, 3]]
+    found = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=1e-9)[0]
+    u, _, v = np.linalg.svd(found[:9].reshape(3, 3))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    stacked = np.vstack([eye - a[:3, :3] for a in one])
+    rest = np.concatenate([a[:3, 3] - rotation @ b[:3, 3] for a, b in zip(one, other, strict=True)])
+    return transform(rotation, np.linalg.lstsq(stacked, rest, rcond=1e-9)[0])
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """Axis times angle of a rotation (3, 3) [rad]."""
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

@@ -1,0 +1,222 @@
+"""URDF in: any serial chain of it, as links ``Rz Tz Tx Rx Ry`` of our convention."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import RobotError
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.transforms import (
+    SAME,
+    along,
+    difference,
+    inverse,
+    link,
+    link_to,
+    link_to_tip,
+    transform,
+)
+from minimax_cal.robots.urdf_file import Joint, Urdf, read_urdf
+
+EXACT = 1e-9  # forward kinematics must agree to this [m, rad]
+TIPS = ("tool0", "flange")  # of several frames on the last moving body, the one that is meant
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfRobot:
+    """A chain of a URDF in our convention: pose of the tip = base @ robot.pose(q) @ tool.
+
+    content: the robot in the file schema, metres and radians.  chain: joints from root to tip.
+    base: (4, 4) frame 0 of the robot in the root link; tool: (4, 4) the tip in the last frame [m].
+    notices: what is not in the robot.
+    """
+
+    content: dict[str, Any]
+    urdf: Urdf
+    chain: tuple[Joint, ...]
+    base: Array
+    tool: Array
+    notices: tuple[str, ...]
+
+
+def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
+    """The joints from the root to the tip, or to the only end there is.  Raises RobotError.
+
+    Ends on a body that carries a longer chain do not count (a camera at the elbow).  Several ends
+    on one moving body differ by a constant: `tool0` or `flange` is taken, else the body's link.
+    """
+    links = {urdf.root, *(joint.child for joint in urdf.joints)}
+    leaves = [name for name in sorted(links) if not urdf.from_link(name)]
+    if tip and tip not in links:
+        raise RobotError(f"{urdf.source}: no link {tip!r}; its ends are {', '.join(leaves)}")
+    ends = {leaf: [j for j in urdf.to_link(leaf) if j.moves] for leaf in leaves}
+    inner = [moving[:i] for moving in ends.values() for i in range(len(moving))]
+    ends = {leaf: moving for leaf, moving in ends.items() if moving not in inner and moving}
+    if not ends:
+        raise RobotError(f"{urdf.source}: has no revolute, continuous or prismatic joint")
+    if not tip:
+        bodies = {moving[-1].child for moving in ends.values()}
+        if len(bodies) > 1:
+            raise RobotError(
+                f"{urdf.source}: several chains: they end in {', '.join(ends)}; name the last "
+                f"link: --tip, or {Path(urdf.source).name}#{next(iter(ends))}"
+            )
+        named = [name for name in TIPS if name in links and len(urdf.to_link(name)) and
+                 [j for j in urdf.to_link(name) if j.moves] in list(ends.values())]  # fmt: skip
+        tip = next(iter(ends)) if len(ends) == 1 else [*named, *bodies][0]
+    chain = urdf.to_link(tip)
+    for joint in chain:
+        if joint.kind in ("floating", "planar") or joint.mimics:
+            kind = "mimic" if joint.mimics else joint.kind
+            raise RobotError(
+                f"{urdf.source}:{joint.element.line}: joint {joint.name!r} on the way to {tip!r} "
+                f"is {kind}; only revolute, continuous, prismatic and fixed joints are supported"
+            )
+    if not any(joint.moves for joint in chain):
+        raise RobotError(f"{urdf.source}: no moving joint leads to {tip!r}")
+    return chain
+
+
+def tip_poses(chain: Sequence[Joint], q: Array) -> Array:
+    """The tip in the root link, by the URDF's own transforms: (m, 4, 4).  q: (m, n) [rad, m]."""
+    pose, column = np.broadcast_to(np.eye(4), (len(q), 4, 4)), 0
+    for joint in chain:
+        pose = pose @ joint.origin
+        if joint.moves:
+            pose = pose @ joint.motion(q[:, column])
+            column += 1
+    return np.asarray(pose)
+
+
+def rest_frames(urdf: Urdf, start: str, pose: Array, *, moving: bool) -> dict[str, Array]:
+    """Poses at joint values 0 of a link and those below it, beyond moving joints or only fixed."""
+    out, queue = {start: pose}, [start]
+    for name in queue:  # grows while it is walked
+        for joint in urdf.from_link(name):
+            if moving or not joint.moves:
+                out[joint.child] = out[name] @ joint.origin
+                queue.append(joint.child)
+    return out
+
+
+def random_joints(lower: Array, upper: Array, count: int = 60) -> Array:
+    """Joint values within limits, and all zero: (count, n)."""
+    q = np.random.default_rng(0).uniform(
+        np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower))
+    )
+    q[0] = 0.0
+    return np.asarray(q)
+
+
+def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
+    """A chain of a URDF as a robot, checked by forward kinematics.  Raises RobotError."""
+    chain = chain_to(urdf, tip)
+    frames = rest_frames(urdf, urdf.root, np.eye(4), moving=True)
+    moving = [joint for joint in chain if joint.moves]
+    sign = np.array([-1.0 if joint.axis[np.abs(joint.axis).argmax()] < 0 else 1.0
+                     for joint in moving])  # fmt: skip
+    up = float((frames[moving[0].child][:3, :3] @ moving[0].axis)[2])
+    if abs(up) > 0.5:  # the base's z stays upright where joint 1 allows it
+        sign[0] = np.sign(up)
+    axes = [frames[joint.child][:3, :3] @ joint.axis * s
+            for joint, s in zip(moving, sign, strict=True)]  # fmt: skip
+    points = [frames[joint.child][:3, 3] for joint in moving]
+    if moving[0].kind == "prismatic":
+        points[0] = np.zeros(3)
+    base = transform(along(axes[0]), points[0] - (points[0] @ axes[0]) * axes[0])
+    ends, rows = [base], []
+    for point, axis in zip(points[1:], axes[1:], strict=True):
+        back = inverse(ends[-1])
+        rows.append(link_to(back[:3, :3] @ point + back[:3, 3], back[:3, :3] @ axis))
+        ends.append(ends[-1] @ link(rows[-1]))
+    tip_pose = frames[chain[-1].child]
+    rows.append(link_to_tip(inverse(ends[-1]) @ tip_pose))
+    ends.append(ends[-1] @ link(rows[-1]))
+    tool = inverse(ends[-1]) @ tip_pose
+    mdh, slides = np.array(rows), np.array([joint.kind == "prismatic" for joint in moving])
+    lower, upper = (np.array([getattr(j, n) for j in moving]) for n in ("lower", "upper"))
+    q = random_joints(lower, upper)
+    pose = base @ kinematics.forward(mdh, q * sign, slides) @ tool
+    if not (worst := difference(pose, tip_poses(chain, q))) <= EXACT:
+        raise RobotError(
+            f"{urdf.source}: poses would be off by {worst:.1e} m; check its units (metres)"
+        )
+    joints = [
+        joint_content(joint, row, s, centre)
+        for joint, row, s, centre in zip(
+            moving, mdh, sign, centres(urdf, moving, frames, ends[1:]), strict=True
+        )
+    ]
+    content = {
+        "name": urdf.name,
+        "units": {"length": "m", "angle": "rad"},
+        "up": base[2, :3].tolist(),
+        "joints": joints,
+    }
+    return UrdfRobot(content, urdf, chain, base, tool, left_out(urdf, chain, base, tool))
+
+
+def centres(
+    urdf: Urdf, moving: Sequence[Joint], frames: Mapping[str, Array], ends: Sequence[Array]
+) -> list[tuple[float, Array]]:
+    """Mass and centre of gravity, in frame i [m], of what joint i carries up to the next joint."""
+    out = []
+    for joint, end in zip(moving, ends, strict=True):
+        body = rest_frames(urdf, joint.child, frames[joint.child], moving=False)
+        parts = [(urdf.masses[n], body[n]) for n in body if n in urdf.masses]
+        mass = sum(m for (m, _), _ in parts)
+        at = sum((m * (pose[:3, :3] @ c + pose[:3, 3]) for (m, c), pose in parts), np.zeros(3))
+        back = inverse(end)
+        out.append((mass, back[:3, :3] @ at / (mass or 1.0) + back[:3, 3]))
+    return out
+
+
+def joint_content(
+    joint: Joint, row: Array, sign: float, centre: tuple[float, Array]
+) -> dict[str, Any]:
+    """A joint in the file schema."""
+    out: dict[str, Any] = dict(zip(kinematics.MDH_NAMES, row.tolist(), strict=True))
+    out |= {"name": joint.name, "sign": int(sign)}
+    if joint.kind == "prismatic":
+        out["type"] = "prismatic"
+    if np.isfinite(joint.lower):
+        out |= {"lower": joint.lower, "upper": joint.upper}
+    mass, com = centre
+    if mass > 0.0:
+        out |= {"mass_kg": mass, "com_mm": (com * 1e3).tolist()}
+    return out
+
+
+def left_out(urdf: Urdf, chain: tuple[Joint, ...], base: Array, tool: Array) -> tuple[str, ...]:
+    """What the robot does not hold, for people."""
+    out = []
+    for what, pose in (("base, in the root link", base), ("tip, in the last frame", tool)):
+        if difference(pose, np.eye(4)) > SAME:
+            at = ", ".join(f"{1e3 * v:.6g}" for v in pose[:3, 3])
+            out.append(f"{urdf.source}: a constant transform remains: {what}, at ({at}) mm")
+    aside = [j.name for j in urdf.joints if j.moves and j not in chain]
+    if aside:
+        out.append(
+            f"{urdf.source}: joints outside the chain, and masses beyond them, are not in the "
+            f"robot: {', '.join(aside[:8])}"
+        )
+    return tuple(out)
+
+
+def load_urdf(source: Path | str) -> UrdfRobot:
+    """A robot of a URDF file; ``robot.urdf#link`` names the last link.  Raises RobotError."""
+    name, mark, tip = str(source).rpartition("#")
+    plain = not mark or Path(source).exists()
+    return to_robot(read_urdf(source)) if plain else to_robot(read_urdf(name), tip)
+
+
+def is_urdf(source: Path | str) -> bool:
+    """Whether a robot's name means a URDF file."""
+    name, mark, _ = str(source).rpartition("#")
+    return (name if mark else str(source)).lower().endswith(".urdf")

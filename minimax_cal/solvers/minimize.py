@@ -1,0 +1,267 @@
+"""`minimize_max`: the minimax SQP behind a function in SciPy's style, for any smooth problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.optimize import (
+    Bounds,
+    LinearConstraint,
+    NonlinearConstraint,
+    OptimizeResult,
+    approx_fprime,
+)
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.minimax import Linear, Sqp, Step
+from minimax_cal.solvers.status import Status
+from qp_backends import Problem, Solution
+from qp_backends import solve as solve_qp
+
+Constraint = LinearConstraint | NonlinearConstraint
+Function = Callable[[Array], Array]
+COMPLEX_STEP = 1e-30
+QP_TOLERANCE = 1e-9
+
+
+def minimize_max(
+    fun: Callable[..., Any],
+    x0: Any,
+    jac: Callable[..., Any] | str = "2-point",
+    bounds: Bounds | None = None,
+    constraints: Constraint | Sequence[Constraint] = (),
+    qp: str | Callable[[Problem], Solution] = "daqp",
+    *,
+    args: tuple[Any, ...] = (),
+    tol: float = 1e-8,
+    maxiter: int = 500,
+    callback: Callable[[OptimizeResult], None] | None = None,
+) -> OptimizeResult:
+    """Minimise over x the largest of several smooth functions.
+
+    fun: (n,) -> (m,).  x0: (n,).  jac: (n,) -> (m, n), or "cs" for the complex step (exact; fun
+    must take complex numbers) or "2-point" for finite differences (least accurate).
+    bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint.
+    qp: name of a QP backend, or a function from Problem to a verified Solution.
+    args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
+    the larger of one and the largest gradient.  callback: called with fun, nit, kkt after each QP.
+
+    Returns x, fun (the largest), values (m,), success, status, message, nit, nfev, njev,
+    multipliers (m,) that sum to one, constraint_multipliers (one row a bound or constraint, > 0
+    at the upper side and < 0 at the lower), kkt, violation, notes.
+    Raises OptionError for arguments that do not fit together.
+    """
+    x = np.array(x0, dtype=float).reshape(-1)
+    if not np.all(np.isfinite(x)):
+        raise OptionError("minimize_max: x0 holds NaN or infinite entries")
+    listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
+    rows = Rows.of(len(x), bounds, listed)
+    if bounds is not None:
+        x = np.clip(x, bounds.lb, bounds.ub)
+    count = Count()
+    function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
+    slope = derivative(function, jac, args, count)
+    first = function(x)
+    if first.ndim != 1 or not np.all(np.isfinite(first)):
+        raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
+    size = max(1.0, float(np.abs(slope(x)).max(initial=0.0)))
+    problem = MaxOfFunctions(function, slope, rows, size)
+    solver = partial(solve_qp, name=qp, tolerance=QP_TOLERANCE) if isinstance(qp, str) else qp
+
+    def tell(step: Step) -> None:
+        if callback is not None:
+            callback(result(fun=step.value * size, nit=step.iteration, kkt=step.kkt))
+
+    settings = Sqp(tolerance=tol, iterations=maxiter, hessian="bfgs")
+    found = minimax.solve(problem, x, solver, settings, tell)
+    values = function(found.x)
+    return result(
+        x=found.x,
+        fun=float(values.max()),
+        values=values,
+        success=found.status is Status.CONVERGED,
+        status=str(found.status),
+        message=found.status.advice or "optimal to the tolerance",
+        nit=found.iterations,
+        nfev=count.function,
+        njev=count.jacobian,
+        multipliers=found.mu,
+        constraint_multipliers=found.lam * size,
+        kkt=found.kkt.residual,
+        violation=found.kkt.violation,
+        notes=found.notes,
+    )
+
+
+def result(**fields: Any) -> OptimizeResult:
+    """A result in SciPy's form."""
+    out = OptimizeResult()
+    out.update(fields)
+    return out
+
+
+@dataclass
+class Count:
+    """How often function and Jacobian were evaluated."""
+
+    function: int = 0
+    jacobian: int = 0
+
+
+def counted(function: Function, count: Count) -> Function:
+    """The function, counting its calls; what it returns that is no number becomes infinite."""
+
+    def run(x: Array) -> Array:
+        count.function += 1
+        with np.errstate(all="ignore"):
+            return np.asarray(function(x))
+
+    return run
+
+
+def derivative(
+    function: Function, jac: Callable[..., Any] | str, args: tuple[Any, ...], count: Count
+) -> Function:
+    """The Jacobian as a function of x alone.  Raises OptionError for an unknown kind."""
+
+    def run(x: Array) -> Array:
+        count.jacobian += 1
+        if callable(jac):
+            matrix = jac(x, *args)
+            return dense(matrix)
+        if jac == "cs":
+            return complex_step(function, x)
+        return np.atleast_2d(approx_fprime(x, function))
+
+    if not callable(jac) and jac not in ("cs", "2-point"):
+        raise OptionError(f"minimize_max: jac {jac!r}: give a function, 'cs' or '2-point'")
+    return run
+
+
+def dense(matrix: Any) -> Array:
+    """A matrix, sparse or not, as a two-dimensional array of floats."""
+    whole: Any = matrix.toarray() if hasattr(matrix, "toarray") else matrix
+    return np.atleast_2d(np.array(whole, dtype=float))
+
+
+def complex_step(function: Function, x: Array) -> Array:
+    """Exact derivative (m, n) of a function that takes complex numbers [Squire and Trapp 1998]."""
+    steps = x + 1j * COMPLEX_STEP * np.eye(len(x))
+    return np.stack([function(step).imag / COMPLEX_STEP for step in steps], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Bounds and constraints as one function c(x) with lower <= c(x) <= upper.
+
+    linear: (l, n) matrix of bounds and linear constraints.  parts: the nonlinear ones, each with
+    its derivative.
+    """
+
+    linear: Array
+    parts: tuple[tuple[Function, Function], ...]
+    lower: Array
+    upper: Array
+
+    @staticmethod
+    def of(n: int, bounds: Bounds | None, constraints: Sequence[Constraint]) -> Rows:
+        """Raises OptionError where sizes do not fit or a kind is unknown."""
+        matrices, lower, upper = [np.zeros((0, n))], [np.zeros(0)], [np.zeros(0)]
+        curved: list[tuple[Function, Function]] = []
+        curved_lower: list[Array] = []
+        curved_upper: list[Array] = []
+        if bounds is not None:
+            low, high = (np.broadcast_to(side, n).astype(float) for side in (bounds.lb, bounds.ub))
+            some = np.isfinite(low) | np.isfinite(high)
+            matrices.append(np.eye(n)[some])
+            lower.append(low[some])
+            upper.append(high[some])
+        for constraint in constraints:
+            if isinstance(constraint, LinearConstraint):
+                matrix = dense(constraint.A)
+                if matrix.shape[1] != n:
+                    raise OptionError(
+                        f"minimize_max: a LinearConstraint has {matrix.shape[1]} columns, x has {n}"
+                    )
+                count = len(matrix)
+                matrices.append(matrix)
+                lower.append(np.broadcast_to(constraint.lb, count).astype(float))
+                upper.append(np.broadcast_to(constraint.ub, count).astype(float))
+            elif isinstance(constraint, NonlinearConstraint):
+                function = counted(partial(vector, constraint.fun), Count())
+                kind = constraint.jac
+                kind = kind if callable(kind) or kind == "cs" else "2-point"
+                curved.append((function, derivative(function, kind, (), Count())))
+                curved_lower.append(np.atleast_1d(np.asarray(constraint.lb, dtype=float)))
+                curved_upper.append(np.atleast_1d(np.asarray(constraint.ub, dtype=float)))
+            else:
+                raise OptionError(
+                    "minimize_max: constraints are scipy.optimize's LinearConstraint and "
+                    f"NonlinearConstraint, not {type(constraint).__name__}"
+                )
+        rows = Rows(
+            np.concatenate(matrices),
+            tuple(curved),
+            np.concatenate([*lower, *curved_lower]),
+            np.concatenate([*upper, *curved_upper]),
+        )
+        if np.any(rows.lower > rows.upper):
+            raise OptionError("minimize_max: a lower bound is above its upper bound")
+        return rows
+
+    def values(self, x: Array) -> Array:
+        """c(x): (l,)."""
+        return np.concatenate([self.linear @ x, *(function(x) for function, _ in self.parts)])
+
+    def slopes(self, x: Array) -> Array:
+        """c'(x): (l, n)."""
+        return np.concatenate([self.linear, *(np.atleast_2d(slope(x)) for _, slope in self.parts)])
+
+
+def vector(function: Callable[[Array], Any], x: Array) -> Array:
+    """The function's value as a vector."""
+    return np.atleast_1d(np.asarray(function(x)))
+
+
+def unknown(weights: Array) -> Array:
+    """The curvature of functions that only BFGS can tell."""
+    return np.zeros((0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class MaxOfFunctions:
+    """A problem over R^n as `solvers.minimax` wants it; functions are divided by size."""
+
+    function: Function
+    slope: Function
+    rows: Rows
+    size: float
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds of the constraints."""
+        return self.rows.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds of the constraints."""
+        return self.rows.upper
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        """f and c."""
+        return self.function(x) / self.size, self.rows.values(x)
+
+    def linearise(self, x: Array) -> Linear:
+        """f, c and their derivatives; the curvature is left to BFGS."""
+        f, c = self.evaluate(x)
+        return Linear(f, self.slope(x) / self.size, c, self.rows.slopes(x), unknown)
+
+    def step(self, x: Array, d: Array) -> Array:
+        """The point moved."""
+        return x + d

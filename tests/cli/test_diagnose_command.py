@@ -1,0 +1,240 @@
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from minimax_cal.diagnosing.result import VERDICTS
+from minimax_cal.modelling.effects.table import EFFECTS
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting import tables
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A UR10 that gives way under gravity, measured."""
+    made = simulate(mc.load_robot("ur10"), 60, 3, seed=1, truth=Truth(compliance=2e-6))
+    where = tmp_path_factory.mktemp("gap")
+    mc.write_measurements(where / "gap.csv", made.data)
+    return where
+
+
+@pytest.fixture
+def here(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "gap.csv").symlink_to(folder / "gap.csv")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_words_come_first_then_tables(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("diagnose", "ur10", "gap.csv", "--seed", 3, "--holdout", 0.3) == 0
+    out, err = capsys.readouterr()
+    found = mc.diagnose("ur10", "gap.csv", seed=3, holdout=0.3)
+    assert " ".join(out.split()).startswith(" ".join(found.headline().split()))
+    assert max(map(len, out.splitlines())) <= 110
+    titles = ("step by step", "effects found", "kind of error", "by target", "turns of each joint")
+    places = [out.index(title) for title in titles]
+    assert places == sorted(places)
+    assert f"{found.ladder[-1].holdout.rms_mm:.4f}" in out
+    assert "\x1b" not in out + err
+    assert err == ""
+
+
+def test_json_is_alone_and_as_agreed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("diagnose", "ur10", "gap.csv", "--json", "-o", "gap.json") == 0
+    out = capsys.readouterr().out
+    content = json.loads(out)
+    kept = json.loads((here / "gap.json").read_text())
+    assert {**kept, "seconds": 0} == {**content, "seconds": 0}
+    assert content["verdict"] in VERDICTS
+    assert content["effects"][0]["effect"] == "joint_compliance"
+    for effect in content["effects"]:
+        assert effect.keys() >= {
+            "effect", "place", "share", "parameters", "holdout_rms_mm", "alternatives"
+        }  # fmt: skip
+        assert effect["holdout_rms_mm"].keys() == {"before", "after"}
+        for parameter in effect["parameters"]:
+            assert parameter.keys() == {"name", "value", "sigma", "unit"}
+        for other in effect["alternatives"]:
+            assert other.keys() >= {"effect", "place", "rho2", "separate_with"}
+    gap = content["gap"]
+    for kind in ("holdout_rms_mm", "holdout_max_mm"):
+        assert gap[kind].keys() == {"nominal", "geometric", "final"}
+    rms = gap["holdout_rms_mm"]
+    assert rms["final"] < rms["geometric"] < rms["nominal"]
+    assert gap["closed_ci95"][0] <= gap["closed"] <= gap["closed_ci95"][1]
+    assert gap["noise_floor_mm"] > 0.0
+    where = content["where"]
+    assert where.keys() >= {"by_target", "by_joint", "by_direction", "by_order", "triage"}
+    assert where["triage"].keys() >= {"pose", "shape", "repeat"}
+    assert all(entry.keys() == {"effect", "needs"} for entry in content["not_testable"])
+
+
+def test_a_suspect_can_be_left_out(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--without", "joint_compliance,link_bending", "--without", "base_flex")
+    assert run("diagnose", "ur10", "gap.csv", *options, "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    named = {e["effect"] for e in content["effects"]}
+    named |= {a["effect"] for e in content["effects"] for a in e["alternatives"]}
+    out = ["joint_compliance", "link_bending", "base_flex"]
+    assert content["provenance"]["settings"]["exclude"] == out
+    assert not named & set(out)
+
+
+def test_notices_go_to_stderr_unless_quiet(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    header, *rows = Path("gap.csv").read_text().splitlines()
+    noted = [f"{header},colour", *(f"{row},red" for row in rows)]
+    Path("noted.csv").write_text("\n".join(noted) + "\n")
+    assert run("diagnose", "ur10", "noted.csv", "--json") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["notices"]
+    assert "notice: " in err
+    assert "colour" in err
+    assert run("diagnose", "ur10", "noted.csv", "--json", "--quiet") == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (("diagnose", "ur10", "gap.csv", "--without", "rust"), "joint_compliance"),
+        (("diagnose", "ur10", "gap.csv", "--holdout", "0"), "no pose is held out"),
+        (("diagnose", "ur10", "gap.csv", "--holdout", "1"), "fraction"),
+        (("diagnose", "ur10", "gap.csv", "--seed", "-1"), "seed -1"),
+        (("diagnose", "ur10", "absent.csv"), "absent.csv"),
+        (("diagnose", "ur10", "bad.csv"), "bad.csv:3"),
+        (("diagnose", "ur11", "gap.csv"), "ur10"),
+        (("diagnose", "ur10", "gap.csv", "--figure", "x.bmp"), ".png, .svg, .pdf"),
+        (("diagnose", "ur10", "gap.csv", "-o", "no/x.json"), "no such folder"),
+        (("diagnose", "ur10", "gap.csv", "--figure", "no/x.png"), "no such folder"),
+        (("diagnose", "ur10"), "DATA"),
+        (("calibrate", "ur10", "gap.csv", "--effects", "rust:J1"), "no effect 'rust'"),
+        (("calibrate", "ur10", "gap.csv", "--effects", "backlash:J9"), "no place 'J9'"),
+        (("effects", "ur10"), "both ROBOT and DATA"),
+        (("effects", "ur10", "absent.csv"), "absent.csv"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_2(
+    arguments: tuple[str, ...], say: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = Path("gap.csv").read_text().splitlines()
+    cells = lines[2].split(",")
+    (here / "bad.csv").write_text("\n".join([*lines[:2], ",".join(["oops", *cells[1:]])]))
+    before = set(here.iterdir())
+    assert run(*arguments) == 2
+    out, err = capsys.readouterr()
+    errors = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert say in errors[0]
+    assert "Traceback" not in err
+    assert out == ""
+    assert set(here.iterdir()) == before
+
+
+def test_numbers_that_break_down_are_exit_1(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("minimax_cal.cli.diagnose.diagnose", broken)
+    assert run("diagnose", "ur10", "gap.csv", "-o", "gap.json") == 1
+    out, err = capsys.readouterr()
+    assert err.startswith("error: the numbers did not work out (Singular matrix)")
+    assert out == ""
+    assert not (here / "gap.json").exists()
+
+
+@pytest.mark.parametrize(("kind", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml")])
+def test_figure(kind: str, start: bytes, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("diagnose", "ur10", "gap.csv", "--figure", f"gap.{kind}", "--json", "-q") == 0
+    out, err = capsys.readouterr()
+    picture = (here / f"gap.{kind}").read_bytes()
+    assert picture.startswith(start)
+    assert len(picture) > 20_000
+    assert json.loads(out)["kind"] == "diagnosis"
+    assert err == ""
+
+
+def test_a_figure_needs_matplotlib_and_says_so(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert run("diagnose", "ur10", "gap.csv", "--figure", "gap.png") == 2
+    assert "pip install minimax-cal[plot]" in capsys.readouterr().err
+    assert not (here / "gap.png").exists()
+
+
+def test_effects_reach_the_fit(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--effects", "joint_compliance:J2,backlash:J3", "--effects", "joint_compliance:J3")
+    assert run("calibrate", "ur10", "gap.csv", "--objective", "sum", *options, "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    asked = content["provenance"]["settings"]["effects"]
+    assert asked == ["joint_compliance:J2", "backlash:J3", "joint_compliance:J3"]
+    fitted = [f"{entry['effect']}:{entry['place']}" for entry in content["effects"]]
+    assert fitted == asked
+    plain = mc.calibrate("ur10", "gap.csv", objective="sum").accuracy["holdout"].rms_mm
+    assert content["accuracy"]["holdout"]["rms_mm"] < plain
+
+
+def test_the_library_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("effects") == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in EFFECTS)
+    assert run("effects", "--json") == 0
+    listed = {e["effect"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
+    assert listed.keys() == EFFECTS.keys()
+    assert "order" in listed["settling"]["needs"]
+    assert listed["backlash"]["law"] == EFFECTS["backlash"].law
+
+
+def test_places_that_data_can_test(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("effects", "ur10", "gap.csv", "--json") == 0
+    with_order = {e["effect"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
+    assert "J2" in with_order["joint_compliance"]["places"]
+    assert "J1" not in with_order["joint_compliance"]["places"]  # its axis is upright
+    assert with_order["target_shift"]["places"] == ["smr1", "smr2", "smr3"]
+    data = mc.read_measurements("gap.csv")
+    mc.write_measurements("one.csv", data.only(0))
+    assert run("effects", "ur10", "one.csv") == 0
+    out = capsys.readouterr().out
+    (row,) = (line for line in out.splitlines() if "target_shift" in line)
+    assert "smr" not in row
+    assert "a second target" in row
+
+
+def test_tables_of_where_show_dashes_for_what_cannot_be_told() -> None:
+    part = {"rms_mm": 0.5, "share": 1.0, "p": None}
+    where = {
+        "by_target": [
+            {"target": "smr1", "points": 4, "rms_mm": 0.5, "max_mm": 1.0, "mean_sight_mm": None}
+        ],
+        "by_joint": [
+            {"joint": "J1", "rms_mrad": 0.25, "share": 0.5, "p": 0.01},
+            {"joint": "J2", "rms_mm": 0.75, "share": None, "p": None},
+        ],
+        "triage": {"noise": part, "shape": None, "repeat": None, "pose": part},
+    }
+    kind, target, joint = tables.where_tables(where)
+    assert [row[1] for row in kind.cells()] == ["0.5000", "-", "-", "0.5000"]
+    assert target.cells() == [["smr1", "4", "0.5000", "1.0000", "-"]]
+    assert joint.cells() == [["J1", "mrad", "0.2500", "0.50", "0.01"],
+                             ["J2", "mm", "0.7500", "-", "-"]]  # fmt: skip
+
+
+def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
+    from dataclasses import replace
+
+    from minimax_cal.diagnosing.result import Alternative
+
+    found = mc.diagnose("ur10", folder / "gap.csv")
+    other = Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
+    first = replace(found.findings[0], alternatives=(other,))
+    more = replace(found, findings=(first,), not_testable=(("settling", "the visit order"),))
+    needs, further = tables.closing_tables(more)
+    assert needs.rows == (("settling", "the visit order"),)
+    assert further.rows[0][1:] == ("base_flex frame", 0.9, "ten poses stretched out")
+    assert tables.closing_tables(replace(more, findings=(), not_testable=())) == ()

@@ -1,0 +1,228 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.robots.robot import robot_from_dict
+
+
+@pytest.fixture
+def csv(tmp_path: Path, noisy: Simulation) -> Path:
+    path = tmp_path / "poses.csv"
+    mc.write_measurements(path, noisy.data)
+    return path
+
+
+def test_summary_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("calibrate", "irb2600", csv) == 0
+    out, err = capsys.readouterr()
+    for words in (
+        "held out, calibrated",
+        "same motion as base_z",
+        "33 of 45 parameters",
+        "F_i mm^2",
+    ):
+        assert words in out
+    assert "\x1b" not in out + err  # no colour codes into a pipe
+
+
+def test_json_alone_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("calibrate", "irb2600", csv, "--objective", "sum", "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["schema"] == 1
+    assert content["status"] == "converged"
+    assert content["accuracy"]["holdout"]["rms_mm"] < content["accuracy"]["nominal"]["rms_mm"]
+    # the calibrated robot is whole: the robot schema reads it
+    assert robot_from_dict(content["robot"]).joints == 6
+
+
+def test_output_file_figure_and_evaluate(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit, picture = tmp_path / "fit.json", tmp_path / "errors.svg"
+    assert run("calibrate", "irb2600", csv, "-o", fit, "--figure", picture, "-q") == 0
+    assert "<svg" in picture.read_text()
+    assert json.loads(fit.read_text())["schema"] == 1
+    capsys.readouterr()
+    assert run("evaluate", fit, csv, "--json") == 0
+    whole = json.loads(capsys.readouterr().out)["accuracy"]
+    assert whole["poses"] == 60
+    assert run("evaluate", fit, csv) == 0
+    assert f"{whole['rms_mm']:.4f}" in capsys.readouterr().out
+
+
+def test_every_option_reaches_the_fit(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = (
+        "--fix",
+        "a2,beta*",
+        "--free",
+        "d1",
+        "--prior",
+        "d4=0.5mm",
+        "--prior",
+        "theta3=1mrad",
+    )
+    more = (
+        "--holdout",
+        0.3,
+        "--seed",
+        7,
+        "--method",
+        "nllm",
+        "--hessian",
+        "bfgs",
+        "--qp",
+        "clarabel",
+    )
+    last = ("--distance", "squared", "--distance-tolerance", 0.05, "--json")
+    assert run("calibrate", "irb2600", csv, *arguments, *more, *last) == 0
+    content = json.loads(capsys.readouterr().out)
+    settings = content["provenance"]["settings"]
+    assert settings["priors"] == {"d4": 0.0005, "theta3": 0.001}
+    assert settings["distance_tolerance"] == pytest.approx(5e-5)
+    assert settings["seed"] == 7
+    assert content["accuracy"]["holdout"]["poses"] == 18
+    assert {step["backend"] for step in content["minimax"]["trace"]} == {"clarabel"}
+    found = {p["name"]: p for p in content["parameters"]}
+    assert not found["a2"]["identifiable"]
+    assert found["d1"]["identifiable"]
+
+
+def test_the_same_seed_gives_the_same_numbers(
+    csv: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = []
+    for _ in range(2):
+        assert run("calibrate", "irb2600", csv, "--json") == 0
+        content = json.loads(capsys.readouterr().out)
+        content.pop("seconds")
+        results.append(content)
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (("calibrate", "irb2600", "CSV", "--qp", "dacp"), "daqp"),
+        (("calibrate", "irb2600", "CSV", "--objective", "best"), "no objective 'best'"),
+        (("calibrate", "irb2600", "CSV", "--holdout", "lots"), "holdout"),
+        (("calibrate", "irb2600", "CSV", "--holdout", "2"), "fraction"),
+        (("calibrate", "irb2600", "CSV", "--prior", "a2"), "NAME=SIGMA"),
+        (("calibrate", "irb2600", "CSV", "--prior", "a2=3inch"), "NAME=SIGMA"),
+        (("calibrate", "irb2600", "CSV", "--prior", "a*=0.5mrad"), "a length"),
+        (("calibrate", "irb2600", "CSV", "--seed", "-1"), "seed -1"),
+        (("calibrate", "x" * 5000, "CSV"), "no robot called"),
+        (
+            ("calibrate", "irb2600", "CSV", "-o", "two.json", "--figure", "no/x.svg"),
+            "no such folder",
+        ),
+        (("calibrate", "irb2600", "CSV", "-o", "."), "is a folder"),
+        (("simulate", "irb2600", "--noise", "nan", "-o", "x.csv"), "finite"),
+        (("simulate", "irb2600", "--poses", "10000000000", "-o", "x.csv"), "at most"),
+        (("calibrate", "irb2600", "CSV", "--colour", "red"), "--colour"),
+        (("calibrate", "irb2600", "CSV", "--figure", "x.bmp"), ".png, .svg, .pdf"),
+        (("calibrate", "irb2600", "CSV", "-o", "/no/such/folder/fit.json"), "cannot be written"),
+        (("calibrate", "irb2600", "absent.csv"), "absent.csv"),
+        (("calibrate", "irb26", "CSV"), "irb2600"),
+        (("calibrate", "ur10", "CSV"), "error"),
+        (("evaluate", "CSV", "CSV"), "is not JSON"),
+        (("calibrate", "irb2600"), "DATA"),
+        (("callibrate", "irb2600", "CSV"), "callibrate"),
+        (("simulate", "irb2600"), "-o"),
+        (("simulate", "irb2600", "--poses", "0", "-o", "x.csv"), "at least one pose"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_2(
+    arguments: tuple[str, ...],
+    say: str,
+    csv: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = set(tmp_path.iterdir())
+    code = run(*(csv if a == "CSV" else a for a in arguments))
+    out, err = capsys.readouterr()
+    if arguments[1] == "ur10":  # another robot than the data's: a notice, or a refusal
+        assert code in (0, 2)
+        return
+    assert code == 2
+    lines = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    assert say in lines[0]
+    assert "Traceback" not in err
+    assert out == ""
+    assert set(tmp_path.iterdir()) == before  # nothing half written
+
+
+def test_numbers_that_do_not_work_out_are_exit_1(
+    csv: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from minimax_cal.solvers import minimax
+
+    monkeypatch.setattr(minimax, "Sqp", minimax.Sqp)
+    import minimax_cal.fitting.calibrate as module  # noqa: F401
+
+    monkeypatch.setattr(sys.modules["minimax_cal.fitting.calibrate"], "Sqp",
+                        lambda hessian: minimax.Sqp(iterations=1, hessian=hessian))  # fmt: skip
+    assert run("calibrate", "irb2600", csv) == 1
+    assert "iteration limit" in capsys.readouterr().err
+
+
+def test_simulate_backends_robots_and_help(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, truth = tmp_path / "d.csv", tmp_path / "t.json"
+    assert run("simulate", "ur5e", "--poses", 30, "-o", data, "--truth", truth) == 0
+    assert mc.read_measurements(data).poses == 30
+    perfect = mc.evaluate(mc.load_cell(truth), mc.read_measurements(data))
+    assert perfect.rms_mm < 2.0
+    assert run("backends", "--json") == 0
+    assert "daqp" in json.loads(capsys.readouterr().out)["backends"]
+    assert run("robots") == 0
+    assert "irb2600" in capsys.readouterr().out
+    assert run("--help") == 0
+    assert "calibrate" in capsys.readouterr().out
+    assert run("--version") == 0
+
+
+def test_console_script_runs(csv: Path) -> None:
+    command = [sys.executable, "-m", "minimax_cal.cli", "calibrate", "nothing", str(csv)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("error: no robot called 'nothing'")
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_evaluate_doubts_data_that_do_not_belong(
+    csv: Path, tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit, wrong = tmp_path / "fit.json", tmp_path / "wrong.csv"
+    assert run("calibrate", "irb2600", csv, "-o", fit) == 0
+    mc.write_measurements(wrong, noisy.data.with_y(noisy.data.y * 1e-3))
+    capsys.readouterr()
+    assert run("evaluate", fit, wrong) == 0
+    assert "the same robot, measurement frame, units" in capsys.readouterr().err
+    (tmp_path / "other.json").write_text('{"schema": 1, "kind": "diagnosis"}')
+    assert run("evaluate", tmp_path / "other.json", csv) == 2
+    assert "is a diagnosis" in capsys.readouterr().err
+
+
+def test_a_bootstrap_is_shown_and_saved(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "fit.json"
+    arguments = ("calibrate", "irb2600", csv, "--objective", "sum", "--bootstrap")
+    assert run(*arguments, "40", "-o", out) == 0
+    assert "calibrations of poses drawn anew" in capsys.readouterr().out
+    found = json.loads(out.read_text())["bootstrap"]
+    assert found["replicates"] + found["lost"] == 40
+    assert all(row["interval"][0] < row["interval"][1] for row in found["parameters"])
+    assert run(*arguments, "1") == 2
+    assert "1 replicates" in capsys.readouterr().err

@@ -1,0 +1,428 @@
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.cli import main
+from minimax_cal.cli.compensate import ADDED, compensate_command, read_targets
+from minimax_cal.correcting.compensate import (
+    FRAMES,
+    Outcome,
+    Reach,
+    arm_of,
+    compensate,
+    examine,
+    motion,
+    path_of,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate
+
+Move = Callable[[Array], Array]
+
+
+@pytest.fixture(scope="module")
+def sim(robot: mc.Robot) -> Simulation:
+    return simulate(robot, 100, 3, seed=5)
+
+
+@pytest.fixture(scope="module")
+def fit(robot: mc.Robot, sim: Simulation) -> mc.Calibration:
+    return mc.calibrate(robot, sim.data, effects=["joint_compliance:all"])
+
+
+@pytest.fixture(scope="module")
+def saved(fit: mc.Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("fit") / "fit.json"
+    fit.save(path)
+    return path
+
+
+def true_points(sim: Simulation, q: Array) -> Array:
+    """Where the reflectors of the true robot are, its compliance included."""
+    return sim.cell.predict(q + Truth().compliance * gravity(sim.cell.robot, q))
+
+
+def off(robot: mc.Robot, rng: np.random.Generator, size: float = 1.0) -> mc.Robot:
+    """A robot with errors of half a millimetre and a milliradian."""
+    error = rng.normal(size=robot.mdh.shape) * [5e-4, 5e-4, 1e-3, 1e-3, 1e-3]
+    return robot.with_mdh(robot.mdh + size * error)
+
+
+def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
+    spots = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
+    return mc.Cell(robot, np.eye(4), ("smr1", "smr2", "smr3"), spots, effects)
+
+
+def regular(robot: mc.Robot, q: Array) -> Array:
+    """The poses at which no two wrist axes and no links line up."""
+    flange = robot.pose(q)[:, :3, 3]
+    clear = (np.abs(np.sin(q[:, 4])) > 0.3) & (np.hypot(flange[:, 0], flange[:, 1]) > 0.5)
+    return q[clear & (np.abs(q[:, 2]) < 1.0)]
+
+
+def apart(one: Array, other: Array) -> tuple[Array, Array]:
+    """Distance and angle between poses."""
+    turn = Rotation.from_matrix(np.swapaxes(one[:, :3, :3], 1, 2) @ other[:, :3, :3])
+    return np.linalg.norm(one[:, :3, 3] - other[:, :3, 3], axis=1), turn.magnitude()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_true_robot_comes_to_the_nominal_targets(robot: mc.Robot, seed: int) -> None:
+    sim = simulate(robot, 100, 3, seed=seed)
+    fit = mc.calibrate(robot, sim.data, effects=["joint_compliance:all"])
+    q = regular(robot, random_poses(robot, 400, np.random.default_rng(seed + 10)))
+    found = compensate(fit, q)
+    assert not found.failed.any()
+    goal = fit.nominal.predict(q)
+    before = np.linalg.norm(true_points(sim, q) - goal, axis=-1)
+    after = np.linalg.norm(true_points(sim, found.q) - goal, axis=-1)
+    assert np.sqrt(np.mean(before**2)) > 1e-3
+    assert 1e3 * np.sqrt(np.mean(after**2)) < fit.accuracy["holdout"].rms_mm
+    assert 1e3 * after.max() < 3.0 * fit.accuracy["holdout"].rms_mm
+
+
+@pytest.mark.parametrize("frame", ["flange", "own"])
+def test_frames_lay_the_flange_where_they_say(
+    robot: mc.Robot, sim: Simulation, fit: mc.Calibration, frame: str
+) -> None:
+    q = regular(robot, random_poses(robot, 100, np.random.default_rng(3)))
+    found = compensate(fit, q, frame=frame)
+    assert not found.failed.any()
+    base = fit.nominal.base if frame == "flange" else fit.cell.base
+    goal = replace(fit.cell, robot=robot, base=base, effects=NOTHING).predict(q)
+    after = np.linalg.norm(true_points(sim, found.q) - goal, axis=-1)
+    assert 1e3 * after.max() < 3.0 * fit.accuracy["holdout"].rms_mm
+
+
+def test_an_arm_as_drawn_is_left_alone(robot: mc.Robot, rng: np.random.Generator) -> None:
+    q = random_poses(robot, 50, rng)
+    for frame in FRAMES:
+        found = compensate(cell_of(robot), q, robot, frame=frame)
+        assert_allclose(found.q, q, rtol=0, atol=1e-9)
+        assert set(found.outcome) == {Outcome.REACHED}
+
+
+def test_position_and_orientation_are_met(robot: mc.Robot, rng: np.random.Generator) -> None:
+    real = off(robot, rng)
+    q = regular(robot, random_poses(robot, 100, rng))
+    found = compensate(cell_of(real), q, robot, frame="own")
+    distance, angle = apart(robot.pose(q), real.pose(found.q))
+    assert distance.max() < 1e-9
+    assert angle.max() < 1e-9
+    assert_allclose(found.distance_before, apart(robot.pose(q), real.pose(q))[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["irb2600", "scara_600"])
+def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Generator) -> None:
+    robot = mc.load_robot(name)
+    q = random_poses(robot, 5, rng)
+    data = path_of(q, robot, 0.0)
+    reach = Reach(arm_of(cell_of(robot)), data, robot.pose(q), 0.3, 1e-5, 0.1)
+    still = np.zeros_like(q)
+    _, slope = examine(reach, q, reach.goal, still)
+    for j, step in enumerate(1e-6 * np.eye(robot.joints)):
+        ahead, _ = examine(reach, q + step, reach.goal, still)
+        behind, _ = examine(reach, q - step, reach.goal, still)
+        assert_allclose((behind - ahead) / 2e-6, slope[:, :, j], rtol=0, atol=1e-8)
+
+
+def test_limits_hold_and_are_reported(robot: mc.Robot, rng: np.random.Generator) -> None:
+    real = robot.with_mdh(robot.mdh + np.array([0, 0, -0.01, 0, 0]) * np.eye(6)[:, [2]])
+    q = np.array([[0.3, 0.2, 1.3085, 0.4, 0.8, 0.1], [0.3, 0.2, 0.5, 0.4, 0.8, 0.1]])
+    found = compensate(cell_of(real), q, robot, frame="own")
+    assert found.outcome == (Outcome.LIMIT, Outcome.REACHED)
+    assert found.q[0, 2] == robot.upper[2]
+    assert np.all((found.q >= robot.lower) & (found.q <= robot.upper))
+    # least squares: no allowed motion of the other joints lowers the cost
+    lever = float(np.sqrt(np.mean(np.square(cell_of(real).spots).sum(axis=1))))
+
+    def cost(at: Array) -> float:
+        distance, angle = apart(robot.pose(q[:1]), real.pose(at[None]))
+        return float(distance[0] ** 2 + (lever * angle[0]) ** 2)
+
+    for j in (0, 1, 3, 4, 5):
+        for step in (-1e-3, 1e-3):
+            assert cost(found.q[0] + step * np.eye(6)[j]) > cost(found.q[0])
+    assert "limit at line 1" in found.complaint()
+
+
+def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot: mc.Robot) -> None:
+    real = robot.with_mdh(robot.mdh - np.array([0, 2e-3, 0, 0, 0]) * np.eye(6)[:, [3]])
+    elbow = -np.arctan2(938.0, 150.0)  # forearm in line with the upper arm
+    found = compensate(cell_of(real), [[0.2, 0.3, elbow, 0.0, 0.7, 0.0]], robot, frame="own")
+    assert found.outcome[0].failed
+    assert 0.0 < found.distance[0] <= found.distance_before[0]
+    assert np.abs(found.q - found.commanded).max() < np.pi / 36 + 1e-12
+
+
+def test_a_straight_wrist_is_not_swung_about(robot: mc.Robot, rng: np.random.Generator) -> None:
+    q = random_poses(robot, 30, rng)
+    q[:, 4] = 0.0
+    found = compensate(cell_of(off(robot, rng)), q, robot, frame="own")
+    change = np.abs(found.q - q).max(axis=1)
+    missed = found.failed
+    assert missed.any()
+    assert change.max() < np.pi / 36 + 1e-12
+    assert {o for o in found.outcome if o.failed} <= {Outcome.SINGULAR, Outcome.CHANGE}
+    before = np.hypot(found.distance_before, 0.1 * found.angle_before)
+    assert np.all(np.hypot(found.distance, 0.1 * found.angle) < 1.1 * before)
+
+
+def test_scara_corrects_what_four_joints_can(rng: np.random.Generator) -> None:
+    robot = mc.load_robot("scara_600")
+    real = off(robot, rng)
+    q = rng.uniform([-1.5, 0.6, 0.03, -2.0], [1.5, 2.0, 0.17, 2.0], (40, 4))
+    found = compensate(cell_of(real), q, robot, frame="own")
+    assert set(found.outcome) <= {Outcome.CLOSEST, Outcome.REACHED}
+    assert not found.failed.any()
+    assert found.distance.max() < 1e-5 < 1e-4 < found.distance_before.max()
+    assert found.angle.max() > 1e-5  # the tilt remains
+    assert "fewer than six joints" in found.summary()
+    edge = q[:1].copy()
+    edge[0, 2] = 0.0
+    raised = robot.with_mdh(robot.mdh + np.array([0, 1e-3, 0, 0, 0]) * np.eye(4)[:, [2]])
+    assert compensate(cell_of(raised), edge, robot, frame="own").outcome == (Outcome.LIMIT,)
+
+
+def test_a_redundant_arm_changes_least(rng: np.random.Generator) -> None:
+    bend = np.pi / 2 * np.array([-1, 1, -1, 1, -1, 1, 0])
+    mdh = np.stack([np.zeros(7), [0.34, 0, 0.4, 0, 0.4, 0, 0.126], np.zeros(7), bend,
+                    np.zeros(7)], axis=1)  # fmt: skip
+    seven = mc.Robot("seven axes", mdh, np.ones(7), np.zeros(7, bool), np.full(7, -3.0),
+                     np.full(7, 3.0), np.full(7, np.nan), np.full(7, np.nan),
+                     np.full((7, 3), np.nan), np.array([0.0, 0.0, 1.0]))  # fmt: skip
+    real = off(seven, rng, 0.1)
+    q = rng.uniform(0.5, 1.2, (20, 7))
+    found = compensate(cell_of(real), q, seven, frame="own")
+    assert set(found.outcome) == {Outcome.REACHED}
+    reach = Reach(arm_of(cell_of(real)), path_of(q, real, 0.0), seven.pose(q), 0.1, 1e-5, 0.1)
+    residual, slope = examine(reach, q, reach.goal, np.zeros_like(q))
+    least = (np.linalg.pinv(slope) @ residual[..., None])[..., 0]
+    assert_allclose(found.q - q, least, rtol=0, atol=0.02 * np.abs(least).max())
+
+
+def effect(name: str, place: str, value: list[float], **choice: float) -> Fitted:
+    return Fitted((Term(name, place, choice),), (np.array(value),))
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        effect("joint_compliance", "J2", [2e-6], parts=2.0**7),
+        effect("link_bending", "L2", [1e-6]),
+        effect("base_flex", "frame", [5e-7]),
+        effect("gear_ripple", "J3", [2e-4, 1e-4], turns=121.0),
+        effect("backlash", "J5", [1e-3]),
+        effect("settling", "J1", [1e-2]),
+        effect("thermal_growth", "all", [3e-4], temperature=1.0, apart=0.0),
+    ],
+    ids=lambda e: e.terms[0].label,
+)
+def test_every_kind_of_effect_is_corrected(
+    robot: mc.Robot, rng: np.random.Generator, effects: Fitted
+) -> None:
+    q = regular(robot, random_poses(robot, 60, rng))
+    columns = {"temperature": np.full(len(q), 32.0), "payload": np.full(len(q), 12.0)}
+    data = replace(path_of(q, robot, 0.0), columns=columns)
+    cell = cell_of(off(robot, rng), effects)
+    found = compensate(cell, data, robot, frame="own")
+    assert set(found.outcome) == {Outcome.REACHED}
+    # as measured points: an independent way through Cell.follow
+    goal = cell_of(robot).predict(q)
+    reached = cell.follow(replace(data, q=found.q))
+    assert_allclose(reached, goal, rtol=0, atol=1e-7)
+    plain = compensate(replace(cell, effects=NOTHING), data, robot, frame="own")
+    assert np.abs(cell.follow(replace(data, q=plain.q)) - goal).max() > 1e-5
+
+
+def test_what_moves_only_reflectors_is_left_out(robot: mc.Robot, rng: np.random.Generator) -> None:
+    q = regular(robot, random_poses(robot, 20, rng))
+    cell = cell_of(robot, effect("target_offset", "all", [1e-3]))
+    found = compensate(cell, q, robot)
+    assert_allclose(found.q, q, rtol=0, atol=1e-9)
+    assert any("target_offset:all" in notice for notice in found.notices)
+
+
+def test_play_that_pulls_both_ways_is_told(robot: mc.Robot) -> None:
+    """A joint is to turn back by less than its play: no side is the one it comes from."""
+    q = np.repeat([[0.3, 0.2, -0.4, 0.4, 0.8, 0.1]], 3, axis=0)
+    q[:, 0] += [0.0, 0.1, 0.2]
+    q[:, 4] += [0.0, 0.1, 0.1 - 2e-4]
+    cell = cell_of(robot, effect("backlash", "J5", [1e-3]))
+    found = compensate(cell, q, robot, frame="own")
+    assert found.outcome == (Outcome.REACHED, Outcome.REACHED, Outcome.STALLED)
+    assert_allclose(found.q[1, 4] - q[1, 4], -5e-4, rtol=0, atol=1e-9)
+    assert_allclose(found.angle[2], 1e-3, rtol=0.1)  # told as it is, not as hoped
+    assert "stalled at line 3" in found.complaint()
+    sided = replace(path_of(q, robot, 0.0), columns={"approach5": np.ones(3)})
+    again = compensate(cell, sided, robot, frame="own")
+    assert set(again.outcome) == {Outcome.REACHED}
+    assert_allclose(again.q[:, 4] - q[:, 4], -5e-4, rtol=0, atol=1e-9)
+
+
+def test_two_thousand_targets(robot: mc.Robot, rng: np.random.Generator) -> None:
+    q = random_poses(robot, 2000, rng)
+    found = compensate(cell_of(off(robot, rng)), q, robot, frame="own")
+    assert found.failed.mean() < 0.05
+
+
+def test_motion_is_rigid_and_the_least(rng: np.random.Generator) -> None:
+    spots = rng.normal(size=(4, 3))
+    turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix(), np.array([1.0, 2.0, 3.0])
+    found = motion(spots, spots @ turn.T + shift)
+    assert_allclose(found[:3, :3], turn, rtol=0, atol=1e-12)
+    assert_allclose(found[:3, 3], shift, rtol=0, atol=1e-12)
+    alone = motion(spots[:1], spots[:1] + shift)
+    assert_allclose(alone, np.block([[np.eye(3), shift[:, None]], [np.zeros(3), 1.0]]), atol=1e-15)
+
+
+def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Calibration, saved: Path) -> None:
+    q = regular(robot, random_poses(robot, 50, np.random.default_rng(8)))
+    for frame in FRAMES:
+        here, there = compensate(fit, q, frame=frame), compensate(saved, q, frame=frame)
+        assert_allclose(here.q, there.q, rtol=0, atol=1e-8)
+    given = compensate(saved, q, robot)
+    assert_allclose(given.q, compensate(fit, q).q, rtol=0, atol=1e-8)
+    # without the calibration's nominal base it is placed by the models: near, not equal
+    bare = compensate(fit.cell, q, robot)
+    assert any("placed by" in notice for notice in bare.notices)
+    assert np.abs(bare.q - given.q).max() < 5e-3
+
+
+def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Calibration) -> None:
+    q = np.zeros((1, 6))
+    for wrong in (
+        lambda: compensate(fit, q, frame="moon"),
+        lambda: compensate(fit, q, tolerance=0.0),
+        lambda: compensate(fit, q, lever=-1.0),
+        lambda: compensate(fit, q, clock=2.0),
+        lambda: compensate(fit, np.zeros((1, 5))),
+        lambda: compensate(fit, np.zeros((0, 6))),
+        lambda: compensate(fit, [[0.0, 0, 0, 0, 0, np.nan]]),
+        lambda: compensate(fit, [["a"] * 6]),  # type: ignore[list-item]
+        lambda: compensate(fit, 60.0 * np.ones((1, 6))),
+        lambda: compensate(fit.cell, q),
+        lambda: compensate(fit, q, mc.load_robot("scara_600")),
+    ):
+        with pytest.raises(mc.CalibrationError):
+            wrong()
+
+
+def write(path: Path, header: str, *rows: str) -> Path:
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    """Exit code, stdout, stderr of the command as `main` would run it."""
+    result = CliRunner().invoke(
+        compensate_command, [str(a) for a in arguments], standalone_mode=False
+    )
+    if isinstance(result.exception, (mc.CalibrationError, click.ClickException)):
+        return 2, result.stdout, str(result.exception)
+    if result.exception:
+        raise result.exception
+    return int(result.return_value), result.stdout, result.stderr
+
+
+DEGREES = "name,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,payload_kg,speed"
+
+
+def test_command_keeps_the_file_and_corrects_the_joints(saved: Path, tmp_path: Path) -> None:
+    rows = ["pick,10,20,-15,30,40,50,0,v100", "place,-40,5,10,-60,55,0,5,v50"]
+    targets = write(tmp_path / "targets.csv", DEGREES, *rows)
+    out = tmp_path / "out.csv"
+    code, text, notes = run(saved, targets, "-o", out)
+    assert code == 0
+    assert "corrected" in text
+    assert "2 of 2 targets" in text
+    assert "column speed is kept and not used" in notes
+    with out.open() as stream:
+        header, *body = csv.reader(stream)
+    assert header == [*DEGREES.split(","), *ADDED]
+    expected = compensate(saved, read_targets(targets).data)
+    for i, row in enumerate(body):
+        assert row[0] == rows[i].split(",")[0]
+        assert row[7:9] == rows[i].split(",")[7:9]
+        assert row[-1] == "reached"
+        assert float(row[-3]) < 1e-3
+        assert_allclose(np.radians([float(c) for c in row[1:7]]), expected.q[i], atol=1e-10)
+    code, text, notes = run(saved, targets)
+    assert text == out.read_text()  # a pipe gets the file, the reader the summary
+    assert "corrected" in notes
+    code, text, notes = run(saved, targets, "--json", "-q", "--robot", "irb2600")
+    content = json.loads(text)
+    assert notes == ""
+    assert content["missed"] == 0
+    assert len(content["targets"]) == 2
+    assert run(saved, out)[0] == 2  # corrected already
+
+
+def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> None:
+    header = ",".join(f"q{i}_rad" for i in range(1, 7))
+    far = write(tmp_path / "far.csv", header, "0.1,0.2,0.3,0.4,0.8,0", "0.1,0.2,0.3,0.4,0,0")
+    out = tmp_path / "out.csv"
+    code, _, notes = run(saved, far, "-o", out)
+    assert code == 1
+    assert "1 of 2 targets are missed" in notes
+    assert "line 3" in notes
+    assert out.read_text().count("reached") == 1
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "word"),
+    [
+        ("x,y", "1,2", "no joint columns"),
+        ("q1_rad,q2_rad", "0,0", "2 joint columns"),
+        (DEGREES, "a,1,2,3,four,5,6,0,v", "four"),
+        (DEGREES, "a,1,2,3,,5,6,0,v", "is empty"),
+        (DEGREES, "a,1,2", "3 cells"),
+        (DEGREES.replace("_deg", "_rad"), "a,10,20,30,40,50,60,0,v", "degrees?"),
+        (DEGREES.replace("q3_deg", "q3_mm"), "a,1,2,3,4,5,6,0,v", "joint 3"),
+        ("q1_rad;q2_rad", "0;0", "commas"),
+    ],
+)
+def test_command_tells_slips(saved: Path, tmp_path: Path, header: str, row: str, word: str) -> None:
+    code, _, said = run(saved, write(tmp_path / "t.csv", header, row))
+    assert code == 2
+    assert word in said
+
+
+def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
+    targets = write(tmp_path / "t.csv", DEGREES, "a,1,2,3,4,50,6,0,v")
+    assert run(saved, tmp_path / "none.csv")[0] == 2
+    assert run(targets, targets)[0] == 2
+    assert run(saved, write(tmp_path / "empty.csv", ""))[0] == 2
+    assert run(saved, write(tmp_path / "bare.csv", DEGREES))[0] == 2
+    assert run(saved, targets, "--frame", "moon")[0] == 2
+    assert run(saved, targets, "-o", tmp_path / "no" / "folder.csv")[0] == 2
+    content = json.loads(saved.read_text())
+    del content["nominal_robot"]
+    old = tmp_path / "old.json"
+    old.write_text(json.dumps(content))
+    code, _, said = run(old, targets)
+    assert code == 2
+    assert "--robot" in said
+    assert run(old, targets, "--robot", "irb2600", "-q")[0] == 0
+
+
+def test_command_through_main_where_it_is_registered(saved: Path, tmp_path: Path) -> None:
+    from minimax_cal.cli import cli
+
+    if "compensate" not in cli.commands:
+        pytest.skip("not registered in this checkout")
+    targets = write(tmp_path / "t.csv", DEGREES, "a,1,2,3,4,50,6,0,v")
+    with pytest.raises(SystemExit) as ended:
+        main(["compensate", str(saved), str(targets), "-o", str(tmp_path / "o.csv")])
+    assert not ended.value.code

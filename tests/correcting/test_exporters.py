@@ -1,0 +1,458 @@
+"""Files out: read back, each gives the same poses; what cannot be held is said or refused."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+from numpy.testing import assert_allclose, assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.cli.export import export_command
+from minimax_cal.correcting.exporters import EXPORTERS, Job, export, read_job
+from minimax_cal.correcting.exporters.moc import Moc, parse_moc, read_moc, text_of
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.transforms import from_rpy, inverse, link, turn
+from minimax_cal.robots.urdf import random_joints, tip_poses, to_robot
+from minimax_cal.robots.urdf_file import parse_urdf
+
+EXACT = dict(rtol=0, atol=1e-9)
+NOTHING = np.full(6, np.nan)
+HALF = "1.5707963267948966"
+UR10 = (  # origins that follow from the maker's DH table; base_link is turned by half a turn
+    ("base_fixed", "fixed", "0 0 0", "0 0 3.141592653589793", ""),
+    ("shoulder_pan", "revolute", "0 0 0.1273", "0 0 0", "0 0 1"),
+    ("shoulder_lift", "revolute", "0 0 0", f"{HALF} 0 0", "0 0 1"),
+    ("elbow", "revolute", "-0.612 0 0", "0 0 0", "0 0 1"),
+    ("wrist_1", "revolute", "-0.5723 0 0.163941", "0 0 0", "0 0 1"),
+    ("wrist_2", "revolute", "0 -0.1157 0", f"{HALF} 0 0", "0 0 1"),
+    ("wrist_3", "revolute", "0 0.0922 0", f"{HALF} 3.141592653589793 3.141592653589793", "0 0 1"),
+    ("to_flange", "fixed", "0 0 0", "0 -1.5707963267948966 -1.5707963267948966", ""),
+    ("to_tool0", "fixed", "0 0 0", f"{HALF} 0 {HALF}", ""),
+)
+
+
+def ur10_urdf() -> str:
+    """A made-up URDF of the UR10 with comments, odd spaces and a side branch."""
+    lines = ['<?xml version="1.0" encoding="utf-8"?>', "<!-- ünïcode, made up -->"]
+    lines += ["<robot name='ur10'>", '  <link name="base_link" />']
+    lines += [f'  <link name="{name}_link"/>' for name, *_ in UR10[:7]]
+    lines += ['  <link name="flange"/><link name="tool0"/><link name="camera"/>']
+    links = ["base_link", *(f"{name}_link" for name, *_ in UR10[:7]), "flange", "tool0"]
+    for i, (name, kind, xyz, rpy, axis) in enumerate(UR10):
+        lines += [f'  <joint   name="{name}" type="{kind}" >  <!-- {name} > -->']
+        if name != "to_flange":  # where the origin is left out, and an attribute
+            lines += [
+                f"    <origin xyz='{xyz}'" + (f' rpy="{rpy}"' if rpy != "0 0 0" else "") + "/>"
+            ]
+        else:
+            lines += [f'    <origin\n       rpy="{rpy}"\n    ></origin>']
+        lines += [f'    <parent link="{links[i]}"/>', f'    <child link="{links[i + 1]}"/>']
+        lines += [f'    <axis xyz="{axis}"/>', '    <limit lower="-3" upper="3" effort="1" '
+                  'velocity="1"/>'] if axis else []  # fmt: skip
+        lines += ["  </joint>"]
+    lines += ['  <joint name="eye" type="fixed"><parent link="elbow_link"/><child link="camera"/>']
+    lines += ["  </joint>", "  <gazebo><x>1 &amp; 2</x></gazebo>", "</robot>", ""]
+    return "\r\n".join(lines)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("urdf") / "ur10.urdf"
+    path.write_bytes(ur10_urdf().encode())
+    return path
+
+
+def bent(robot: mc.Robot, size: float = 1e-3, last: bool = False) -> mc.Robot:
+    """An imperfect copy: every parameter off, the last link's only where asked for."""
+    change = size * np.random.default_rng(3).normal(size=robot.mdh.shape)
+    change[-1] *= last
+    return robot.with_mdh(robot.mdh + change)
+
+
+def job_of(robot: mc.Robot, nominal: mc.Robot | None = None) -> Job:
+    before = nominal or robot
+    compliance = np.full(robot.joints, np.nan)
+    return Job(robot, before, "fit.json", (), compliance, fitted=nominal is not None)
+
+
+def poses_of(robot: mc.Robot) -> tuple[np.ndarray, np.ndarray]:
+    q = random_joints(robot.lower, robot.upper, 30)
+    return q, robot.pose(q)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(export_command, [str(a) for a in arguments], standalone_mode=False)
+
+
+ROBOTS = ("irb120", "fanuc_r2000ic_165f", "ur10", "scara_600", "meca500")
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_new_urdf(name: str) -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    robot = bent(mc.load_robot(name), last=True)
+    mass, com = np.arange(robot.joints) + 1.0, np.ones((robot.joints, 3)) * [0.1, 0.2, 0.3]
+    robot = replace(robot, mass=mass, com=com)
+    made = export(job_of(robot), "urdf")
+    assert any("point masses" in notice for notice in made.notices)
+    q, poses = poses_of(robot)
+    model = to_robot(parse_urdf(made.content))
+    again = robot_from_dict(model.content)
+    assert_allclose(tip_poses(model.chain, q), poses, **EXACT)
+    assert_allclose(model.base @ again.pose(q) @ model.tool, poses, **EXACT)
+    assert_allclose(again.mass, mass)
+    assert_allclose([again.lower, again.upper], [robot.lower, robot.upper])
+    # parallel axes stay near: no origin is farther away than the arm reaches
+    assert max(np.abs(joint.origin[:3, 3]).max() for joint in model.chain) < robot.reach()
+    text = made.content.decode()
+    for kind in ("lower", "upper"):
+        assert text.count(f'{kind}="') == np.isfinite(getattr(robot, kind)).sum()
+    assert_allclose(theirs_at(text, q, "flange"), poses, **EXACT)
+    # the centre of gravity of the arm, by a reader that knows of masses, and ours
+    theirs = pinocchio.buildModelFromXML(text)
+    data = theirs.createData()
+    pinocchio.centerOfMass(theirs, data, configuration(theirs, q[1]))
+    ends = [robot_prefix(robot, i + 1, q[1]) for i in range(robot.joints)]
+    ours = sum(m * (e @ np.append(c, 1.0))[:3] for m, e, c in zip(mass, ends, com, strict=True))
+    assert_allclose(data.com[0], ours / mass.sum(), **EXACT)
+
+
+def robot_prefix(robot: mc.Robot, count: int, q: np.ndarray) -> np.ndarray:
+    cut = {key: getattr(robot, key)[:count] for key in ("mdh", "sign", "prismatic")}
+    return replace(robot, **cut).pose(q[:count])
+
+
+def configuration(model: Any, q: np.ndarray) -> np.ndarray:
+    """Pinocchio's: an endless joint is a cosine and a sine."""
+    pairs = zip(list(model.joints)[1:], q, strict=True)
+    return np.hstack([[np.cos(v), np.sin(v)] if joint.nq == 2 else [v] for joint, v in pairs])
+
+
+def theirs_at(text: str, q: np.ndarray, frame: str) -> np.ndarray:
+    pinocchio = pytest.importorskip("pinocchio")
+    model = pinocchio.buildModelFromXML(text)
+    data, out = model.createData(), []
+    for joints in q:
+        pinocchio.framesForwardKinematics(model, data, configuration(model, joints))
+        out.append(data.oMf[model.getFrameId(frame)].homogeneous)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_original_urdf_with_corrected_origins(original: Path, last: bool) -> None:
+    nominal = mc.load_robot(original)
+    model = to_robot(parse_urdf(original.read_bytes()))
+    robot = bent(nominal, last=last)
+    job = replace(job_of(robot, nominal), originals=(model.urdf,))
+    made = export(job, "urdf").content
+    q, poses = poses_of(robot)
+    expected = model.base @ poses @ model.tool
+    assert_allclose(theirs_at(made.decode(), q, "tool0"), expected, **EXACT)
+    # only origins of joints on the chain differ, and not the first: the base frame is the fit's
+    old, new = (raw.split(b"\r\n") for raw in (original.read_bytes(), made))
+    changed = [a for a, b in zip(old, new, strict=True) if a != b]
+    assert len(changed) == 5 + last
+    assert all(b"<origin" in line or b"rpy=" in line for line in changed)
+    nothing = replace(job_of(nominal, nominal), originals=(model.urdf,))
+    assert export(nothing, "urdf").content == original.read_bytes()
+
+
+def test_fit_of_the_builtin_robot_on_a_urdf_with_other_frames(original: Path) -> None:
+    nominal = mc.load_robot("ur10")
+    robot = bent(nominal)
+    urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
+    made = export(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
+    q, poses = poses_of(replace(robot, lower=np.full(6, -3.0), upper=np.full(6, 3.0)))
+    expected = turn(2, np.pi) @ poses  # base_link is turned against the controller's base
+    assert_allclose(theirs_at(made.content.decode(), q, "tool0"), expected, **EXACT)
+    assert any("base_link to the robot's base" in notice for notice in made.notices)
+
+
+def test_urdf_that_is_rounded_still_gives_the_calibrated_poses(original: Path) -> None:
+    nominal = mc.load_robot("ur10")
+    robot, rounded = bent(nominal), original.read_bytes().replace(HALF.encode(), b"1.5708")
+    urdf = parse_urdf(rounded, "rounded.urdf")
+    made = export(replace(job_of(robot, nominal), originals=(urdf,)), "urdf")
+    assert any("differ by up to" in notice for notice in made.notices)
+    q, poses = poses_of(robot)
+    there = theirs_at(made.content.decode(), q, "tool0")
+    # up to one constant at either end
+    assert_allclose(
+        there @ inverse(there[0]) @ (base := base_between(there, poses)),
+        base @ poses @ inverse(poses[0]),
+        rtol=0,
+        atol=3e-9,
+    )
+
+
+def base_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    from minimax_cal.robots.transforms import shared_base
+
+    return shared_base(one @ inverse(one[0]), other @ inverse(other[0]))
+
+
+def test_urdf_without_a_fixed_joint_after_the_last(original: Path) -> None:
+    urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
+    nominal = robot_from_dict(to_robot(urdf, "wrist_3_link").content)
+    change = np.zeros((6, 5))
+    change[-1, 1:3] = 1e-3  # along the joint axis: the last link's frame moves
+    job = replace(job_of(nominal.with_mdh(nominal.mdh + change), nominal), tip="wrist_3_link")
+    made = export(replace(job, originals=(urdf,)), "urdf").content
+    q, poses = poses_of(job.robot)
+    base = to_robot(urdf, "wrist_3_link").base
+    assert_allclose(theirs_at(made.decode(), q, "wrist_3_link"), base @ poses, **EXACT)
+    change[-1, 0] = 1e-3  # off the axis: this URDF cannot hold it
+    job = replace(job, robot=nominal.with_mdh(nominal.mdh + change), originals=(urdf,))
+    with pytest.raises(OptionError, match="cannot hold this geometry"):
+        export(job, "urdf")
+
+
+def test_another_robot_is_refused(original: Path) -> None:
+    urdf = parse_urdf(original.read_bytes(), "ur10.urdf")
+    irb = mc.load_robot("irb120")
+    with pytest.raises(OptionError, match="moves otherwise than the nominal robot"):
+        export(replace(job_of(irb), originals=(urdf,)), "urdf")
+    ur10 = mc.load_robot("ur10")
+    flipped = replace(ur10, sign=ur10.sign * [1, 1, 1, -1, 1, 1])
+    with pytest.raises(OptionError, match=r"most at joint 4 \(wrist_1\)"):
+        export(replace(job_of(flipped), originals=(urdf,)), "urdf")
+    with pytest.raises(OptionError, match="6 moving joints, the robot 4; name another last link"):
+        export(replace(job_of(mc.load_robot("scara_600")), originals=(urdf,)), "urdf")
+    with pytest.raises(OptionError, match="--urdf goes with --to urdf"):
+        export(replace(job_of(ur10), originals=(urdf,)), "json")
+
+
+def test_ur_yaml() -> None:
+    robot = bent(mc.load_robot("ur10"))
+    made = export(job_of(robot), "ur-yaml")
+    table = yaml.safe_load(made.content)["kinematics"]
+    number = table.pop("hash")
+    assert number == yaml.safe_load(export(job_of(robot), "ur-yaml").content)["kinematics"]["hash"]
+    assert number.startswith("calib_")
+    assert number.removeprefix("calib_").isdigit()
+    assert list(table) == ["shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"]
+    q, poses = poses_of(robot)
+    for joints, pose in zip(q, poses, strict=True):
+        found = np.eye(4)
+        for angle, row in zip(joints, table.values(), strict=True):
+            xyz, rpy = ([row[k] for k in names] for names in ("xyz", ("roll", "pitch", "yaw")))
+            found = found @ from_rpy(np.array(xyz), np.array(rpy)) @ turn(2, angle)
+        assert_allclose(found, pose, **EXACT)
+    assert max(abs(v) for row in table.values() for k, v in row.items() if k in "xyz") < 1
+    other = export(job_of(robot.with_mdh(robot.mdh * (1 + 1e-12))), "ur-yaml").content
+    assert yaml.safe_load(other)["kinematics"]["hash"] != number
+
+
+def test_ur_yaml_turns_a_joint_over_and_refuses_what_it_cannot_hold() -> None:
+    ur10 = mc.load_robot("ur10")
+    robot = replace(bent(ur10), sign=np.array([1.0, -1, -1, 1, -1, 1]))
+    table = yaml.safe_load(export(job_of(robot), "ur-yaml").content)["kinematics"]
+    q, poses = poses_of(robot)
+    found = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for i, row in enumerate(list(table.values())[:6]):
+        v = np.array(list(row.values()))
+        found = found @ from_rpy(v[:3], v[3:]) @ np.array([turn(2, a) for a in q[:, i]])
+    assert_allclose(found, poses, **EXACT)
+    with pytest.raises(OptionError, match="has no place for a, alpha, beta"):
+        export(job_of(bent(ur10, last=True)), "ur-yaml")
+    with pytest.raises(OptionError, match="six turning joints"):
+        export(job_of(mc.load_robot("scara_600")), "ur-yaml")
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_ros_yaml(name: str) -> None:
+    robot = bent(mc.load_robot(name), last=True)
+    joints = yaml.safe_load(export(job_of(robot), "ros-yaml").content)["joints"]
+    q, poses = poses_of(robot)
+    for values, pose in zip(q, poses, strict=True):
+        found = np.eye(4)
+        for value, row in zip((*values, 0.0), joints.values(), strict=True):
+            origin = {k: np.array(v) for k, v in row["origin"].items()}
+            found = found @ from_rpy(**origin)
+            if row["type"] == "prismatic":
+                found = found @ from_rpy(value * np.array(row["axis"]), np.zeros(3))
+            elif row["type"] == "revolute":
+                found = found @ turn(2, value * row["axis"][2])
+        assert_allclose(found, pose, **EXACT)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_dh_csv_and_json(name: str, tmp_path: Path) -> None:
+    robot = bent(mc.load_robot(name), last=True)
+    made = export(job_of(robot), "dh-csv")
+    rows = list(csv.DictReader(io.StringIO(made.content.decode())))
+    assert "beta is not 0" in made.notices[0]
+    keys = ("a_mm", "d_mm", "theta_rad", "alpha_rad", "beta_rad")
+    mdh = np.array([[float(row[key]) for key in keys] for row in rows]) * [1e-3, 1e-3, 1, 1, 1]
+    again = replace(robot.with_mdh(mdh), sign=np.array([float(row["sign"]) for row in rows]))
+    q, poses = poses_of(robot)
+    assert_allclose(again.pose(q), poses, **EXACT)
+    assert [row["type"] == "prismatic" for row in rows] == list(robot.prismatic)
+    (tmp_path / "r.json").write_bytes(export(job_of(robot), "json").content)
+    assert_allclose(mc.load_robot(tmp_path / "r.json").pose(q), poses, **EXACT)
+
+
+MOC = r"""MOC:CFG_1.0:6:0::
+#
+ROBOT:
+
+      -name "ROB_1" -use_robot_type "ROB1_0 \\ x: made up" -use_robot_calib "r1_calib"\
+      -use_lin_jog  -base_mass 16.2
+#
+TOOL_INTERFACE:
+
+      -name "r1_tool" -offset_x -1.5E-06 -offset_y 2E-005
+#
+ARM_CALIB:
+
+      -name "rob1_1" -absacc_version 2 -error_offset_x 2E-06\
+      -error_offset_y -0.00015 -error_roll 0.0002 -error_jaw -0.0003\
+      -arm_compliance_y 3.1E-06
+
+      -name "rob1_2"
+#
+JOINT_CALIB:
+
+      -name "rob1_2" -Compl 1.1E-05
+"""
+
+
+def test_moc_parse_write_parse_is_identical(tmp_path: Path) -> None:
+    moc = parse_moc(MOC)
+    assert parse_moc(text_of(moc)) == moc
+    assert parse_moc(text_of(moc, "a comment\nof two lines")) == moc
+    assert max(map(len, text_of(moc).splitlines())) <= 80
+    assert dict(moc.sections[0].entries[0])["use_lin_jog"] == ""
+    found = moc.corrections()
+    assert found["ARM_CALIB"]["rob1_1"]["error_offset_y"] == -0.00015
+    assert found["ARM_CALIB"]["rob1_2"] == {}
+    assert found["TOOL_INTERFACE"]["r1_tool"] == {"offset_x": -1.5e-6, "offset_y": 2e-5}
+    assert found["JOINT_CALIB"] == {"rob1_2": {"Compl": 1.1e-5}}
+    path = tmp_path / "MOC.cfg"
+    path.write_bytes(
+        MOC.replace("made up", "g\xe9n\xe9ral").replace("\n", "\r\n").encode("latin-1")
+    )
+    assert len(read_moc(path).sections) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "1: is not a MOC.cfg"),
+        ("EIO:CFG_1.0:6:0::\n", "1: is not a MOC.cfg"),
+        ('MOC:CFG_1.0:6:0::\n  -name "a"\n', "2: an entry before any section"),
+        ('MOC:CFG_1.0:6:0::\nARM_CALIB:\n  -name "a\n', "3: a quotation mark is not closed"),
+        ('MOC:CFG_1.0:6:0::\nARM_CALIB:\n  -name "a" 1 2\n', "3: '1': expected -key value"),
+        ('MOC:CFG_1.0:6:0::\nARM_CALIB:\n\n  -name "a"\\\n', "4: ends in the middle"),
+    ],
+)
+def test_a_broken_moc_is_one_clear_line(text: str, words: str) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        parse_moc(text)
+    for entry in ('-name "a" -error_roll x', '-name "a" -error_roll nan', "-error_roll 1"):
+        moc = parse_moc(f"MOC:CFG_1.0:6:0::\nARM_CALIB:\n  {entry}\n")
+        with pytest.raises(
+            CalibrationError, match=r"ARM_CALIB: (-error_roll|an entry has no -name)"
+        ):
+            moc.corrections()
+
+
+def test_moc_holds_the_corrections_of_a_fit() -> None:
+    nominal = mc.load_robot("irb120")
+    robot = bent(nominal, last=True)
+    job = replace(job_of(robot, nominal), experimental=True)
+    job = replace(job, compliance=np.array([np.nan, 1e-6, 2e-6, np.nan, np.nan, np.nan]))
+    made = export(job, "moc")
+    assert made.notices[0].startswith("EXPERIMENTAL")
+    text = made.content.decode()
+    assert "EXPERIMENTAL" in text
+    moc: Moc = parse_moc(text)
+    assert parse_moc(text_of(moc)) == moc
+    found = moc.corrections()
+    assert found["JOINT_CALIB"]["rob1_3"] == {"Compl": 2e-6}
+    for i, row in enumerate(found["ARM_CALIB"].values()):
+        xyz = [row.get(f"error_offset_{axis}", 0.0) for axis in "xyz"]
+        rpy = [row.get(f"error_{name}", 0.0) for name in ("roll", "pitch", "jaw")]
+        pose = link(nominal.mdh[i]) @ from_rpy(np.array(xyz), np.array(rpy))
+        assert_allclose(pose, link(robot.mdh[i]), **EXACT)
+    with pytest.raises(OptionError, match="add --experimental"):
+        export(replace(job, experimental=False), "moc")
+    with pytest.raises(OptionError, match="holds no nominal robot"):
+        export(replace(job, fitted=False), "moc")
+
+
+@pytest.fixture(scope="module")
+def fit(tmp_path_factory: pytest.TempPathFactory, original: Path) -> tuple[Path, Simulation]:
+    """The UR10 of a URDF, calibrated with an effect beyond geometry."""
+    made = simulate(mc.load_robot(original), 60, 3, seed=2)
+    path = tmp_path_factory.mktemp("fit") / "fit.json"
+    mc.calibrate(
+        mc.load_robot(original), made.data, objective="sum", effects=["joint_coupling:J3"]
+    ).save(path)
+    return path, made
+
+
+def test_a_calibrated_ur10_by_command_in_an_independent_reader(
+    fit: tuple[Path, Simulation], original: Path, tmp_path: Path
+) -> None:
+    path, _ = fit
+    result = run(path, "--to", "urdf", "--urdf", original, "-o", tmp_path / "out.urdf")
+    assert result.exception is None, result.output
+    assert result.stdout == ""
+    assert "joint_coupling:J3: effects beyond geometry are not in this file" in result.stderr
+    robot, model = mc.load_robot(path), to_robot(parse_urdf(original.read_bytes()))
+    q, poses = poses_of(robot)
+    text = (tmp_path / "out.urdf").read_text()
+    assert_allclose(theirs_at(text, q, "tool0"), model.base @ poses @ model.tool, **EXACT)
+    assert_allclose(mc.load_robot(tmp_path / "out.urdf").pose(q).shape, poses.shape)
+
+
+@pytest.mark.parametrize("to", [name for name in EXPORTERS if name != "moc"])
+def test_every_format_by_command(to: str, fit: tuple[Path, Simulation]) -> None:
+    result = run(fit[0], "--to", to)
+    assert result.exception is None
+    assert result.stdout_bytes == export(read_job(fit[0]), to).content
+    quiet = run(fit[0], "--to", to, "-q")
+    assert quiet.stderr == ""
+    assert_array_equal(quiet.stdout_bytes, result.stdout_bytes)
+
+
+def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> None:
+    assert json.loads(run("irb120", "--to", "json").stdout)["name"] == "ABB IRB 120"
+    result = run(original, "--to", "dh-csv")
+    assert result.exception is None
+    assert "a constant transform remains: base" not in result.stderr  # a turn about axis 1
+    assert run(f"{original}#wrist_1_link", "--to", "dh-csv").stdout.count("revolute") == 4
+    for arguments, words in (
+        (("irb120", "--to", "step"), "no such format; choose one of urdf, ur-yaml"),
+        (("irb120", "--to", "moc"), "add --experimental"),
+        (("irb120", "--to", "moc", "--experimental"), "holds no nominal robot"),
+        (("irb120", "--to", "json", "--urdf", original), "--urdf goes with --to urdf"),
+        (("irb120", "--to", "urdf", "--tip", "x"), "--tip names a link of the file"),
+        (("irb120", "--to", "urdf", "-o", tmp_path / "no" / "x"), "no such folder"),
+        (("irb12", "--to", "urdf"), "did you mean 'irb120'"),
+        (("irb120", "--to", "urdf", "--urdf", tmp_path / "x"), "cannot be read"),
+    ):
+        result = run(*arguments)
+        assert isinstance(result.exception, CalibrationError)
+        assert words in str(result.exception)
+    (tmp_path / "broken.json").write_text("{")
+    assert "cannot be parsed" in str(run(tmp_path / "broken.json", "--to", "json").exception)
+
+
+def test_a_fit_from_before_nominal_robots(fit: tuple[Path, Simulation], tmp_path: Path) -> None:
+    content = json.loads(fit[0].read_text())
+    del content["nominal_robot"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    job = read_job(tmp_path / "old.json")
+    assert job.nominal is job.robot
+    assert job.effects == ("joint_coupling:J3",)

@@ -1,0 +1,266 @@
+"""The diagnosis as a whole: verdicts, faults of the data, the ladder, words backed by numbers."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from experiments.gap_cases import Case, Cause, Sealed, make
+from minimax_cal.diagnosing.diagnose import closed_share
+from minimax_cal.diagnosing.result import VERDICTS
+from minimax_cal.fitting.exchanged import misplaced, put_right
+from minimax_cal.modelling.simulate import Simulation
+
+
+def sealed(*causes: Cause, seed: int = 1, condition: str = "single") -> Sealed:
+    return make(Case("irb2600", condition, causes, seed=seed))
+
+
+@pytest.fixture(scope="module")
+def plain() -> mc.Diagnosis:
+    made = sealed(Cause("backlash", "J2", 1000.0))
+    return mc.diagnose(made.robot, made.data)
+
+
+def test_nothing_is_named_on_a_sound_arm() -> None:
+    made = sealed(condition="none")
+    found = mc.diagnose(made.robot, made.data)
+    assert found.verdict == "none"
+    assert found.findings == ()
+    assert abs(found.floor / (1e3 * made.floor) - 1.0) < 0.1
+    assert "no effect is named" in found.headline()
+
+
+def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:
+    assert plain.verdict == "named"
+    (one,) = plain.findings
+    assert (one.term.effect, one.term.place) == ("backlash", "J2")
+    assert one.chance < 1e-6
+    assert plain.closed > 0.7
+    assert plain.closed_ci[0] <= plain.closed <= plain.closed_ci[1]
+    assert one.after < one.before
+
+
+def test_the_json_is_the_contract(plain: mc.Diagnosis) -> None:
+    said = json.loads(plain.json())
+    assert said["verdict"] in VERDICTS
+    effect = said["effects"][0]
+    assert {"effect", "place", "share", "parameters", "holdout_rms_mm", "alternatives"} <= set(
+        effect
+    )
+    assert {"name", "value", "sigma", "unit"} <= set(effect["parameters"][0])
+    assert set(effect["holdout_rms_mm"]) == {"before", "after"}
+    gap = said["gap"]
+    for kind in ("holdout_rms_mm", "holdout_max_mm"):
+        assert set(gap[kind]) == {"nominal", "geometric", "final"}
+    assert {"noise_floor_mm", "closed", "closed_ci95"} <= set(gap)
+    assert {"by_target", "by_joint", "by_direction", "by_order", "triage"} <= set(said["where"])
+    assert set(said["where"]["triage"]) >= {"pose", "shape", "repeat"}
+    for entry in said["not_testable"]:
+        assert set(entry) == {"effect", "needs"}
+
+
+def numbers_of(content: object) -> list[float]:
+    """Every number in a JSON content."""
+    if isinstance(content, bool):
+        return []
+    if isinstance(content, int | float):
+        return [float(content)]
+    if isinstance(content, str):  # what to measure next stands there as words
+        return [float(text) for text in re.findall(r"(?<![\w.])\d+(?:\.\d+)?", content)]
+    values = content.values() if isinstance(content, dict) else content
+    if isinstance(content, dict | list):
+        return [number for value in values for number in numbers_of(value)]  # type: ignore[union-attr]
+    return []
+
+
+@pytest.mark.parametrize(
+    "causes",
+    [
+        (),
+        (Cause("joint_compliance", "J2", 300.0),),
+        (Cause("outside_sum", "J2", 1000.0),),
+        (Cause("backlash", "J1", 500.0), Cause("gear_error", "J3", 500.0)),
+        (Cause("outliers", "all", 1.0),),
+    ],
+    ids=["none", "one", "outside", "two", "fault"],
+)
+def test_every_number_in_words_stands_in_the_json(causes: tuple[Cause, ...]) -> None:
+    made = sealed(*causes, seed=3)
+    found = mc.diagnose(made.robot, made.data)
+    said = json.loads(found.json())
+    del said["reasons"]  # the words themselves
+    known = numbers_of(said)
+    shown = {f"{scale * value:.{digits}f}" for value in known for scale in (1, 100)
+             for digits in (0, 1, 2, 3)} | {f"{value:.1g}" for value in known}  # fmt: skip
+    text = re.sub(r"\b[JL]\d\b|smr\d|joint \d|link \d|95 %|angle \d", "", found.headline())
+    for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", text):
+        assert number in shown, f"{number} in {text!r}"
+
+
+def test_an_arm_that_does_not_come_back_is_called_so() -> None:
+    made = make(Case("irb2600", "rough", jitter=200e-6, seed=4))
+    found = mc.diagnose(made.robot, made.data)
+    assert found.verdict == "not_repeatable"
+    assert "does not return" in found.headline()
+
+
+def test_a_law_outside_the_library_is_unknown() -> None:
+    made = sealed(Cause("outside_sum", "J2", 1000.0))
+    found = mc.diagnose(made.robot, made.data)
+    assert found.verdict == "unknown"
+    assert found.structure < 1e-3
+    assert "cause is unknown" in found.headline() or "best guess" in found.headline()
+
+
+def test_without_the_true_effect_no_relative_is_named_with_confidence() -> None:
+    made = sealed(Cause("backlash", "J2", 1000.0))
+    found = mc.diagnose(made.robot, made.data, exclude=("backlash",))
+    assert found.verdict == "unknown" or any(f.alternatives for f in found.findings)
+    assert all(f.term.effect != "backlash" for f in found.findings)
+
+
+def test_the_ladder_is_of_poses_that_no_fit_has_seen(plain: mc.Diagnosis) -> None:
+    held = plain.held
+    cell = plain.cells[-1]
+    error = np.linalg.norm(cell.error(plain.data.take(held)), axis=-1)
+    assert_allclose(plain.ladder[-1].holdout.rms_mm, 1e3 * np.sqrt(np.mean(error**2)), rtol=1e-9)
+    again = mc.diagnose(
+        sealed(Cause("backlash", "J2", 1000.0)).robot,
+        plain.data.with_y(np.where(held[:, None, None], plain.data.y + 5.0, plain.data.y)),
+    )
+    assert [f.values for f in again.findings][-1:] != [] or again.findings == ()
+    assert_allclose(again.ladder[1].train.rms_mm, plain.ladder[1].train.rms_mm, rtol=1e-6)
+
+
+def test_the_split_column_is_kept(plain: mc.Diagnosis) -> None:
+    assert (plain.data.columns["split"][plain.held] == "holdout").all()
+    assert (plain.data.columns["split"][~plain.held] == "train").all()
+
+
+def test_outliers_and_swapped_rows_are_named_and_mended() -> None:
+    made = sealed(Cause("outliers", "all", 1.0), seed=7)
+    found = mc.diagnose(made.robot, made.data)
+    assert found.findings[0].term.effect == "outliers"
+    assert found.ladder[-1].holdout.rms_mm < 1.1e3 * made.floor * 1.05
+    made = sealed(Cause("swapped_rows", "all", 1.0), seed=7)
+    found = mc.diagnose(made.robot, made.data)
+    assert found.findings[0].term.effect == "swapped_rows"
+    moved = np.flatnonzero(np.abs(made.displacement).max(axis=(0, 2)) > 0.01)
+    assert sorted(found.findings[0].rows) == made.data.line[moved].tolist()
+    assert found.ladder[-1].holdout.rms_mm < 1.1e3 * made.floor * 1.05
+
+
+def test_rows_find_their_own_points_again() -> None:
+    made = sealed(condition="none", seed=5)
+    y = made.data.y.copy()
+    y[[3, 8, 20]] = y[[8, 20, 3]]
+    rows, source = misplaced(made.robot, made.data.with_y(y))
+    assert rows.tolist() == [3, 8, 20]
+    back = put_right(made.data.with_y(y), rows, source)
+    assert_allclose(back.y, made.data.y, rtol=0, atol=0)
+    assert not len(misplaced(made.robot, made.data)[0])
+    y = made.data.y.copy()
+    y[4] += 0.5
+    rows, source = misplaced(made.robot, made.data.with_y(y))
+    assert (rows.tolist(), source.tolist()) == ([4], [4])
+    assert put_right(made.data.with_y(y), rows, source).poses == made.data.poses - 1
+
+
+def test_closed_share_is_of_squares_above_the_floor() -> None:
+    rng = np.random.default_rng(0)
+    before, after = (s * rng.normal(size=(3, 4000, 3)) for s in (2e-3, 1e-3))
+    share, (low, high) = closed_share(before, after, np.sqrt(3.0) * 0.5, 0)
+    assert abs(share - (4.0 - 1.0) / (4.0 - 0.25)) < 0.02
+    assert low < share < high
+    none = closed_share(before * 0.0, before * 0.0, 1.0, 0)
+    assert np.isnan(none[0])
+
+
+def test_computed_points_have_no_gap(clean: Simulation, robot: mc.Robot) -> None:
+    found = mc.diagnose(robot, clean.data)
+    assert found.verdict == "none"
+    assert found.ladder[1].holdout.rms_mm < 1e-6
+
+
+def test_user_errors_say_what_to_do(robot: mc.Robot) -> None:
+    made = sealed(condition="none")
+    with pytest.raises(mc.OptionError, match="choose joint_compliance"):
+        mc.diagnose(made.robot, made.data, exclude=("gremlins",))
+    columns = {k: v for k, v in made.data.columns.items() if k != "split"}
+    with pytest.raises(mc.DataError, match="no pose is held out"):
+        mc.diagnose(made.robot, replace(made.data, columns=columns), holdout=0.0)
+    degrees = replace(made.data, q=np.degrees(made.data.q) / 10.0)
+    with pytest.raises(mc.DataError):
+        mc.diagnose(made.robot, degrees)
+
+
+def test_one_target_is_enough() -> None:
+    made = sealed(Cause("encoder_gain", "J1", 2000.0), seed=2)
+    alone = made.data.only(0)
+    found = mc.diagnose(made.robot, alone)
+    assert found.verdict in VERDICTS
+    assert "target_shift" in {name for name, _ in found.not_testable}
+
+
+# ---- real arms ---------------------------------------------------------------------------------
+
+
+def test_qkm_gravity_is_named() -> None:
+    found = mc.diagnose(*shared("qkm_hl6"))
+    gravity = {"joint_compliance", "link_bending"}
+    first = found.findings[0]
+    assert {first.term.effect, *(a.effect for a in first.alternatives)} >= gravity
+    assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
+
+
+def test_fanuc_gravity_is_named() -> None:
+    found = mc.diagnose(*shared("fanuc_r2000"))
+    assert found.findings[0].term.effect in ("joint_compliance", "link_bending")
+    assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
+
+
+def test_meca_has_no_gravity() -> None:
+    found = mc.diagnose(*shared("meca500_r"))
+    gravity = {"joint_compliance", "link_bending", "base_flex", "gravity_compensator", "tool_flex"}
+    assert not gravity & {f.term.effect for f in found.findings}
+    assert ("backlash", "J6") in {(f.term.effect, f.term.place) for f in found.findings}
+
+
+def test_ur10_has_lines_at_about_17_a_turn() -> None:
+    found = mc.diagnose(*shared("ur10_b"))
+    turns = [v for f in found.findings if f.term.effect == "gear_ripple" for v in f.fixed.values()]
+    assert any(abs(value - 17.0) < 0.5 for value in turns)
+    assert found.ladder[-1].holdout.rms_mm < 0.75 * found.ladder[1].holdout.rms_mm
+
+
+def irb120(every: int, *, read_back: bool = False) -> mc.Diagnosis:
+    """The IRB 120's diagnosis on some of its rows, with commanded or read-back joints."""
+    robot, path = shared("irb120")
+    data = mc.read_measurements(path)
+    q = np.stack([data.columns[f"qread{j + 1}"] for j in range(6)], axis=1)
+    kept = {k: v for k, v in data.columns.items() if not k.startswith(("qread", "base"))}
+    data = replace(data, q=q, columns=kept) if read_back else data
+    return mc.diagnose(mc.load_robot(robot), data.take(np.arange(0, data.poses, every)))
+
+
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_irb120_gives_way_at_its_joints(every: int) -> None:
+    found = irb120(every)
+    assert found.findings[0].term.effect == "joint_compliance"
+    final = found.ladder[-1].holdout
+    assert final.rms_mm <= 0.10
+    assert final.max_mm <= 0.35
+
+
+@pytest.mark.slow
+def test_read_back_joints_are_not_called_backlash() -> None:
+    """Every row is needed: a row tells of its move only if the pose before it is there."""
+    names = {f.term.effect for f in irb120(1, read_back=True).findings}
+    assert names & {"readback", "settling"}
+    assert "backlash" not in names

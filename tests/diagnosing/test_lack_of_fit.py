@@ -1,0 +1,62 @@
+"""What remains: right levels on noise, power against what no library holds."""
+
+import numpy as np
+import pytest
+from problems_fit import study
+from scipy import stats
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.lack_of_fit import rest_of, structure
+from minimax_cal.evidence.noise import Noise, restricted
+
+
+def test_probabilities_are_right_on_noise() -> None:
+    """White rows of the assumed covariance: each question's p below 0.1 in a tenth of all runs.
+
+    Bands are of 99.9 % for all questions of 60 drawings together; the lack of fit and the wave are
+    bounds on a maximum, which may only be rarer.
+    """
+    made = study(6e-6, 1.0, 0)
+    rng, rows = np.random.default_rng(1), made.rows
+    noise = Noise(0.5, 1e-10, 0.0)
+    spread = np.sqrt(1e-10 * (1.0 + 0.5 * rows.stretch))
+    hits = []
+    for _ in range(60):
+        drawn = type(rows)(
+            spread * rng.normal(size=len(rows.error)),
+            rows.basis, rows.stretch, rows.size, rows.count, rows.turn, rows.weight,
+        )  # fmt: skip
+        found = structure(made.scene, drawn, noise, np.zeros((len(rows.error), 0)))
+        hits.append([trace.p < 0.1 for trace in found if "wave" not in trace.name])
+    count = np.array(hits)
+    low, high = stats.binom.ppf((0.0005, 0.9995), 60, 0.1)
+    each = count.sum(axis=0)
+    assert np.mean((each >= low) & (each <= high)) > 0.95
+    assert abs(count.mean() - 0.1) < 0.03
+
+
+@pytest.mark.parametrize("law", ["outside_sum", "outside_product", "outside_waves"])
+def test_laws_outside_the_library_leave_a_trace(law: str) -> None:
+    from minimax_cal.diagnosing.diagnose import studied
+    from minimax_cal.fitting.calibrate import Options, fit_cell, silent
+    from minimax_cal.measuring.history import with_history
+    from minimax_cal.measuring.measurements import split
+
+    sealed = make(Case("irb2600", "outside", (Cause(law, "J2", 300.0),), seed=5))
+    train, _, _ = split(with_history(sealed.data), 0.2, 0)
+    fit = fit_cell(sealed.robot, train, Options(objective="sum"), silent)
+    made = studied(sealed.robot, train, fit)
+    none = np.zeros((len(made.rows.error), 0))
+    found = structure(made.scene, made.rows, restricted(made.rows, none), none)
+    best = min(found, key=lambda trace: trace.p)
+    assert best.p * len(found) < 1e-4
+    assert "J2" in best.name or "wave" in best.name or "repeated" in best.name
+
+
+def test_what_was_fitted_is_not_found_again() -> None:
+    made = study(6e-6, 1.0, 2)
+    wave = np.cos(made.scene.q[1]) * made.scene.slope[1]
+    column = made.rows.of(wave[None])
+    rest = rest_of(made.rows, Noise(0.1, 1e-10, 0.0), column)
+    root = rest.root
+    assert abs(rest.rows @ (column[:, 0] * root)) < 1e-8 * np.linalg.norm(column[:, 0] * root)

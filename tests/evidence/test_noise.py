@@ -1,0 +1,82 @@
+"""The two noises: rotated rows are the same problem, and REML finds what was put in."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import study
+
+import minimax_cal as mc
+from experiments.gap_cases import Case, make
+from minimax_cal.diagnosing.diagnose import Study, studied
+from minimax_cal.evidence.noise import Noise, Rows, restricted
+from minimax_cal.fitting.calibrate import Options, fit_cell, silent
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import split
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Study:
+    return study(6e-6, 1.0, 0)
+
+
+def test_rotated_rows_keep_every_square(quiet: Study, rng: np.random.Generator) -> None:
+    fields = rng.normal(size=(4, *quiet.scene.points.shape))
+    rows = quiet.rows.of(fields)
+    assert_allclose(rows.T @ rows, fields.reshape(4, -1) @ fields.reshape(4, -1).T, rtol=1e-12)
+    assert_allclose(quiet.rows.back(rows[:, 2]), fields[2], rtol=0, atol=1e-12)
+
+
+def test_the_variance_of_a_row_is_that_of_its_direction(quiet: Study) -> None:
+    """Each rotated row has variance s^2 + t^2 |S'u|^2, and rows of a pose are uncorrelated."""
+    rows, slope = quiet.rows, quiet.scene.slope
+    arms = rows.of(slope)  # (N, n)
+    pose = 7
+    r = rows.weight.shape[1]
+    own = arms.reshape(-1, r, slope.shape[0])[pose]
+    expected = np.diag(rows.stretch.reshape(-1, r)[pose] * rows.size)
+    assert_allclose(own @ own.T, expected, rtol=0, atol=1e-9 * expected.max())
+
+
+def test_what_is_left_is_square_to_the_geometry(quiet: Study) -> None:
+    """The fit is a least-squares one, so its rows have no part in the geometry's span."""
+    rows = quiet.rows
+    assert_allclose(rows.basis.T @ rows.error, 0.0, atol=1e-6 * np.linalg.norm(rows.error))
+
+
+@pytest.mark.parametrize(("jitter", "noise"), [(0.0, 1.0), (6e-6, 1.0), (20e-6, 1.0), (6e-6, 2.0)])
+def test_noise_and_jitter_are_found(jitter: float, noise: float) -> None:
+    """Means over eight arms, within 15 % (a fifth of the mean instrument noise for no jitter)."""
+    found = []
+    for seed in range(8):
+        made = study(jitter, noise, seed)
+        away = np.linalg.norm(made.data.y, axis=-1).mean()
+        one = restricted(made.rows, np.zeros((len(made.rows.error), 0)))
+        truth = noise * (10e-6 + 2.5e-6 * away)
+        found.append((one.jitter, np.sqrt(one.variance) / truth))
+    mean_jitter, mean_ratio = np.mean(found, axis=0)
+    assert abs(mean_ratio - 1.0) < 0.1
+    assert abs(mean_jitter - jitter) < max(0.15 * jitter, 2e-6)
+
+
+def test_weights_are_the_inverse_variances(quiet: Study) -> None:
+    noise = Noise(2.0, 1e-10, 0.0)
+    stretch = quiet.rows.stretch
+    assert_allclose(noise.weights(quiet.rows) * 1e-10 * (1.0 + 2.0 * stretch), 1.0, rtol=1e-12)
+
+
+def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
+    rows = quiet.rows
+    few = Rows(rows.error[:9], np.eye(9), rows.stretch[:9], rows.size, 9, rows.turn, rows.weight)
+    assert restricted(few, np.zeros((9, 0))).variance > 0.0
+
+
+def test_missing_targets_count_for_nothing(robot: mc.Robot) -> None:
+    made = make(Case("irb2600", "none", seed=3))
+    data = with_history(made.data)
+    y = data.y.copy()
+    y[::3, 1] = np.nan
+    train, _, _ = split(data.with_y(y), 0.2, 0)
+    one = studied(made.robot, train, fit_cell(made.robot, train, Options(objective="sum"), silent))
+    assert one.rows.count == 3 * int(train.seen.sum())
+    found = restricted(one.rows, np.zeros((len(one.rows.error), 0)))
+    assert 12e-6 < np.sqrt(found.variance) < 25e-6

@@ -1,0 +1,443 @@
+"""The generator of the blind study, against expectations of its own, and the study's scoring."""
+
+import dataclasses
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from experiments import blind_gap, gap_cases
+from experiments.gap_cases import ARMS, FAULTS, LAWS, Case, Cause, Sealed, Truth, World
+from minimax_cal.ground.arrays import Array
+
+ROBOTS = tuple(ARMS)
+
+
+def world(robot: str = "irb2600", **options: float) -> World:
+    return gap_cases.world_of(Case(robot, "test", **options), np.random.default_rng(4))  # type: ignore[arg-type]
+
+
+def moved(place: World, cause: Cause, amplitude: float, seed: int = 0) -> Array:
+    """(m, k, 3) displacement of the points [m]."""
+    still = gap_cases.measure(place, gap_cases.rigid(place))
+    unit = LAWS[cause.law](place, cause, np.random.default_rng(seed))
+    return gap_cases.measure(place, unit * amplitude) - still
+
+
+def seen(place: World, robot: mc.Robot, q: Array, spots: Array) -> Array:
+    """Points by the package's forward kinematics: (m, k, 3) [m]."""
+    pose = place.base @ robot.pose(q)
+    return np.einsum("mij,kj->mki", pose[:, :3, :3], spots) + pose[:, None, :3, 3]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("law", LAWS)
+def test_lambda_is_what_was_asked_for(law: str, robot: str) -> None:
+    for place in gap_cases.places(law, robot)[-1:]:
+        power = 1.0 if law in FAULTS else 70.0
+        sealed = gap_cases.make(Case(robot, "test", (Cause(law, place, power, 1),), poses=60))
+        assert sealed.truth == ((law.partition("/")[0], place),)
+        if law not in FAULTS:
+            assert_allclose(sealed.powers, [70.0], rtol=1e-6)
+        assert_allclose(sealed.parts[0], sealed.displacement, rtol=0, atol=1e-12)
+        assert sealed.displacement.shape == (3, sealed.data.poses, 3)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_no_power_moves_nothing(law: str) -> None:
+    place = gap_cases.places(law, "irb2600")[0]
+    sealed = gap_cases.make(Case("irb2600", "test", (Cause(law, place, 0.0),), poses=60))
+    assert np.all(sealed.displacement == 0.0)
+    assert sealed.amplitudes == (0.0,)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_forward_kinematics_is_the_packages(robot: str) -> None:
+    place = world(robot)
+    expected = seen(place, place.robot, place.q + place.jitter, place.spots)
+    assert_allclose(gap_cases.measure(place, gap_cases.rigid(place)), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_torque_is_the_slope_of_potential_energy(robot: str) -> None:
+    place = world(robot)
+    q = place.q[:20]
+
+    def energy(q: Array) -> Array:
+        height = gap_cases.centres(place.robot, gap_cases.frames(place.robot, q)) @ place.robot.up
+        return np.asarray(gap_cases.G * height @ place.robot.mass)
+
+    for joint, step in enumerate(1e-30j * np.eye(6)):
+        slope = energy(q + step).imag / 1e-30
+        torque = gap_cases.torque(place.robot, q)[:, joint]
+        assert_allclose(torque, -slope, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_jacobians_are_the_derivatives_of_the_points(robot: str) -> None:
+    place = dataclasses.replace(world(robot, jitter=0.0), base=np.eye(4))
+    geometry, joints = gap_cases.jacobians(place)
+    assert geometry.shape[-1] == 5 * 6 + 6 + 9
+    step = 1e-6
+    order = (2, 1, 0, 3, 4)  # theta, d, a, alpha, beta
+    for part, column in enumerate(order):
+        for joint in (0, 2, 5):
+            ends = []
+            for sign in (1.0, -1.0):
+                mdh = place.robot.mdh.copy()
+                mdh[joint, column] += sign * step
+                ends.append(seen(place, place.robot.with_mdh(mdh), place.q, place.spots))
+            slope = (ends[0] - ends[1]) / (2 * step)
+            assert_allclose(geometry[..., 6 * part + joint], slope, rtol=0, atol=1e-8)
+    for joint in range(6):
+        ends = [
+            seen(place, place.robot, place.q + s * np.eye(6)[joint], place.spots)
+            for s in (step, -step)
+        ]
+        assert_allclose(joints[..., joint], (ends[0] - ends[1]) / (2 * step), rtol=0, atol=1e-8)
+
+
+def test_geometry_alone_has_no_power() -> None:
+    place = world()
+    geometry, _ = gap_cases.jacobians(place)
+    ruler = gap_cases.judge(place, np.full(geometry.shape[:2], 1e-5), 6e-6)
+    for column in (3, 20, 31, 40):
+        motion = 1e-3 * geometry[..., column] @ place.base[:3, :3].T
+        assert ruler.power(motion) < 1e-10
+        assert np.linalg.norm(motion) > 1e-3
+
+
+def test_power_without_jitter_is_the_squared_ratio_to_noise() -> None:
+    place = world()
+    ruler = gap_cases.judge(place, np.full((len(place.q), 3), 2e-5), 0.0)
+    bare = dataclasses.replace(ruler, geometry=ruler.geometry[:, :0])
+    motion = np.zeros((len(place.q), 3, 3))
+    motion[place.train, 1, 2] = 1e-5
+    assert_allclose(bare.power(motion), 0.25 * place.train.sum(), rtol=1e-12)
+
+
+def test_encoder_gain_is_a_difference_of_forward_kinematics() -> None:
+    place = world(jitter=0.0)
+    gain = np.array([1.0, 1.0, 1.003, 1.0, 1.0, 1.0])
+    expected = seen(place, place.robot, place.q * gain, place.spots)
+    expected -= seen(place, place.robot, place.q, place.spots)
+    found = moved(place, Cause("encoder_gain", "J3", 1.0), 0.003)
+    assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_coupling_backlash_and_settling_by_hand() -> None:
+    place = world(jitter=0.0)
+    last = np.concatenate([place.q[:1], place.q[:-1]])
+    for cause, joint, dq in (
+        (Cause("joint_coupling", "J5", 1.0), 4, place.q[:, 3]),
+        (Cause("joint_coupling", "J6", 1.0), 5, place.q[:, 4]),
+        (Cause("backlash", "J2", 1.0), 1, np.sign(place.q[:, 1] - last[:, 1])),
+        (Cause("settling", "J4", 1.0), 3, last[:, 3] - place.q[:, 3]),
+    ):
+        q = place.q.copy()
+        q[:, joint] += 2e-4 * dq
+        expected = seen(place, place.robot, q, place.spots)
+        expected -= seen(place, place.robot, place.q, place.spots)
+        assert_allclose(moved(place, cause, 2e-4), expected, rtol=0, atol=1e-13)
+
+
+def test_growth_is_another_geometry_at_every_row() -> None:
+    place = world(jitter=0.0)
+    found = moved(place, Cause("thermal_growth", "all", 1.0), 1e-4)
+    assert_allclose(found[0], 0.0, atol=1e-15)  # time 0
+    mdh = place.robot.mdh.copy()
+    for joint, column in place.arm.hot:
+        mdh[joint - 1, column] *= 1 + 1e-4
+    whole = seen(place, place.robot.with_mdh(mdh), place.q, place.spots)
+    whole -= seen(place, place.robot, place.q, place.spots)
+    share = np.sum(found * whole, axis=(1, 2)) / np.sum(whole**2, axis=(1, 2))
+    assert np.all(np.diff(share) > 0.0)
+    assert_allclose(found, share[:, None, None] * whole, rtol=0, atol=1e-9)
+
+
+def test_target_laws_move_what_they_say() -> None:
+    place = world(jitter=0.0)
+    still = gap_cases.measure(place, gap_cases.rigid(place))
+    offset = moved(place, Cause("target_offset", "smr2", 1.0), 1e-4)
+    assert np.all(offset[:, [0, 2]] == 0.0)
+    along = np.sum(offset[:, 1] * still[:, 1], axis=1) / np.linalg.norm(still[:, 1], axis=1)
+    assert_allclose(along, 1e-4, rtol=1e-9)
+    size = np.linalg.norm(moved(place, Cause("target_shift", "smr3", 1.0), 3e-4), axis=-1)
+    assert np.all(size[:, :2] == 0.0)
+    after = size[:, 2] > 0.0
+    assert 0.3 <= after.mean() <= 0.7
+    assert np.all(np.diff(after.astype(int)) >= 0)
+    assert_allclose(size[after, 2], 3e-4, rtol=1e-9)
+
+
+def test_a_beam_under_a_weight_at_its_end_sags_as_the_textbook_says() -> None:
+    """One heavy point at the end of a level beam: slope F L^2 / 2EI, sag F L^3 / 3EI."""
+    place = world()
+    mdh = np.zeros((6, 5))
+    mdh[1] = [1.3, 0.0, 0.0, 0.0, 0.0]
+    mass = np.array([0.0, 0.0, 20.0, 0.0, 0.0, 0.0])
+    bare = dataclasses.replace(place.robot, mdh=mdh, mass=mass, com=np.zeros((6, 3)))
+    level = dataclasses.replace(place, robot=bare, q=np.zeros_like(place.q))
+    unit = LAWS["link_bending"](level, Cause("link_bending", "L2", 1.0), np.random.default_rng(0))
+    weight = 20.0 * gap_cases.G
+    assert_allclose(unit.links[:, 1, 5], -weight * 1.3**3 / 3.0, rtol=1e-12)
+    assert_allclose(unit.links[:, 1, 1], weight * 1.3**2 / 2.0, rtol=1e-12)
+    assert_allclose(unit.links[:, 1, [0, 2, 3, 4]], 0.0, atol=1e-9)
+
+
+def test_base_flex_tips_the_arm_towards_its_load() -> None:
+    place = world()
+    unit = LAWS["base_flex"](place, Cause("base_flex", "frame", 1.0), np.random.default_rng(0))
+    centres = gap_cases.centres(place.robot, gap_cases.frames(place.robot, place.q))
+    middle = np.einsum("mni,n->mi", centres, place.robot.mass)
+    motion = np.cross(unit.base[:, :3], place.robot.up)  # of the top
+    assert_allclose(motion[:, :2], gap_cases.G * middle[:, :2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_session_is_as_described(robot: str) -> None:
+    sealed = gap_cases.make(Case(robot, "test", (Cause("backlash", "J1", 50.0),), poses=60))
+    data = sealed.data
+    train = data.columns["split"] == "train"
+    assert train.sum() == 60 + gap_cases.REVISITS
+    assert (~train).sum() == gap_cases.HELD_OUT
+    assert_allclose(data.columns["order"], np.arange(data.poses))
+    assert np.all(np.diff(data.columns["time"]) > 15.0)
+    labels, counts = np.unique(data.columns["pose"], return_counts=True)
+    assert sorted(counts)[-gap_cases.REVISITS :] == [2] * gap_cases.REVISITS
+    assert len(labels) == 60 + gap_cases.HELD_OUT
+    for label in labels[counts == 2]:
+        assert np.ptp(data.q[data.columns["pose"] == label], axis=0).max() == 0.0
+        assert train[data.columns["pose"] == label].all()
+    assert np.all((data.q >= sealed.robot.lower) & (data.q <= sealed.robot.upper))
+    away = np.linalg.norm(data.y, axis=-1)
+    assert 0.3 < away.min() < away.max() < 7.0
+
+
+def test_the_robot_told_is_not_the_true_one() -> None:
+    sealed = gap_cases.make(Case("irb2600", "test"))
+    told, true = sealed.robot, sealed.true
+    assert_allclose(told.mdh, mc.load_robot("irb2600").mdh)
+    assert np.all(np.abs(true.mdh - told.mdh) > 0.0)
+    assert np.all(np.abs(true.mass / told.mass - 1.0) < 0.4)
+    assert np.std(true.mass / told.mass) > 0.03
+    off = np.linalg.norm(true.com - told.com, axis=1) / np.linalg.norm(told.com, axis=1)
+    assert_allclose(off, gap_cases.WRONG, rtol=1e-9)
+
+
+def test_noise_and_floor() -> None:
+    """Without effect, the true robot leaves the noise and jitter that the floor says."""
+    sums = []
+    for seed in range(5):
+        case = Case("irb2600", "none", seed=seed)
+        sealed = gap_cases.make(case)
+        place = gap_cases.world_of(case, np.random.default_rng(seed))
+        left = sealed.data.y - seen(place, place.robot, place.q, place.spots)
+        held = sealed.data.columns["split"] == "holdout"
+        sums.append(np.sum(left[held] ** 2, axis=-1).mean() / sealed.floor**2)
+    assert_allclose(np.mean(sums), 1.0, atol=0.1)
+
+
+def test_files_read_back_and_keep_the_secret_apart(tmp_path: Path) -> None:
+    causes = (Cause("joint_compliance", "J2", 100.0), Cause("gear_error", "J3", 60.0, 1))
+    sealed = gap_cases.make(Case("irb2600", "pair", causes, background=10.0, seed=9))
+    gap_cases.write(sealed, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"robot.json", "data.csv", "sealed"}
+    data = mc.read_measurements(tmp_path / gap_cases.DATA)
+    robot = mc.load_robot(tmp_path / gap_cases.ROBOT)
+    assert not data.notices
+    assert_allclose(data.y, sealed.data.y, rtol=0, atol=1e-9)
+    assert_allclose(data.q, sealed.data.q, rtol=0, atol=1e-9)
+    assert_allclose(robot.mass, sealed.robot.mass)
+    assert_allclose(robot.ratio, sealed.robot.ratio)
+    truth = gap_cases.open_seal(tmp_path)
+    assert truth.truth == (("joint_compliance", "J2"), ("gear_error", "J3"))
+    assert len(truth.background) == 6
+    assert_allclose(truth.displacement, sealed.displacement)
+    assert_allclose(truth.parts, sealed.parts)
+    assert_allclose(truth.powers, [100.0, 60.0], rtol=1e-6)
+
+
+def test_the_same_case_is_the_same_file() -> None:
+    case = Case("ur10e", "single", (Cause("tool_flex", "all", 50.0),), seed=3)
+    assert pickle.loads(pickle.dumps(case)) == case
+    first, second = gap_cases.make(case), gap_cases.make(case)
+    assert np.array_equal(first.data.y, second.data.y)
+    other = gap_cases.make(dataclasses.replace(case, seed=4))
+    assert not np.array_equal(first.data.q, other.data.q)
+
+
+# ---- scoring ---------------------------------------------------------------------------------
+
+
+def truth_of(*names: tuple[str, str], power: float = 100.0, **more: object) -> Truth:
+    none = np.zeros((len(names), 3, 1, 3))
+    fields: dict[str, object] = dict(
+        truth=names, background=(), displacement=none.sum(0), parts=none,
+        powers=(power,) * len(names), power=power, amplitudes=(), floor=4e-5,
+    )  # fmt: skip
+    return Truth(**(fields | more))  # type: ignore[arg-type]
+
+
+def answer(verdict: str, *names: tuple[str, str], also: tuple[tuple[str, str], ...] = ()) -> dict:
+    effects = [
+        {
+            "effect": effect,
+            "place": place,
+            "alternatives": [{"effect": e, "place": p, "rho2": 0.9} for e, p in also],
+        }
+        for effect, place in names
+    ]
+    gap = {"holdout_rms_mm": {"geometric": 0.06, "final": 0.041}, "noise_floor_mm": 0.04}
+    return {"verdict": verdict, "effects": effects, "gap": gap}
+
+
+J2, J3, ALL = ("gear_error", "J2"), ("gear_error", "J3"), ("gear_error", "all")
+GAIN = ("encoder_gain", "J2")
+
+
+@pytest.mark.parametrize(
+    ("said", "truth", "expected"),
+    [
+        (J2, J2, "exact"),
+        (J3, J2, "place"),
+        (ALL, J2, "broad"),
+        (J2, ALL, "broad"),
+        (GAIN, J2, "wrong"),
+        (("outliers", "smr1"), ("outliers", "all"), "exact"),
+    ],
+)
+def test_match(said: tuple[str, str], truth: tuple[str, str], expected: str) -> None:
+    assert blind_gap.match(said, truth) == expected
+
+
+def test_score_of_single_answers() -> None:
+    case = Case("irb2600", "single", (Cause("gear_error", "J2", 100.0),))
+    row = blind_gap.score(case, truth_of(J2), answer("named", J2))
+    assert (row["match"], row["in_set"], row["set_size"], row["sure"]) == ("exact", True, 1, True)
+    assert row["all_right"]
+    assert row["final_mm"] == 0.041
+    row = blind_gap.score(case, truth_of(J2), answer("one_of", GAIN, also=(J2, J3)))
+    assert (row["match"], row["in_set"], row["set_size"], row["sure"]) == ("wrong", True, 3, False)
+    assert (row["all_right"], row["all_in_sets"], row["strange"]) == (False, True, 1)
+    row = blind_gap.score(case, truth_of(J2), answer("unknown"))
+    assert (row["match"], row["in_set"], row["set_size"]) == ("", False, 0)
+    json.dumps(blind_gap.clean(row), allow_nan=False)
+
+
+def test_score_of_several_effects() -> None:
+    causes = (Cause("gear_error", "J2", 100.0), Cause("encoder_gain", "J2", 100.0))
+    case = Case("irb2600", "pair", causes)
+    truth = truth_of(J2, GAIN)
+    assert blind_gap.score(case, truth, answer("named", GAIN, J2))["all_right"]
+    assert not blind_gap.score(case, truth, answer("named", J2, J3))["all_right"]
+    assert not blind_gap.score(case, truth, answer("named", J2))["all_right"]
+    assert not blind_gap.score(case, truth, answer("named", J2, GAIN, J3))["all_right"]
+    # one answer cannot stand for two truths
+    assert not blind_gap.score(case, truth, answer("one_of", J2, also=(GAIN,)))["all_in_sets"]
+    assert blind_gap.score(case, truth, answer("one_of", J2, J3, also=(GAIN,)))["all_in_sets"]
+    small = truth_of(J2, background=(GAIN,))
+    assert blind_gap.score(case, small, answer("named", J2, GAIN, J3))["strange"] == 1
+
+
+def test_nearest_rival_is_not_the_truth_itself() -> None:
+    alike = {J2: 1.0, ALL: 0.99, J3: 0.2, GAIN: 0.8, ("backlash", "J1"): float("nan")}
+    assert blind_gap.nearest(J2, alike) == (GAIN, 0.8)
+    assert blind_gap.nearest(J2, {J2: 1.0}) == (("", ""), 0.0)
+
+
+def test_criteria_and_tables_of_made_up_rows() -> None:
+    def row(condition: str, said: dict, *names: tuple[str, str], **more: object) -> dict:
+        causes = tuple(Cause(effect, place, 100.0) for effect, place in names)
+        made = blind_gap.score(Case("irb2600", condition, causes), truth_of(*names), said)
+        return made | {"seconds": 0.1, "telling": 90.0, "rho2": 0.1} | more
+
+    rows = [
+        row("none", answer("none")),
+        row("none", answer("named", J2)),
+        row("single", answer("named", J2), J2, oracle_mm=0.04, known_mm=0.04),
+        row("single", answer("one_of", GAIN, also=(J2,)), J2, oracle_mm=0.01, known_mm=0.04),
+        row("single", answer("unknown"), GAIN, telling=3.0, rho2=0.97),
+        row("deleted", answer("named", GAIN), J2),
+        row("outside", answer("unknown"), ("outside_sum", "J2")),
+        row("pair", answer("named", J2, GAIN), GAIN, J2),
+    ]
+    criteria = blind_gap.criteria(rows)
+    table = blind_gap.headline(rows, criteria)
+    found = {str(line[0]).strip(): line for line in table.rows}
+    assert found["no effect: something named"][1:3] == (2, 50.0)
+    assert found["no effect: something named"][6] == "MISSED"
+    assert_allclose(found["one effect, lambda >= 50: truth in the set of the first"][2], 200 / 3)
+    assert found["first name right where lambda (1 - rho^2) >= 25"][1:3] == (2, 50.0)
+    assert found["true effect deleted: named for sure"][2] == 100.0
+    assert found["outside the library, lambda (1 - rho^2) >= 50: unknown"][6] == "met"
+    assert found["two effects exactly right, each lambda (1 - rho^2) >= 25"][2] == 100.0
+    assert found["one effect, lambda >= 50: mean size of the set"][2] == 1.5
+    assert found["median seconds of a diagnosis"][6] == "met"
+    reasons = [line[0] for line in blind_gap.misses(criteria).rows]
+    assert {"false alarm", "wrong name", "not close", "sure without the truth"} <= set(reasons)
+    for made in (blind_gap.verdicts, blind_gap.per_effect, blind_gap.detectability,
+                 blind_gap.shrink, blind_gap.confusion_table, blind_gap.troubles):  # fmt: skip
+        assert made(rows).text()
+    lines, columns, counts = blind_gap.confusion(rows)
+    assert lines == ("gear_error", "encoder_gain")
+    assert counts[0, columns.index("encoder_gain")] == 1
+    assert counts[1, columns.index("unknown")] == 1
+
+
+def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robot and data by path, in a folder that says nothing; then the seal is opened."""
+    given = []
+
+    class Answer:
+        def to_dict(self) -> dict:
+            return answer("named", GAIN)
+
+    def diagnose(robot: Path, data: Path, **options: object) -> Answer:
+        given.append((robot.name, data.name, options))
+        text = robot.read_text() + data.read_text().partition("\n")[0]
+        assert not any(word in text for word in ("encoder", "gain", "lambda", "truth"))
+        return Answer()
+
+    def resemblance(robot: mc.Robot, data: mc.Measurements, motion: Array) -> dict:
+        assert motion.shape == (3, data.poses, 3)
+        return {GAIN: 1.0, J2: 0.7}
+
+    monkeypatch.setattr(mc, "diagnose", diagnose, raising=False)
+    monkeypatch.setattr(blind_gap, "resemblance", resemblance)
+    case = Case("irb2600", "single", (Cause(*GAIN, 1000.0),), poses=60, seed=8)
+    row = blind_gap.run(case)
+    assert given == [("robot.json", "data.csv", {"seed": 8, "exclude": ()})]
+    assert row["trouble"] == ""
+    assert (row["match"], row["rho2"], row["rival"]) == ("exact", 0.7, list(J2))
+    assert_allclose(row["telling"], 300.0, rtol=1e-6)
+    assert_allclose(row["oracle_mm"], row["known_mm"], rtol=0.02)
+    assert_allclose(row["known_mm"], row["floor_mm"], rtol=0.2)
+
+
+def test_intervals_are_clopper_and_pearsons() -> None:
+    assert_allclose(blind_gap.interval(0, 100), [0.0, 1 - 0.025 ** (1 / 100)], atol=1e-12)
+    assert_allclose(blind_gap.interval(100, 100), [0.025 ** (1 / 100), 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [blind_gap.Size(), blind_gap.QUICK])
+def test_plan_covers_every_condition(size: blind_gap.Size) -> None:
+    cases = blind_gap.plan(1, size)
+    assert len({case.seed for case in cases}) == len(cases)
+    conditions = {case.condition for case in cases}
+    assert {"none", "single", "pair", "triple", "background"} <= conditions
+    assert {"outside", "deleted", "wrong_law", "fault"} <= conditions
+    single = {case.causes[0].law for case in cases if case.condition == "single"}
+    assert single == set(blind_gap.LIBRARY)
+    for case in cases:
+        for cause in case.causes:
+            assert cause.place in gap_cases.places(cause.law, case.robot)
+
+
+def test_sealed_fields_are_what_is_written() -> None:
+    names = {field.name for field in dataclasses.fields(Sealed)}
+    assert {field.name for field in dataclasses.fields(Truth)} <= names

@@ -1,0 +1,185 @@
+"""The comparison of methods: measures of error, splits, and what must hold between methods."""
+
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from conftest import SHARED, shared
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from experiments import methods
+from experiments.methods import (
+    FIGURES,
+    MINIMAX,
+    PARTS,
+    POSE,
+    SINGLE,
+    Job,
+    Outcome,
+    Studies,
+    figure_of,
+)
+from experiments.poses import (
+    euler_deviation,
+    exp,
+    lever,
+    orientation_error,
+    points,
+    pose,
+    poses_of,
+    position_error,
+    triangle,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.kinematics import hat
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Studies:
+    """The study without real data."""
+    return methods.run(quick=True, seed=1, folder=tmp_path_factory.mktemp("none"))
+
+
+def moved_triangle(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Corners, poses and corners at these poses."""
+    shape = triangle(rng.normal(size=(1, 3, 3)))
+    poses = exp(rng.normal(size=(30, 6)))
+    return shape, poses, points(poses, shape)
+
+
+def test_poses_of_a_triangle_are_recovered(rng: np.random.Generator) -> None:
+    shape, poses, y = moved_triangle(rng)
+    assert_allclose(triangle(y), shape, atol=1e-13)
+    assert_allclose(shape.mean(axis=0), 0.0, atol=1e-15)
+    assert_allclose(poses_of(shape, y), poses, atol=1e-13)
+
+
+def test_errors_of_known_poses(rng: np.random.Generator) -> None:
+    measured = exp(rng.normal(size=(30, 6)))
+    turn = rng.normal(size=(30, 3))
+    other = measured @ pose(Rotation.from_rotvec(turn).as_matrix(), np.tile([0.3, 0, 0.4], (30, 1)))
+    assert_allclose(orientation_error(measured, other), np.linalg.norm(turn, axis=1), atol=1e-12)
+    assert_allclose(position_error(measured, other), 0.5, atol=1e-14)
+
+
+def test_euler_angles_exaggerate_near_gimbal_lock() -> None:
+    def turned(a: float, b: float, c: float) -> Array:
+        turn = Rotation.from_euler("xyz", [a, b, c], degrees=True).as_matrix()
+        return pose(turn, np.zeros(3))[None]
+
+    assert_allclose(euler_deviation(turned(170, 5, 0), turned(-170, 2, 1)),
+                    np.radians([[20, 3, 1]]), atol=1e-12)  # fmt: skip
+    near = turned(40, 89.9, 0), turned(0, 89.9, -40)
+    assert orientation_error(*near)[0] < np.radians(0.1)
+    assert_allclose(euler_deviation(*near), np.radians([[40, 0, 40]]), atol=1e-9)
+
+
+def test_lever_weighs_an_angle_like_the_three_points(rng: np.random.Generator) -> None:
+    shape = triangle(rng.normal(size=(1, 3, 3)))
+    spread = sum(np.trace(hat(s).T @ hat(s)) for s in shape) / 3.0  # mean over axes of the turn
+    assert 3.0 * lever(shape) ** 2 == pytest.approx(spread, rel=1e-12)
+
+
+def test_sum_and_minimax_are_the_best_at_what_they_minimise(alone: Studies) -> None:
+    # all methods but the nominal one fit the same family of arms
+    _, results = alone[0]
+    best = figure_of(results["sum"], "AP RMSE", "training")
+    worst = figure_of(results[MINIMAX], "worst SMR", "training")
+    for name, outcomes in results.items():
+        assert all(outcome.status == "converged" for outcome in outcomes), name
+        assert figure_of(outcomes, "AP RMSE", "training") >= best * (1 - 1e-9), name
+        assert figure_of(outcomes, "worst SMR", "training") >= worst * (1 - 1e-3), name
+
+
+def test_poe_and_mdh_fit_one_smr_alike(alone: Studies) -> None:
+    _, results = alone[0]
+    for i, name in enumerate(SINGLE, start=1):
+        mdh, poe = results[name][0], results[f"POE SMR {i}"][0]
+        for part in PARTS:
+            assert_allclose(mdh.errors[part].distance, poe.errors[part].distance, rtol=0, atol=1e-8)
+
+
+def test_every_method_beats_the_nominal_one_held_out(alone: Studies) -> None:
+    _, results = alone[0]
+    for key in FIGURES:
+        values = {name: figure_of(each, key, "held out") for name, each in results.items()}
+        assert max(values, key=lambda name: values[name]) == "nominal"
+
+
+def test_absent_data_are_said_to_be_absent(alone: Studies) -> None:
+    text = "\n".join(table.text(200) for table in methods.tables(alone, []))
+    assert text.count("data absent") == 2 * 2  # title and row, for each real robot
+    assert list(methods.figures(alone)) == ["methods_1"]
+
+
+def test_training_never_stands_without_held_out(alone: Studies) -> None:
+    for table in methods.tables(alone, []):
+        for name in table.header:
+            if name.endswith("training"):
+                assert name.replace("training", "held out") in table.header
+
+
+def test_splits_part_the_poses() -> None:
+    shared("fanuc_r2000")
+    for case in methods.cases(quick=False):
+        joints = [methods.divided(case, split, 3, SHARED)[1:] for split in range(case.splits)]
+        for train, held in joints:
+            assert train.poses == case.train
+            both = np.concatenate([train.q, held.q])
+            assert len(np.unique(both, axis=0)) == len(both)
+        if case.folds:
+            every = np.concatenate([held.q for _, held in joints])
+            assert len(np.unique(every, axis=0)) == len(every) == train.poses + held.poses
+
+
+def test_real_robots_improve_held_out() -> None:
+    shared("irb120")
+    case = methods.cases(quick=True)[1]
+    outcomes = {
+        name: [methods.outcome_of(Job(case, 0, name, 0, SHARED))]
+        for name in ("nominal", "POE pose", "MDH pose", "sum")
+    }
+    error = {name: figure_of(each, "AP RMSE", "held out") for name, each in outcomes.items()}
+    assert 0.7 < error["nominal"] < 1.1  # [mm]
+    assert error["POE pose"] == pytest.approx(error["MDH pose"], rel=1e-6)
+    assert max(error["MDH pose"], error["sum"]) < 0.4
+    assert len(pickle.dumps(outcomes)) > 0  # so that a sweep may keep them
+
+
+def test_weights_are_swept_for_each_case(alone: Studies, tmp_path: Path) -> None:
+    case, results = alone[0]
+    asked: list[float] = []
+
+    def sweep(function: Callable[[Job], Outcome], jobs: Sequence[Job]) -> list[Outcome]:
+        asked.extend(job.length for job in jobs)
+        return [results[POSE][0] for _ in jobs]
+
+    found = methods.run_weights(quick=True, seed=1, folder=tmp_path, sweep=sweep)
+    assert_allclose(asked, [np.nan, *methods.LENGTHS])
+    assert [(each.label, len(outcomes)) for each, _, outcomes in found] == [(case.label, 1)] * 7
+
+
+def test_a_heavier_weight_favours_orientation(alone: Studies, tmp_path: Path) -> None:
+    case, results = alone[0]
+    heavy = [methods.outcome_of(Job(case, 0, POSE, 1, tmp_path, length=3.0))]
+    for key, sense in (("AO' RMSE", -1.0), ("AP RMSE", 1.0)):
+        change = figure_of(heavy, key, "training") - figure_of(results[POSE], key, "training")
+        assert sense * change > 0.0
+
+
+def test_command(alone: Studies, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case, results = alone[0]
+    monkeypatch.setattr(methods, "run", lambda *_: alone)
+    monkeypatch.setattr(methods, "run_weights", lambda *_: [(case, np.nan, results[POSE])])
+    out, figures = tmp_path / "out", tmp_path / "figures.json"
+    options = ["--quick", "--data", str(tmp_path), "--out", str(out), "--json", str(figures)]
+    done = CliRunner().invoke(methods.main, options)
+    assert done.exit_code == 0, done.output
+    assert "data absent" in done.output
+    for name in ("methods.md", "methods.tex", "methods_1.csv", "methods_1.png", "methods_1.svg"):
+        assert (out / name).exists()
+    assert '"schema": 1' in figures.read_text()

@@ -1,0 +1,434 @@
+import hashlib
+import importlib.util
+import json
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from experiments import __main__ as studies
+from experiments import sweep as module
+from experiments.index import tables_of
+from experiments.record import save_figure, save_json, save_tables
+from experiments.sweep import Study, study_options, sweep
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Table
+
+HERE = Path(__file__).parent  # which workers import too, where there is no conftest
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), str(HERE)])}
+
+
+@dataclass(frozen=True)
+class Job:
+    seed: int
+    log: str = ""
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Found:
+    seed: int
+    values: np.ndarray
+    process: int
+
+
+def work(job: Job) -> Found:
+    """Numbers that depend on the job alone; later jobs are faster, so they finish out of order."""
+    time.sleep(job.seconds or 0.01 * (5 - job.seed % 5))
+    if job.log:
+        with Path(job.log).open("a") as stream:
+            stream.write(f"{job.seed}\n")
+    matrix = np.random.default_rng(job.seed).normal(size=(20, 20))
+    return Found(job.seed, np.linalg.svd(matrix)[1], os.getpid())
+
+
+def kill_worker(job: int) -> int:
+    if job == 1:
+        os._exit(9)
+    return job
+
+
+def missing(job: int) -> int:
+    raise ModuleNotFoundError(f"no extra for {job}")
+
+
+JOBS = [Job(seed) for seed in range(12)]
+
+
+def same(left: list[Found], right: list[Found]) -> bool:
+    """Equal to the last bit and in the same order."""
+    pairs = zip(left, right, strict=True)
+    return all(a.seed == b.seed and a.values.tobytes() == b.values.tobytes() for a, b in pairs)
+
+
+@pytest.fixture(scope="module")
+def expected() -> list[Found]:
+    return [work(job) for job in JOBS]
+
+
+# ---- on this machine -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_results_in_the_order_of_the_jobs(
+    processes: int, expected: list[Found], tmp_path: Path
+) -> None:
+    found = sweep(work, JOBS, name="order", jobs_in_parallel=processes, folder=tmp_path)
+    assert same(found, expected)
+    assert (os.getpid() in {each.process for each in found}) == (processes == 1)
+
+
+def test_kept_results_are_used_unless_fresh(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log"
+    jobs = [Job(seed, str(log)) for seed in range(4)]
+    one = dict(name="kept", jobs_in_parallel=1, folder=tmp_path)
+    first = sweep(work, jobs[:3], **one)
+    again = sweep(work, jobs, **one)
+    assert same(again[:3], first)
+    assert log.read_text().split() == ["0", "1", "2", "3"]
+    assert "3 of 4 parts were kept" in capsys.readouterr().err
+    sweep(work, jobs, fresh=True, **one)
+    assert len(log.read_text().split()) == 8
+
+
+def test_damaged_parts_are_computed_again(expected: list[Found], tmp_path: Path) -> None:
+    one = dict(name="damage", jobs_in_parallel=1, folder=tmp_path)
+    sweep(work, JOBS, **one)
+    paths = sorted((tmp_path / "damage").iterdir())
+    assert len(paths) == len(JOBS)
+    paths[0].write_bytes(b"")
+    paths[1].write_bytes(paths[1].read_bytes()[:-7])
+    flipped = bytearray(paths[2].read_bytes())
+    flipped[-20] ^= 1
+    paths[2].write_bytes(bytes(flipped))
+    nonsense = b"not a pickle"
+    paths[3].write_bytes(hashlib.sha256(nonsense).hexdigest().encode() + b"\n" + nonsense)
+    gone = pickle.dumps(Found(0, np.zeros(1), 0)).replace(b"Found", b"Gonee")
+    paths[4].write_bytes(hashlib.sha256(gone).hexdigest().encode() + b"\n" + gone)
+    assert [len(module.read_part(path)) for path in paths[:6]] == [0, 0, 0, 0, 0, 1]
+    assert same(sweep(work, JOBS, **one), expected)
+    assert all(module.read_part(path) for path in paths)
+
+
+def test_a_key_names_all_that_a_result_depends_on() -> None:
+    keys = {
+        module.key(name, function, job, code)
+        for name in ("a", "b")
+        for function in (work, kill_worker)
+        for job in (Job(0), Job(1))
+        for code in ("x", "y")
+    }
+    assert len(keys) == 16
+    assert module.key("a", work, Job(0), "x") == module.key("a", work, Job(0), "x")
+
+
+def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path: Path) -> None:
+    for name, text in {
+        "study": "from pkg.helper import f\nimport numpy.linalg",
+        "helper": "def f():\n    from pkg import deeper",
+        "deeper": "",
+        "other": "",
+        "record": "",
+    }.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    found = [path.stem for path in module.study_files(tmp_path / "study.py")]
+    assert found == ["deeper", "helper", "study"]
+
+
+SCRIPT = """
+import signal
+import sys
+from pathlib import Path
+from experiments.sweep import sweep
+from test_sweep import Job, work
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which background jobs may ignore
+folder = Path(sys.argv[1])
+jobs = [Job(seed, str(folder / "log"), 0.15) for seed in range(20)]
+sweep(work, jobs, name="interrupted", jobs_in_parallel=2, folder=folder)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a signal")
+def test_an_interrupted_sweep_resumes(tmp_path: Path) -> None:
+    child = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)],
+        env=ENVIRONMENT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(lambda: len(list(tmp_path.glob("interrupted/*.part"))) >= 4)
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate(timeout=20)
+    assert child.returncode != 0
+    kept = len(list(tmp_path.glob("interrupted/*.part")))
+    assert 4 <= kept < 20
+    assert f"{kept} of 20 parts are kept" in said
+    log = tmp_path / "log"
+    log.unlink()
+    jobs = [Job(seed, str(log), 0.15) for seed in range(20)]
+    found = sweep(work, jobs, name="interrupted", jobs_in_parallel=2, folder=tmp_path)
+    assert len(log.read_text().split()) == 20 - kept
+    assert same(found, [work(Job(seed)) for seed in range(20)])
+
+
+def test_functions_and_options_that_cannot_work(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="top of a module"):
+        sweep(lambda job: job, [1], name="lambda", folder=tmp_path)
+    with pytest.raises(OptionError, match="--jobs 0"):
+        sweep(work, JOBS, name="none", jobs_in_parallel=0, folder=tmp_path)
+    assert sweep(work, [], name="empty", folder=tmp_path) == []
+
+
+# ---- on a cluster ----------------------------------------------------------------------------
+
+
+def wait_for(ready: Any, seconds: float = 30.0) -> None:
+    until = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A real Dask scheduler and two worker processes on loopback."""
+    if importlib.util.find_spec("distributed") is None:
+        pytest.skip("distributed is not installed: pip install 'minimax-cal[distributed]'")
+    folder = tmp_path_factory.mktemp("cluster")
+    file, log = folder / "scheduler.json", (folder / "log").open("w")
+    dask = [sys.executable, "-m", "dask"]
+    settings = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    place = dict(env=ENVIRONMENT | settings, cwd=folder, stdout=log, stderr=log)
+    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    running = [
+        subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", str(file)], **place)
+    ]
+    try:
+        wait_for(file.exists)
+        address = json.loads(file.read_text())["address"]
+        size = ["--nworkers", "2", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0"]
+        running += [subprocess.Popen([*dask, "worker", address, *size], **place)]
+        yield address
+    finally:
+        for process in reversed(running):  # workers first: they sign off at the scheduler
+            process.terminate()
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        log.close()
+
+
+def test_a_cluster_gives_the_same_results(
+    cluster: str, expected: list[Found], tmp_path: Path
+) -> None:
+    found = sweep(work, JOBS, name="dask", cluster=cluster, folder=tmp_path)
+    assert same(found, expected)
+    processes = {each.process for each in found}
+    assert len(processes) == 2
+    assert os.getpid() not in processes
+    again = sweep(work, JOBS, name="dask", folder=tmp_path)  # kept: no matter where it ran
+    assert same(again, expected)
+    assert {each.process for each in again} == processes
+
+
+def test_a_cluster_with_other_code_is_refused(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "fingerprint", lambda function: "other")
+    with pytest.raises(OptionError, match="other code"):
+        sweep(work, JOBS, name="other", cluster=cluster, folder=tmp_path)
+
+
+def test_a_cluster_without_the_study_is_refused(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "only_here.py").write_text("def work(job):\n    return job\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import only_here
+
+    with pytest.raises(OptionError, match="no module 'only_here'"):
+        sweep(only_here.work, [1, 2], name="lost", cluster=cluster, folder=tmp_path)
+
+
+def test_errors_of_a_job_come_back_from_a_cluster(cluster: str, tmp_path: Path) -> None:
+    with pytest.raises(ModuleNotFoundError, match="no extra for"):
+        sweep(missing, [1, 2], name="error", cluster=cluster, folder=tmp_path)
+
+
+def test_a_job_that_kills_its_worker_ends_the_sweep(cluster: str, tmp_path: Path) -> None:
+    with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
+        sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
+
+
+@click.command()
+@study_options("toy")
+@click.option("--more", default=1)
+def toy(study: Study, more: int) -> None:
+    click.echo(f"{study} {more}")
+    study.sweep(work, JOBS[:2])
+
+
+def run_toy(*arguments: str) -> Result:
+    return CliRunner().invoke(toy, arguments)
+
+
+def test_nobody_at_the_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "PATIENCE", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # it listens, but never says a word
+        port = silent.getsockname()[1]
+        for address in (f"tcp://127.0.0.1:{port}", "nonsense", "tcp://127.0.0.1:1"):
+            began = time.monotonic()
+            result = run_toy("--cluster", address)
+            assert time.monotonic() - began < 5
+            assert result.exit_code == 2
+            line = result.stderr.splitlines()[-1]
+            assert line.startswith(f"error: no Dask scheduler at {address!r}")
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "options"),
+    [("distributed", "distributed", ["--cluster", "tcp://h:1"]), ("joblib", "experiments", [])],
+)
+def test_a_missing_package_is_named(
+    package: str,
+    extra: str,
+    options: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    result = run_toy(*options)
+    assert result.exit_code == 2
+    assert f"pip install 'minimax-cal[{extra}]'" in result.stderr.splitlines()[-1]
+
+
+# ---- all studies -----------------------------------------------------------------------------
+
+
+def test_options_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run_toy("--quick", "--seed", "3", "--jobs", "1", "--json", "x.json", "--more", "2")
+    assert result.exit_code == 0, result.stderr
+    path = Path("x.json")
+    study = Study("toy", True, path, Path("results/toy"), 3, 1, "", False)
+    assert result.stdout.strip() == f"{study} 2"
+    assert len(list(tmp_path.glob("results/cache/toy/*.part"))) == 2
+
+
+HOSTILE = "<script>alert('x')</script> & \"quoted\" | bar"
+
+
+def fake(name: str, monkeypatch: pytest.MonkeyPatch, body: Any) -> None:
+    """A module with a command `main` that does body(study)."""
+    made = ModuleType(name)
+    made.main = click.command()(study_options(name)(body))
+    monkeypatch.setitem(sys.modules, name, made)
+
+
+def good(study: Study) -> None:
+    from matplotlib.figure import Figure
+
+    table = Table(HOSTILE, ("what", HOSTILE), ((HOSTILE, 1.5), ("b", 2.0)), ("", ".2f"))
+    save_tables(study.out, study.name, [table])
+    figure = Figure(figsize=(1, 1))
+    figure.subplots()
+    save_figure(study.out, "a picture", figure)
+    assert study.json
+    save_json(study.json, {"seed": study.seed, "quick": study.quick})
+
+
+def bad(study: Study) -> None:
+    raise ValueError(HOSTILE)
+
+
+def test_all_studies_make_one_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake("fake_bad", monkeypatch, bad)
+    fake("fake_good", monkeypatch, good)
+    table = {
+        "bad": ("fake_bad", HOSTILE),
+        "good": ("fake_good", "All is well"),
+        "later": ("experiments.not_there_yet", "Later"),
+    }
+    monkeypatch.setattr(studies, "STUDIES", table)
+    out, numbers = tmp_path / "out", tmp_path / "all.json"
+    (out / "good").mkdir(parents=True)
+    (out / "good" / "old_1.csv").write_text("of an earlier run")
+    (out / "good" / "old.md").write_text("**old**\n\n| stale |\n| --- |\n| stale |\n")
+    options = ["--quick", "--seed", "7", "--out", str(out), "--json", str(numbers)]
+    result = CliRunner().invoke(studies.everything, options)
+    assert result.exit_code == 1
+    assert result.stderr.splitlines()[-1] == "Error: failed: bad"
+    assert "later skipped" in result.stderr
+    page = (out / "index.html").read_text()
+    assert "<script" not in page
+    assert "ValueError: &lt;script&gt;" in page
+    assert "stale" not in page
+    assert "old_1.csv" not in page
+    assert '<td class="right">1.50</td>' in page
+    assert "python -m experiments all --quick --seed 7" in page
+    for url in ("a%20picture.png", "a%20picture.svg", "fake_good_1.csv", "fake_good.tex"):
+        assert f'"good/{url}"' in page
+    assert "http" not in page
+    assert str(tmp_path) not in page
+    found = json.loads(numbers.read_text())["studies"]
+    assert [found[name]["status"] for name in table] == ["failed", "done", "skipped"]
+    assert found["good"]["numbers"] == {"schema": 1, "seed": 7, "quick": True}
+    CliRunner().invoke(studies.everything, options)
+    assert (out / "index.html").read_text() == page
+
+
+def test_tables_survive_markdown() -> None:
+    table = Table("t | t", ("a|b", "n"), (("x | y", 1.0), ("", 2.0)), ("", ".1f"))
+    (found,) = tables_of(table.markdown())
+    assert (found.title, found.header, found.right) == ("t | t", table.header, (False, True))
+    assert [list(row) for row in found.rows] == table.cells()
+    assert tables_of("no table\n| lonely |\n") == []
+
+
+def test_studies_are_listed_and_run_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    studies.main([])
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in studies.STUDIES)
+    with pytest.raises(SystemExit) as ended:
+        studies.main(["speeed"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("error: no study 'speeed'")
+    fake("fake_good", monkeypatch, good)
+    monkeypatch.setattr(studies, "STUDIES", {"good": ("fake_good", "")})
+    with pytest.raises(SystemExit) as ended:
+        studies.main(["good", "--out", str(tmp_path), "--json", str(tmp_path / "good.json")])
+    assert ended.value.code == 0
+    assert (tmp_path / "fake_good.md").exists()
+
+
+def test_a_study_starts_under_its_own_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = ModuleType("experiments.fake_study")
+    seen: list[str] = []
+    made.main = lambda prog_name: seen.append(prog_name)
+    monkeypatch.setitem(sys.modules, made.__name__, made)
+    module.start("/somewhere/experiments/fake_study.py")
+    assert seen == ["python -m experiments.fake_study"]

@@ -1,0 +1,223 @@
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import identified, solve
+
+import minimax_cal as mc
+from experiments.worst_point import Case, by_cones, by_cvxpy, by_sqp, linear_optimum
+from minimax_cal.fitting.certificate import PointCones, certify
+from minimax_cal.fitting.minimax_problem import Distances, Worst, measured_distances, worst_of
+from minimax_cal.modelling.model import Model, Prior
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import Simulation, simulate
+from minimax_cal.solvers import cones, minimax
+from minimax_cal.solvers.minimax import Optimum, Sqp
+from minimax_cal.solvers.status import Status
+from qp_backends import solve as solve_qp
+
+QP = partial(solve_qp, name="daqp", tolerance=1e-10)
+
+
+@dataclass(frozen=True)
+class Setup:
+    data: mc.Measurements
+    model: Model
+    start: State
+    distances: Distances
+    form: str = "two-sided"
+
+    @property
+    def worst(self) -> Worst:
+        return worst_of(self.model, self.start, self.distances, self.form, "point")
+
+    @property
+    def case(self) -> Case:
+        return Case(self.data, self.start, self.worst)
+
+    def sqp(self, **settings: object) -> Optimum[State]:
+        return minimax.solve(self.worst, self.start, QP, Sqp(**settings))  # type: ignore[arg-type]
+
+
+def setup(robot: mc.Robot, data: mc.Measurements) -> Setup:
+    model, begin = identified(robot, data)
+    start = solve(model, begin).x.take(np.array(0))
+    return Setup(data, model, start, measured_distances(data))
+
+
+def plain(robot: mc.Robot, noisy: Simulation) -> Setup:
+    return setup(robot, noisy.data)
+
+
+def bound_by_distances(robot: mc.Robot, noisy: Simulation) -> Setup:
+    """Distances that disagree with the points by 50 um bind."""
+    here = setup(robot, noisy.data)
+    measured = measured_distances(noisy.data, 1e-6)
+    off = np.array([5e-5, -5e-5, 0.0])
+    return replace(here, distances=replace(measured, mean=measured.mean + off))
+
+
+def one_target(robot: mc.Robot, noisy: Simulation) -> Setup:
+    return setup(robot, noisy.data.only(0))
+
+
+def missing(robot: mc.Robot, noisy: Simulation) -> Setup:
+    gone = np.random.default_rng(2).uniform(size=(60, 3)) < 0.3
+    gone[:, 0] &= ~(gone[:, 1] & gone[:, 2])
+    y = np.where(gone[..., None], np.nan, noisy.data.y)
+    return setup(robot, noisy.data.with_y(y))
+
+
+def weighted(robot: mc.Robot, noisy: Simulation) -> Setup:
+    u95 = np.random.default_rng(4).uniform(1e-5, 4e-5, 60)
+    return setup(robot, replace(noisy.data, columns={**noisy.data.columns, "u95": u95}))
+
+
+def with_prior(robot: mc.Robot, noisy: Simulation) -> Setup:
+    here = setup(robot, noisy.data)
+    weight = np.zeros(here.model.names.count)
+    weight[[1, 2, 8]] = 0.3, 0.3, 0.5  # a2, a3, d3: as if known to about a noise length
+    return replace(here, model=here.model.with_prior(Prior(here.model.prior.mean, weight)))
+
+
+CASES = {
+    name.__name__: name
+    for name in (plain, bound_by_distances, one_target, missing, weighted, with_prior)
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+    here = CASES[name](robot, noisy)
+    problem, rng = PointCones.of(here.worst), np.random.default_rng(0)
+    at = problem.step(here.start, rng.normal(size=len(problem.white)))
+    rows, step = problem.linearise(at), 1e-4
+    for _ in range(3):
+        e = rng.normal(size=len(problem.white))
+        plus, minus = (problem.linearise(problem.step(at, sign * step * e)) for sign in (1, -1))
+        # errors are told in base axes, which a step may turn: only their lengths are compared
+        slope = (plus.norms - minus.norms) / (2 * step)
+        along = np.einsum("nw,nwp,p->n", rows.r, rows.J, e) / rows.norms
+        assert_allclose(along, slope, rtol=1e-6, atol=1e-6)
+        assert_allclose(rows.C @ e, (plus.c - minus.c) / (2 * step), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_norms_are_the_sqps_functions(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+    here = CASES[name](robot, noisy)
+    rows = PointCones.of(here.worst).linearise(here.start)
+    f, c = here.worst.evaluate(here.start)
+    assert_allclose(rows.norms**2, f, rtol=1e-12)
+    assert_allclose(rows.c, c, rtol=1e-12)
+    # whitened: the mean of J'J is the identity
+    assert_allclose(np.einsum("nwp,nwq->pq", rows.J, rows.J) / len(f), np.eye(rows.J.shape[2]),
+                    atol=1e-8)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_three_ways_end_at_the_same_value(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+    """SQP on squares, our cone programs, and cone programs stated for cvxpy."""
+    here = CASES[name](robot, noisy)
+    values = [way(here.case) for way in (by_sqp, by_cones, by_cvxpy)]
+    assert_allclose(values, values[-1], rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_certificate_closes_at_an_optimum(
+    name: str, robot: mc.Robot, noisy: Simulation
+) -> None:
+    here = CASES[name](robot, noisy)
+    best = here.sqp()
+    proof = certify(here.worst, best, here.data.line)
+    assert best.status is Status.CONVERGED
+    assert abs(proof.gap) < 1e-8
+    assert proof.kkt.residual < 1e-7
+    # the bound is right: the linearised problem's optimum by cvxpy is not below it
+    problem = PointCones.of(here.worst)
+    rows = problem.linearise(best.x)
+    _, optimum = linear_optimum(rows, problem.lower, problem.upper)
+    assert proof.bound <= optimum * np.sqrt(here.worst.size) * (1 + 1e-8)
+    assert_allclose(proof.bound, optimum * np.sqrt(here.worst.size), rtol=1e-7)
+    assert_allclose(proof.multiplier.sum(), 1.0, rtol=1e-6)
+    # distances that bind do so with a multiplier
+    if name == "bound_by_distances":
+        assert np.abs(best.lam).max() > 0.0
+        assert np.abs(rows.c).max() > 1.0 - 1e-7
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_certificate_is_open_elsewhere(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+    here = CASES[name](robot, noisy)
+    early = here.sqp(iterations=1)
+    proof = certify(here.worst, early, here.data.line)
+    assert early.status is Status.ITERATION_LIMIT
+    assert proof.gap > 1e-2
+    assert proof.bound < certify(here.worst, here.sqp(), here.data.line).value
+
+
+def test_the_points_that_decide_are_named(robot: mc.Robot, noisy: Simulation) -> None:
+    here = missing(robot, noisy)
+    data = replace(here.data, line=here.data.line + 100)
+    best = here.sqp()
+    proof = certify(here.worst, best, data.line)
+    error = here.model.error(best.x)
+    distance = np.linalg.norm(error, axis=-1)
+    assert_allclose(proof.value, np.nanmax(distance), rtol=1e-12)
+    assert_allclose(proof.distance, proof.value, rtol=1e-6)  # every active point is a largest one
+    for target, line, size in zip(proof.target, proof.line, proof.distance, strict=True):
+        pose = int(np.flatnonzero(data.line == line)[0])
+        assert_allclose(size, distance[data.targets.index(target), pose], rtol=1e-12)
+    assert np.all(np.diff(proof.multiplier) <= 0)
+    assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.line)
+    text = proof.table().text()
+    assert f"{1e3 * proof.value:.4f} mm" in text
+    content = proof.to_dict()
+    assert content["points"][0]["line"] == proof.line[0]
+    assert_allclose(content["value_mm"], 1e3 * proof.value)
+
+
+def test_weights_count_in_the_value_and_not_in_the_distances(
+    robot: mc.Robot, noisy: Simulation
+) -> None:
+    here = weighted(robot, noisy)
+    best = here.sqp()
+    proof = certify(here.worst, best, here.data.line)
+    weight = here.model.weight[
+        [here.data.targets.index(name) for name in proof.target],
+        [int(np.flatnonzero(here.data.line == line)[0]) for line in proof.line],
+    ]
+    assert np.ptp(proof.distance) > 1e-5
+    assert_allclose(np.sqrt(weight) * proof.distance, proof.value, rtol=1e-6)
+
+
+def test_a_certificate_does_not_depend_on_the_scaling(robot: mc.Robot, noisy: Simulation) -> None:
+    """The problem may be scaled at the answer instead of the start: the multipliers follow."""
+    here = bound_by_distances(robot, noisy)
+    best = here.sqp()
+    again = replace(here, start=best.x).worst
+    one, two = (certify(problem, best, here.data.line) for problem in (here.worst, again))
+    assert again.size != here.worst.size
+    assert_allclose(two.value, one.value, rtol=1e-12)
+    assert abs(two.gap) < 1e-8
+    assert_allclose(two.multiplier, one.multiplier, rtol=1e-6)
+
+
+def test_cones_find_their_way_from_the_nominal_arm(robot: mc.Robot, noisy: Simulation) -> None:
+    """Errors of millimetres, not of the fit: the trust region and several programs are needed."""
+    model, begin = identified(robot, noisy.data)
+    here = Setup(noisy.data, model, begin, measured_distances(noisy.data))
+    found = cones.solve(PointCones.of(here.worst), begin)
+    assert found.status is Status.CONVERGED
+    reference = by_sqp(plain(robot, noisy).case)
+    assert_allclose(found.value * np.sqrt(here.worst.size), reference, rtol=1e-8)
+
+
+def test_thousands_of_points(robot: mc.Robot) -> None:
+    """3000 points take the SQP no more programs than 300 do, and its answer is certified."""
+    few, many = (setup(robot, simulate(robot, poses, 3, seed=1).data) for poses in (100, 1000))
+    assert many.sqp().iterations <= few.sqp().iterations + 3
+    proof = certify(many.worst, many.sqp(), many.data.line)
+    assert abs(proof.gap) < 1e-8
+    assert_allclose(by_cones(many.case), proof.value, rtol=1e-8)

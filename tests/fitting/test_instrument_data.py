@@ -1,0 +1,228 @@
+"""Files of lengths, closures and poses: read as meant, or one line says why not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.fitting.instruments import (
+    RelativeData,
+    closures,
+    distances,
+    flange_poses,
+    read_relative,
+    write_relative,
+)
+
+JOINTS = "q1_rad,q2_rad,q3_rad"
+
+
+def poses(count: int, rng: np.random.Generator) -> np.ndarray:
+    out = np.tile(np.eye(4), (count, 1, 1))
+    out[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    out[:, :3, 3] = rng.normal(size=(count, 3))
+    return out
+
+
+def examples(rng: np.random.Generator) -> dict[str, RelativeData]:
+    q = rng.uniform(-2, 2, (12, 3))
+    length = rng.uniform(0.5, 2, (12, 2))
+    length[0, 1] = length[3, 0] = np.nan
+    socket = np.array(["A", "B", "plate 3"] * 4)
+    return {
+        "distances": distances(q, length, order=np.arange(12)),
+        "closures": closures(q, socket, split=np.array(["train", "holdout"] * 6)),
+        "poses": flange_poses(
+            q, poses(12, rng), u95=np.full(12, 2e-5), rotation_u95=np.full(12, 2e-4)
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", ["distances", "closures", "poses"])
+def test_what_is_written_is_read_back(kind: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    data, path = examples(rng)[kind], tmp_path / "data.csv"
+    write_relative(path, data)
+    found = read_relative(path)
+    assert found.kind == kind
+    assert found.wires == data.wires
+    assert found.at.notices == ()
+    assert found.at.line.tolist() == list(range(2, 14))
+    # nine decimals of radians and millimetres
+    assert_allclose(found.at.q, data.at.q, rtol=0, atol=1e-9)
+    assert_allclose(found.length, data.length, rtol=0, atol=1e-12)
+    assert_allclose(found.pose, data.pose, rtol=0, atol=2e-9)
+    assert found.socket.tolist() == data.socket.tolist()
+    assert set(found.at.columns) == set(data.at.columns)
+    for name, column in data.at.columns.items():
+        if column.dtype.kind == "U":
+            assert found.at.columns[name].tolist() == column.tolist()
+        else:
+            assert_allclose(found.at.columns[name], column, rtol=0, atol=1e-9)
+
+
+def test_slides_and_degrees_and_metres(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    rows = [f"{10 * i},{100 + i},{1.5 + 0.01 * i}" for i in range(6)]
+    path.write_text("\n".join(["q1_deg,q2_mm,wire3_m", *rows]))
+    found = read_relative(path)
+    assert found.wires == ("wire3",)
+    assert found.at.sliding.tolist() == [False, True]
+    assert_allclose(found.at.q[5], [np.radians(50), 0.105], rtol=1e-14)
+    assert_allclose(found.length[:, 0], 1.5 + 0.01 * np.arange(6), rtol=1e-14)
+
+
+def test_quaternions_and_rotation_vectors_are_the_same_poses(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    turn = Rotation.random(5, rng=rng)
+    place = rng.normal(size=(5, 3))
+    sign = np.array([1, -1, 1, -1, 1])  # q and -q are the same turn
+    files = {
+        "rx_deg,ry_deg,rz_deg": np.degrees(turn.as_rotvec()),
+        "qw,qx,qy,qz": sign[:, None] * turn.as_quat(scalar_first=True),
+    }
+    for names, values in files.items():
+        header = [f"flange_{name}" for name in ("x_m", "y_m", "z_m", *names.split(","))]
+        path = tmp_path / "data.csv"
+        lines = [
+            ",".join(map(repr, map(float, (i, 2 * i, *place[i], *values[i])))) for i in range(5)
+        ]
+        path.write_text("\n".join([",".join(["q1_rad", "q2_rad", *header]), *lines]))
+        found = read_relative(path)
+        assert_allclose(found.pose[:, :3, :3], turn.as_matrix(), rtol=0, atol=1e-14)
+        assert_allclose(found.pose[:, :3, 3], place, rtol=0, atol=1e-15)
+
+
+def test_rows_without_a_measurement_are_left_out_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    rows = [f"{i / 10},0,0,{500 + i}" for i in range(6)] + ["0.7,0,0,"]
+    path.write_text("\n".join([f"{JOINTS},wire1_mm", *rows]))
+    found = read_relative(path)
+    assert found.poses == 6
+    assert found.at.notices == (f"{path}: 1 rows hold nothing measured and are left out",)
+
+
+def test_columns_that_nothing_uses_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    rows = [f"{i / 10},0,0,{500 + i},7,0.02" for i in range(6)]
+    path.write_text("\n".join([f"{JOINTS},wire1_mm,operator,u95_mm", *rows]))
+    notices = read_relative(path).at.notices
+    assert notices == (
+        f"{path}: column operator is not used",
+        f"{path}: column u95_mm is not used",
+    )
+
+
+GOOD = {
+    "wire1_mm": [f"{500 + i}" for i in range(6)],
+    "socket": ["A", "A", "A", "B", "B", "B"],
+    "flange_x_mm,flange_y_mm,flange_z_mm,flange_rx_rad,flange_ry_rad,flange_rz_rad": [
+        f"{i},2,3,0.1,0.2,0.3" for i in range(6)
+    ],
+    "flange_x_mm,flange_y_mm,flange_z_mm,flange_qw,flange_qx,flange_qy,flange_qz": [
+        f"{i},2,3,1,0,0,0" for i in range(6)
+    ],
+}
+WIRE, SOCKET, VECTOR, QUATERNION = GOOD
+
+
+def changed(header: str, row: int, text: str) -> list[str]:
+    return [text if i == row else cell for i, cell in enumerate(GOOD[header])]
+
+
+@pytest.mark.parametrize(
+    ("header", "cells", "place", "words"),
+    [
+        ("weight_kg", ["1"] * 6, ":1:", "no measured columns; name them wire1_mm"),
+        ("smr1_x_mm,smr1_y_mm,smr1_z_mm", ["1,2,3"] * 6, ":1:", "use minimax-cal calibrate"),
+        ("wire1_cm", ["1"] * 6, ":1:", "column wire1_cm is not understood; write wire1_mm"),
+        ("wire1_mm,wire1_m", ["1,1"] * 6, ":1:", "wire1 has two columns"),
+        ("wire1_mm,socket", ["1,A"] * 6, ":1:", "columns wire1_mm and socket are of different"),
+        (WIRE, changed(WIRE, 2, "-510"), ":4:", "column wire1_mm: -510 is no length"),
+        (WIRE, changed(WIRE, 2, "0"), ":4:", "column wire1_mm: 0 is no length"),
+        (WIRE, changed(WIRE, 2, "nan"), ":4:", "column wire1_mm: nan is not a finite number"),
+        (WIRE, changed(WIRE, 2, "1e12"), ":4:", "is more than 100 km"),
+        (WIRE, changed(WIRE, 2, "5x"), ":4:", "column wire1_mm: '5x' is not a number"),
+        (WIRE, changed(WIRE, 2, "500;5"), ":4:", "is not a number"),
+        ("wire1_mm,wire2_mm", [f"{500 + i}," for i in range(6)], ":", "wire2 is measured at 0"),
+        (WIRE, ["500", "501", "", "", "", ""], ":", "wire1 is measured at 2 poses"),
+        (WIRE, [""] * 6, ":", "nothing was measured at any pose"),
+        (SOCKET, changed(SOCKET, 5, "C"), ":7:", "column socket: 'C' is visited once"),
+        (SOCKET, [""] * 6, ":", "nothing was measured at any pose"),
+        (VECTOR, changed(VECTOR, 2, "1,2,3,,0.2,0.3"), ":4:", "some of the flange's columns"),
+        (VECTOR, changed(VECTOR, 2, "1,2,3,inf,0,0"), ":4:", "inf is not a finite number"),
+        (VECTOR, changed(VECTOR, 2, "1e12,2,3,0,0,0"), ":4:", "is more than 100 km"),
+        (QUATERNION, changed(QUATERNION, 2, "1,2,3,2,0,0,0"), ":4:", "length 2, not 1"),
+        (VECTOR.replace("flange_ry_rad,", ""), ["1,2,3,4,5"] * 6, ":1:", "flange_ry_rad is mis"),
+        (VECTOR.replace("flange_y_mm,", ""), ["1,2,3,4,5"] * 6, ":1:", "flange_y_mm is missing"),
+        ("flange_x_mm,flange_y_mm,flange_z_mm", ["1,2,3"] * 6, ":1:", "give the flange's orien"),
+        ("flange_rx_rad,flange_ry_rad,flange_rz_rad", ["1,2,3"] * 6, ":1:", "flange_x_mm is miss"),
+        ("flange_x_cm", ["1"] * 6, ":1:", "column flange_x_cm is not understood"),
+    ],
+)  # fmt: skip
+def test_bad_columns_are_one_line_with_place_and_mend(
+    header: str, cells: list[str], place: str, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.csv"
+    rows = [f"0.{i},0.2,-0.{i},{cell}" for i, cell in enumerate(cells)]
+    path.write_text("\n".join([f"{JOINTS},{header}", *rows]))
+    with pytest.raises(mc.DataError) as caught:
+        read_relative(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}{place}")
+    assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("header", list(GOOD))
+def test_the_good_columns_are_good(header: str, tmp_path: Path) -> None:
+    path = tmp_path / "good.csv"
+    rows = [f"0.{i},0.2,-0.{i},{cell}" for i, cell in enumerate(GOOD[header])]
+    path.write_text("\n".join([f"{JOINTS},{header}", *rows]))
+    assert read_relative(path).poses == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        (f"{JOINTS},wire1_mm\n", "holds a header but no rows"),
+        ("wire1_mm\n500\n", "no joint columns"),
+        ("q1_rad,q3_rad,wire1_mm\n0,0,5\n", "column q2_rad is missing"),
+        (f"{JOINTS},wire1_mm\n0,0,0\n", "3 cells, but the header has 4"),
+        (f"{JOINTS},wire1_mm\n,0,0,500\n", "column q1_rad: is empty"),
+        (f"{JOINTS},wire1_mm\n" + "0,0,0,500\n" * 6, "holds one pose only"),
+        (f"{JOINTS},socket\n0,0,0,A\n", "holds one pose only"),
+        (f"{JOINTS},socket\n0,0,0,A\n0,0,0,A\n1,0,0,B\n2,0,0,B\n", "the same joint values only"),
+    ],
+)
+def test_bad_files_are_one_line(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(mc.DataError) as caught:
+        read_relative(path)
+    assert str(caught.value).startswith(f"{path}:")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_arrays() -> None:
+    q = np.arange(18.0).reshape(6, 3)
+    with pytest.raises(mc.DataError, match="holds no poses"):
+        distances(np.zeros((0, 3)), np.zeros((0, 1)))
+    with pytest.raises(mc.DataError, match="joint 1 is not a finite number"):
+        closures(np.full((6, 3), np.nan), np.repeat("A", 6))
+    mirrored = np.tile(np.diag([1.0, 1.0, -1.0, 1.0]), (6, 1, 1))
+    with pytest.raises(mc.DataError, match="no rigid motion"):
+        flange_poses(q, mirrored)
+    with pytest.raises(mc.DataError, match=r"must be \(m, 4, 4\)"):
+        flange_poses(q, np.zeros((6, 4)))
+    with pytest.raises(mc.DataError, match="pose has 4 entries, but there are 6 poses"):
+        flange_poses(q, np.eye(4))
+    with pytest.raises(mc.DataError, match="order has 5 entries"):
+        closures(q, np.repeat(["A", "B"], 3), order=np.arange(5))
+    with pytest.raises(mc.DataError, match=r"q must be \(m, n\)"):
+        distances(q[0], np.ones(6))

@@ -1,0 +1,575 @@
+"""Calibration without coordinates, against simulation with known truth and plain models."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SHARED, shared
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from experiments.relative import (
+    SIMULATORS,
+    SPOT,
+    Arm,
+    Measured,
+    RealJob,
+    place,
+    position_errors,
+    rank_of,
+    run_real,
+    seen_from,
+    spot_of,
+)
+from minimax_cal.correcting.exporters.job import read_job
+from minimax_cal.correcting.exporters.table import export
+from minimax_cal.fitting.instruments import (
+    RelativeCalibration,
+    closures,
+    distances,
+    flange_poses,
+    poses_as_targets,
+    relative,
+)
+from minimax_cal.fitting.instruments.closing import closing_poses, reach
+from minimax_cal.fitting.instruments.options import known_of
+from minimax_cal.fitting.instruments.poses import spots_of
+from minimax_cal.fitting.instruments.rows import Closures, Instrument, Wires, state_of
+from minimax_cal.fitting.instruments.split import free_numbers, misclosures
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import random_poses
+
+NOISE = 15e-6
+
+
+@cache
+def measured(name: str, kind: str, seed: int = 0, noise: float = 0.0) -> tuple[Arm, Measured]:
+    """An arm, stiff, and what an instrument says of it."""
+    arm = Arm.of(name, seed, 0.0)
+    return arm, SIMULATORS[kind](arm, np.random.default_rng([seed, 5]), 100, noise)
+
+
+@cache
+def fitted(
+    name: str, kind: str, seed: int = 0, noise: float = 0.0
+) -> tuple[Arm, RelativeCalibration]:
+    arm, seen = measured(name, kind, seed, noise)
+    return arm, relative(arm.robot, seen.data, known_distances=seen.known)
+
+
+def checks(arm: Arm) -> Array:
+    return random_poses(arm.robot, 200, np.random.default_rng(8))
+
+
+# ---- the residuals ---------------------------------------------------------------------------
+
+
+def wires(robot: mc.Robot, rng: np.random.Generator) -> tuple[Instrument, State]:
+    q = random_poses(robot, 15, rng)
+    length = rng.uniform(0.5, 2.0, (15, 3))
+    length[rng.uniform(size=length.shape) < 0.3] = np.nan
+    x = state_of(robot.mdh, SPOT, rng.normal(size=12))
+    return Wires.of(robot, q, ("wire1", "wire2", "wire7"), length), x
+
+
+def sockets(robot: mc.Robot, rng: np.random.Generator) -> tuple[Instrument, State]:
+    q, socket = random_poses(robot, 15, rng), rng.permutation(np.arange(15) % 4)
+    pairs, length = np.array([[0, 2], [3, 1]]), np.array([0.7, 1.1])
+    return Closures.of(robot, q, socket, pairs, length), state_of(robot.mdh, SPOT, np.zeros(0))
+
+
+@pytest.mark.parametrize("name", ["irb2600", "scara_600"])
+@pytest.mark.parametrize("make", [wires, sockets])
+def test_slopes_are_the_derivative_of_the_rows(
+    name: str, make: object, rng: np.random.Generator
+) -> None:
+    robot = mc.load_robot(name)
+    robot = robot.with_mdh(robot.mdh + 0.05 * rng.normal(size=robot.mdh.shape))
+    instrument, x = make(robot, rng)  # type: ignore[operator]
+    count = instrument.names.count
+    every = np.ones(count, dtype=bool)
+    every[5 * robot.joints : 5 * robot.joints + 6] = False  # the base is the frame
+    _, slopes = instrument.rows(x, every)
+    for column, i in enumerate(np.flatnonzero(every)):
+        step = np.zeros(count)
+        step[i] = 1e-6
+        after, before = (instrument.rows(x.step(sign * step), every)[0] for sign in (1, -1))
+        # rows are measured minus predicted; central differences of 1e-6 are good to 1e-9
+        assert_allclose(slopes[column], -(after - before) / 2e-6, rtol=1e-7, atol=2e-8)
+
+
+@pytest.mark.parametrize("make", [wires, sockets])
+def test_rows_of_a_batch_are_those_of_its_members(
+    robot: mc.Robot, make: object, rng: np.random.Generator
+) -> None:
+    instrument, x = make(robot, rng)  # type: ignore[operator]
+    some = rng.uniform(size=instrument.names.count) < 0.7
+    some[30:36] = False
+    batch = x.repeat(3)
+    batch = batch.step(1e-2 * rng.normal(size=(3, instrument.names.count)) * some)
+    errors, slopes = instrument.rows(batch, some)
+    for i in range(3):
+        error, slope = instrument.rows(batch.take(np.array(i)), some)
+        assert_allclose(errors[i], error, rtol=0, atol=1e-13)
+        assert_allclose(slopes[i], slope, rtol=0, atol=1e-13)
+
+
+def test_the_barycentre_is_the_best_place_of_a_socket(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    # the cost without the sockets is the least over all sockets' places, by explicit least squares
+    q, socket = random_poses(robot, 20, rng), rng.permutation(np.arange(20) % 3)
+    instrument = Closures.of(robot, q, socket, np.zeros((0, 2), dtype=int), np.zeros(0))
+    x = state_of(robot.mdh, SPOT, np.zeros(0))
+    error, _ = instrument.rows(x, np.zeros(instrument.names.count, dtype=bool))
+    design = np.kron(np.eye(3)[socket], np.eye(3))
+    _, cost, _, _ = np.linalg.lstsq(design, place(robot, q, SPOT).reshape(-1))
+    assert_allclose(error @ error, cost[0], rtol=1e-12)
+
+
+# ---- recovery, rank, scale -------------------------------------------------------------------
+
+KINDS = [k for k in SIMULATORS if k != "closures"]
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_noise_the_true_arm_is_found(name: str, kind: str) -> None:
+    arm, fit = fitted(name, kind)
+    assert fit.status == "converged"
+    assert fit.accuracy["holdout"].poses > 0
+    assert fit.accuracy["holdout"].max_mm < 1e-6  # 1e-9 m
+    assert fit.accuracy["nominal"].rms_mm > 0.3
+    off = position_errors(arm, fit.robot, spot_of(fit), checks(arm), scaled=False)
+    assert off.max() < 1e-8  # what is not identified moves no position once a base is fitted
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10"])
+def test_closures_find_the_arm_but_for_its_scale(name: str) -> None:
+    arm, fit = fitted(name, "closures")
+    assert fit.accuracy["holdout"].max_mm < 1e-6
+    shape = position_errors(arm, fit.robot, spot_of(fit), checks(arm), scaled=True)
+    plain = position_errors(arm, fit.robot, spot_of(fit), checks(arm), scaled=False)
+    assert shape.max() < 1e-8
+    assert plain.max() > 1e-5
+    kept = [n for n, reason in fit.identification.reasons.items() if "length standard" in reason]
+    lengths = {p.name: abs(p.nominal) for p in fit.parameters if p.name.rstrip("123456") in "ad"}
+    assert kept == [max(lengths, key=lengths.__getitem__)]  # the longest is as drawn
+    joint, column = int(kept[0][1:]) - 1, "ad".index(kept[0][0])
+    assert fit.robot.mdh[joint, column] == arm.robot.mdh[joint, column]
+    assert any("the scale is not identifiable" in notice for notice in fit.notices)
+    # the scale is that of the drawing: every length is off by the same factor, which a fit with a
+    # known distance tells
+    _, told = fitted(name, "closures_known")
+    factor = told.robot.mdh[joint, column] / arm.robot.mdh[joint, column]
+    scaled = fit.robot.mdh.copy()
+    scaled[:, :2] *= factor
+    off = position_errors(
+        arm, arm.robot.with_mdh(scaled), factor * spot_of(fit), checks(arm), scaled=False
+    )
+    assert off.max() < 1e-8
+
+
+def test_one_socket_is_enough() -> None:
+    arm, seen = measured("irb2600", "closures")
+    rng = np.random.default_rng(3)
+    goal = np.repeat(arm.place(seen.data.at.q[:1]), 300, axis=0)
+    q, gap = reach(arm.real, SPOT, goal, random_poses(arm.robot, 300, rng))
+    data = closures(q[gap < 1e-9][:60], np.repeat("A", 60))
+    fit = relative(arm.robot, data)
+    assert fit.identified == rank_of(arm, Measured(data)) == 20
+    assert fit.accuracy["holdout"].max_mm < 1e-6
+    shape = position_errors(arm, fit.robot, spot_of(fit), checks(arm), scaled=True)
+    assert shape.max() < 1e-8
+
+
+def test_scaling_all_lengths_changes_no_closure_but_a_known_distance(robot: mc.Robot) -> None:
+    q, socket = closing_poses(robot, SPOT, 4, 5, np.random.default_rng(0))
+    _, socket = np.unique(socket, return_inverse=True)
+    centres = [place(robot, q, SPOT)[socket == i].mean(axis=0) for i in (0, 1)]
+    pairs, length = np.array([[0, 1]]), np.array([np.linalg.norm(centres[0] - centres[1])])
+    none = np.zeros(30 + 9, dtype=bool)
+    for factor in (1.0, 1.01, 2.0):
+        mdh = robot.mdh * [factor, factor, 1, 1, 1]
+        x = state_of(mdh, factor * SPOT, np.zeros(0))
+        alone, _ = Closures.of(robot, q, socket, pairs[:0], length[:0]).rows(x, none)
+        assert_allclose(alone, 0.0, atol=1e-8)
+        known = Closures.of(robot, q, socket, pairs, length)
+        told, _ = known.rows(x, none)
+        root = np.sqrt(3 * len(q))  # weighs as all visits together
+        assert_allclose(told[-1] / root, (1.0 - factor) * length[0], rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10", "meca500"])
+@pytest.mark.parametrize("kind", list(SIMULATORS))
+def test_identified_is_the_rank_by_finite_differences(name: str, kind: str) -> None:
+    arm, seen = measured(name, kind)
+    _, fit = fitted(name, kind)
+    assert fit.identified == rank_of(arm, seen)
+
+
+def test_counts_by_kind(robot: mc.Robot) -> None:
+    # 21 of the arm itself; 3 more for each anchor; 6 of the base and 3 of the tool's turn
+    expected = {"poses": 30, "wires_4": 33, "wires_3": 30, "wires_1": 24, "ball_bar": 30}
+    expected |= {"closures": 20, "closures_known": 21, "plate_known": 21}
+    assert {kind: fitted("irb2600", kind)[1].identified for kind in SIMULATORS} == expected
+
+
+def slid(name: str, sizes: tuple[float, float]) -> tuple[Arm, np.random.Generator]:
+    rng = np.random.default_rng(4)
+    robot = mc.load_robot(name)
+    errors = rng.normal(size=(robot.joints, 5)) * np.repeat(sizes, (2, 3))
+    return Arm(robot, robot.with_mdh(robot.mdh + errors), 0.0), rng
+
+
+def test_an_arm_with_a_slide() -> None:
+    arm, rng = slid("scara_600", (5e-4, 1e-3))
+    q = random_poses(arm.robot, 80, rng)
+    anchors = rng.normal(size=(3, 3))
+    data = distances(q, np.linalg.norm(arm.place(q)[:, None] - anchors, axis=-1))
+    with pytest.raises(mc.DataError, match="slides; name its column q3_mm"):
+        relative(arm.robot, data)
+    data = replace(data, at=replace(data.at, sliding=arm.robot.prismatic))
+    fit = relative(arm.robot, data)
+    assert fit.identified == rank_of(replace(arm, real=arm.robot), Measured(data)) == 20
+    assert fit.accuracy["holdout"].max_mm < 1e-6
+
+
+# ---- the start -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(("anchors", "offset"), [(1, 0.0), (3, 0.1)])
+def test_no_guess_is_needed(seed: int, anchors: int, offset: float) -> None:
+    # 5 mm and 10 mrad off, a target half a metre off, anchors anywhere, offsets of 0.1 m
+    rng = np.random.default_rng(seed)
+    robot = mc.load_robot(["irb2600", "ur10"][seed % 2])
+    real = robot.with_mdh(robot.mdh + rng.normal(size=(6, 5)) * np.repeat([5e-3, 1e-2], (2, 3)))
+    q = random_poses(robot, 70, rng)
+    spot = rng.uniform(-0.5, 0.5, 3)
+    at = 0.8 * robot.reach() * rng.normal(size=(anchors, 3))
+    zero = offset * rng.uniform(-1, 1, anchors)
+    length = np.linalg.norm(place(real, q, spot)[:, None] - at, axis=-1) + zero
+    fit = relative(robot, distances(q, np.where(length > 0, length, np.nan)), offset=offset > 0)
+    assert fit.status == "converged"
+    assert fit.accuracy["holdout"].max_mm < 1e-6
+    if offset:
+        found = np.array(list(fit.instrument["offsets_mm"].values()))
+        assert_allclose(found, 1e3 * zero, rtol=0, atol=1e-6)
+        assert any("offsets are weakly determined" in notice for notice in fit.notices)
+
+
+def test_an_offset_that_is_there_and_not_fitted_shows() -> None:
+    arm, seen = measured("irb2600", "wires_3", noise=NOISE)
+    shifted = replace(seen.data, length=seen.data.length + np.array([0.002, 0.0, -0.003]))
+    wrong, right = relative(arm.robot, shifted), relative(arm.robot, shifted, offset=True)
+    assert right.identified == wrong.identified + 3
+    assert right.accuracy["holdout"].rms_mm < 0.025 < wrong.accuracy["holdout"].rms_mm
+    told = {p.name: p for p in right.parameters}
+    for name, value in (("offset1", 0.002), ("offset2", 0.0), ("offset3", -0.003)):
+        assert abs(told[name].value - value) < 4.0 * told[name].sigma
+        assert told[name].sigma > NOISE / np.sqrt(80)  # weaker than the mean of the lengths
+
+
+def test_reach_closes_and_says_where_it_cannot(robot: mc.Robot) -> None:
+    rng = np.random.default_rng(1)
+    q = random_poses(robot, 20, rng)
+    goal = place(robot, random_poses(robot, 20, rng), SPOT)
+    goal[0] = [9.0, 0.0, 0.0]
+    found, gap = reach(robot, SPOT, goal, q)
+    assert_allclose(np.linalg.norm(place(robot, found, SPOT) - goal, axis=1), gap, atol=1e-12)
+    assert gap[0] > 5.0
+    assert np.count_nonzero(gap < 1e-9) >= 17
+
+
+# ---- what the numbers say --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "arms"), [("wires_3", 8), ("closures_known", 4), ("poses", 6)])
+def test_sigmas_are_the_scatter_of_fits(kind: str, arms: int) -> None:
+    # each parameter's deviation from the fit without noise, which is the truth in the same gauge
+    z, ratio = [], []
+    for seed in range(arms):
+        _, clean = fitted("irb2600", kind, seed)
+        arm, noisy = fitted("irb2600", kind, seed, NOISE)
+        assert noisy.identification.active.tolist() == clean.identification.active.tolist()
+        rows = [
+            ((a.value - b.value) / a.sigma)
+            for a, b in zip(noisy.parameters, clean.parameters, strict=True)
+            if a.identifiable and not a.name.startswith(("base", "tool_r"))  # of other axes
+        ]
+        z.append(rows)
+        error = position_errors(arm, noisy.robot, spot_of(noisy), checks(arm), scaled=False)
+        ratio.append(np.sqrt(np.mean(error**2)) / noisy.position_sigma)
+    scatter = np.sqrt(np.mean(np.square(z)))
+    assert 0.8 < scatter < 1.2  # 100 to 200 correlated numbers
+    assert 0.7 < np.sqrt(np.mean(np.square(ratio))) < 1.3
+
+
+def test_misclosures_are_as_about_known_sockets() -> None:
+    rng = np.random.default_rng(3)
+    socket = np.array(["A"] * 4 + ["B"] * 2 + ["C"] * 3 + ["D"])
+    held = np.array([False, False, False, True] + [False] * 2 + [True] * 3 + [True])
+    draws = rng.normal(size=(4000, 10, 3))
+    squares = [(misclosures(draw, socket, held) ** 2).sum(axis=1) for draw in draws]
+    mean = np.mean(squares, axis=0)
+    assert_allclose(mean[:9], 3.0, rtol=0.1)  # unit variance of each coordinate
+    assert np.isnan(mean[9])  # one visit closes with nothing
+    # numbers: A and B train with 3 + 2 visits about 2 barycentres; C and D have their own
+    assert free_numbers(socket, held) == (3 * (5 - 2), 3 * (5 - 2))
+
+
+def test_whole_sockets_are_held_out_where_there_are_enough() -> None:
+    arm, seen = measured("irb2600", "closures_known", noise=NOISE)
+    fit = relative(arm.robot, seen.data, known_distances=seen.known, holdout=0.3)
+    held = [n for n in fit.notices if "3 of 10 sockets are held out whole" in n]
+    assert len(held) == 1
+    assert "three degrees of freedom less for each socket" in held[0]
+    assert fit.numbers["holdout"] == 3 * (30 - 3)
+    assert fit.numbers["train"] == 3 * (70 - 7)
+    assert not set(seen.known[0][:2]) - set(fit.instrument["sockets_mm"])  # those must stay
+    some = seen.data.take(np.isin(seen.data.socket, ["S1", "S2", "S3"]))
+    with pytest.raises(mc.DataError, match="independent coordinates of visits in training, but 20"):
+        relative(arm.robot, some.take(np.arange(30) % 10 < 3))
+    fewer = relative(arm.robot, some)
+    assert any("with 3 sockets, visits are held out" in n for n in fewer.notices)
+    assert fewer.numbers["holdout"] == 3 * 6
+
+
+def test_the_split_column_decides() -> None:
+    arm, seen = measured("irb2600", "closures_known")
+    out = [label for label in seen.data.sockets if label not in seen.known[0][:2]][:2]
+    label = np.where(np.isin(seen.data.socket, out), "holdout", "train")
+    data = replace(seen.data, at=replace(seen.data.at, columns={"split": label}))
+    fit = relative(arm.robot, data, known_distances=seen.known)
+    assert set(fit.instrument["sockets_mm"]) == set(data.sockets) - set(out)
+    needed = np.where(data.socket == seen.known[0][0], "holdout", "train")
+    data = replace(seen.data, at=replace(seen.data.at, columns={"split": needed}))
+    with pytest.raises(mc.DataError, match="holds out all of socket"):
+        relative(arm.robot, data, known_distances=seen.known)
+
+
+def test_an_error_of_lengths_is_not_called_one_of_position() -> None:
+    _, fit = fitted("irb2600", "wires_3", noise=NOISE)
+    assert "no error of position" in fit.headline()
+    _, fit = fitted("irb2600", "closures", noise=NOISE)
+    assert "no error of position" in fit.headline()
+
+
+def test_points_that_stand_out_are_named() -> None:
+    arm, seen = measured("irb2600", "wires_3", noise=NOISE)
+    length = seen.data.length.copy()
+    length[17, 2] += 0.05
+    fit = relative(arm.robot, replace(seen.data, length=length))
+    assert any("line 18 wire3" in notice for notice in fit.notices)
+
+
+def test_another_robot_is_doubted() -> None:
+    _, seen = measured("irb2600", "wires_3")
+    fit = relative("irb120", seen.data)
+    assert any("the nominal robot misses by" in notice for notice in fit.notices)
+    assert any("implausibly large changes" in notice for notice in fit.notices)
+
+
+# ---- options ---------------------------------------------------------------------------------
+
+
+def test_fix_and_free() -> None:
+    arm, seen = measured("irb2600", "wires_3", noise=NOISE)
+    fit = relative(arm.robot, seen.data, fix="a2,beta*", free=["d1"])
+    told = {p.name: p for p in fit.parameters}
+    assert told["a2"].reason == told["beta2"].reason == "fixed by the user"
+    assert told["d1"].identifiable
+    assert not told["anchor1_z"].identifiable or not told["anchor2_z"].identifiable
+    # a fixed length sets the scale of closures: nothing else is given up for it
+    arm, seen = measured("irb2600", "closures", noise=NOISE)
+    fit = relative(arm.robot, seen.data, fix=["a2"])
+    assert not any("length standard" in reason for reason in fit.identification.reasons.values())
+    assert {p.name: p.identifiable for p in fit.parameters}["d4"]
+    # what the user wants is not what is kept for the scale
+    fit = relative(arm.robot, seen.data, free=["d4"])
+    assert "length standard" in fit.identification.reasons["a2"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "words"),
+    [
+        ("closures", {"offset": True}, "--offset is for distances"),
+        ("wires_3", {"known_distances": [("S1", "S2", 1.0)]}, "--known-distance is for closures"),
+        ("wires_3", {"lever": 0.1}, "--lever is for poses"),
+        ("closures", {"known_distances": [("S1", "Z", 1.0)]}, "no socket 'Z'"),
+        ("closures", {"known_distances": [("S1", "S1", 1.0)]}, "two different sockets"),
+        ("closures", {"known_distances": [("S1", "S2", -1.0)]}, "a positive length"),
+        ("poses", {"lever": -0.1}, "must be positive"),
+        ("wires_3", {"holdout": 1.0}, "not a fraction"),
+        ("wires_3", {"seed": -1}, "seed -1"),
+        ("wires_3", {"method": "newton"}, "no method 'newton'"),
+        ("wires_3", {"resolution": 1.0}, "resolution"),
+        ("wires_3", {"fix": ["a9"]}, "no parameter called 'a9'"),
+        ("wires_3", {"fix": ["a2"], "free": ["a2"]}, "a2 is both fixed and freed"),
+        ("wires_3", {"fix": ["anchor1_x"]}, "no nominal value to keep"),
+    ],
+)
+def test_bad_options_are_one_line(kind: str, options: dict[str, object], words: str) -> None:
+    arm, seen = measured("irb2600", kind)
+    with pytest.raises(mc.OptionError) as caught:
+        relative(arm.robot, seen.data, **options)  # type: ignore[arg-type]
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_too_few_lengths_are_told_with_their_number() -> None:
+    arm, seen = measured("irb2600", "wires_1")
+    few = seen.data.take(np.arange(25))
+    with pytest.raises(mc.DataError, match="20 independent lengths in training, but 24 unknown"):
+        relative(arm.robot, few)
+    with pytest.raises(mc.DataError, match="wire1 has 4 lengths in training, and needs 5"):
+        relative(arm.robot, seen.data.take(np.arange(5)))
+    with pytest.raises(mc.DataError, match="has 4 joints"):
+        relative("scara_600", seen.data)
+
+
+@pytest.mark.parametrize("text", ["A,B", "A,B,x", "A,B,5,6", ",B,5", "A,B,--5", "A,B,nan"])
+def test_a_known_distance_must_be_readable(text: str) -> None:
+    with pytest.raises(mc.OptionError, match="write two sockets and a length"):
+        known_of(text)
+
+
+def test_a_known_distance_in_words() -> None:
+    *labels, length = known_of(" S1 , plate 2, 500.02 mm")
+    assert labels == ["S1", "plate 2"]
+    assert_allclose(length, 0.50002, rtol=1e-14)
+
+
+# ---- whole poses -----------------------------------------------------------------------------
+
+
+def test_four_reflectors_weigh_position_and_turn_by_the_lever(rng: np.random.Generator) -> None:
+    lever = 0.37
+    shift, turn = 1e-6 * rng.normal(size=3), 1e-6 * rng.normal(size=3)
+    for count in (3, 4):
+        spots = spots_of(lever, count)
+        assert_allclose(spots.mean(axis=0), 0.0, atol=1e-16)
+        assert_allclose(np.mean((spots**2).sum(axis=1)), 1.5 * lever**2, rtol=1e-14)
+    moved = shift + np.cross(turn, spots)
+    square = 4.0 * (shift @ shift + lever**2 * turn @ turn)
+    assert_allclose((moved**2).sum(), square, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_virtual_reflectors_are_real_ones(count: int) -> None:
+    """Reflectors screwed on where the virtual ones are give the same calibration."""
+    arm, seen = measured("ur10", "poses", noise=NOISE)
+    lever = 0.2
+    pose = seen.data.pose
+    spots = spots_of(lever, count)
+    y = np.stack([pose[:, :3, :3] @ spot + pose[:, :3, 3] for spot in spots], axis=1)
+    real = mc.calibrate(arm.robot, mc.measurements(seen.data.at.q, y), objective="sum")
+    virtual = mc.calibrate(arm.robot, poses_as_targets(seen.data, lever, count), objective="sum")
+    assert_allclose(virtual.robot.mdh, real.robot.mdh, rtol=0, atol=1e-13)
+    if count == 4:
+        fit = relative(arm.robot, seen.data, lever=lever)
+        assert_allclose(fit.robot.mdh, real.robot.mdh, rtol=0, atol=1e-13)
+        assert fit.identified == sum(p.identifiable for p in real.parameters) - 6  # their shape
+
+
+def test_poses_tell_the_turn_of_the_tool_and_more() -> None:
+    arm, seen = measured("irb2600", "poses", noise=NOISE)
+    fit = relative(arm.robot, seen.data)
+    assert fit.beyond == ("tool_rx", "tool_ry", "tool_rz")  # at a point off all wrist axes
+    # a frame in the flange's centre: one reflector there would not see the wrist's last turn
+    tool = np.eye(4)
+    tool[:3, 3] = -SPOT + [0.0, 0.0, 1e-5]
+    centred = relative(arm.robot, replace(seen.data, pose=seen.data.pose @ tool))
+    assert set(centred.beyond) > {"tool_rx", "tool_ry", "tool_rz"}
+    assert any("beyond what one reflector" in notice for notice in centred.notices)
+
+
+def test_the_tool_and_its_sigma_are_found() -> None:
+    _, fit = fitted("irb2600", "poses", noise=NOISE)
+    told = {p.name: p for p in fit.parameters}
+    exact = fitted("irb2600", "poses")[1]
+    turned = Rotation.from_rotvec(fit.instrument["tool"]["rotation_vector_rad"])
+    true = Rotation.from_rotvec(exact.instrument["tool"]["rotation_vector_rad"])
+    off = (turned * true.inv()).as_rotvec()
+    for i, axis in enumerate("xyz"):
+        assert told[f"tool_r{axis}"].unit == "rad"
+        assert 0.0 < abs(off[i]) < 4.0 * told[f"tool_r{axis}"].sigma < 1e-3
+    assert fit.turns["holdout"][0] == pytest.approx(np.sqrt(3) * 0.15e-3, rel=0.25)
+    assert fit.turns["nominal"][0] > 5.0 * fit.turns["holdout"][0]
+    assert told["d6"].reason == "same motion as the tool"
+
+
+def test_the_lever_comes_from_the_columns() -> None:
+    arm, seen = measured("irb2600", "poses", noise=NOISE)
+    assert relative(arm.robot, seen.data).instrument["lever_mm"] == pytest.approx(100.0)
+    columns = {"u95": np.full(100, 3e-5), "rotation_u95": np.full(100, 1e-4)}
+    data = replace(seen.data, at=replace(seen.data.at, columns=columns))
+    assert relative(arm.robot, data).instrument["lever_mm"] == pytest.approx(300.0)
+    assert relative(arm.robot, data, lever=0.05).instrument["lever_mm"] == pytest.approx(50.0)
+
+
+def test_errors_of_poses_name_the_users_columns() -> None:
+    arm, seen = measured("irb2600", "poses")
+    pose = seen.data.pose.copy()
+    pose[:, :3, 3] *= 1e-3
+    with pytest.raises(mc.DataError, match="name the columns flange_x_m"):
+        relative(arm.robot, flange_poses(seen.data.at.q, pose), lever=1e-4)
+
+
+def test_a_real_arm_by_lengths_of_its_trackers_points() -> None:
+    shared("irb120")  # skips where there are no data
+    kinds = ("wires_3", "wires_1", "tracker")
+    three, one, tracker = (run_real(RealJob("irb120", kind, 0)) for kind in kinds)
+    assert three.position_mm[1] < 1.2 * tracker.position_mm[1] < 0.4 * three.position_mm[0]
+    # a length may fit well and tell little of positions: that must be said
+    assert one.held_mm < tracker.held_mm
+    assert one.position_mm[1] > 10.0 * three.position_mm[1]
+    data = mc.read_measurements(SHARED / "irb120" / "measurements.csv").only(0)
+    robot = mc.load_robot(SHARED / "irb120" / "robot.json")
+    said = [relative(robot, seen_from(data, kind)).notices for kind in ("wires_3", "wires_1")]
+    weakly = [any("positions are told weakly" in notice for notice in some) for some in said]
+    assert weakly == [False, True]
+
+
+# ---- the result ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["wires_3", "closures_known", "poses"])
+def test_the_saved_result_is_a_robot(kind: str, tmp_path: Path) -> None:
+    arm, fit = fitted("irb2600", kind, noise=NOISE)
+    path = tmp_path / "fit.json"
+    fit.save(path)
+    again = mc.load_robot(path)
+    q = checks(arm)
+    assert_allclose(again.pose(q), fit.robot.pose(q), rtol=0, atol=1e-12)
+    assert b"<robot" in export(read_job(path), "urdf").content
+    with pytest.raises(mc.CalibrationError, match="relative calibration"):
+        mc.load_cell(path)  # it has no place in a measurement frame, or no reflectors
+
+
+def test_the_same_data_give_the_same_numbers() -> None:
+    arm, seen = measured("ur10", "wires_3", noise=NOISE)
+    one, other = (relative(arm.robot, seen.data).to_dict() for _ in range(2))
+    one.pop("seconds"), other.pop("seconds")
+    assert one == other
+
+
+def test_nothing_held_out_is_said() -> None:
+    arm, seen = measured("ur10", "closures", noise=NOISE)
+    fit = relative(arm.robot, seen.data, holdout=0.0)
+    assert any("no pose is held out" in notice for notice in fit.notices)
+    assert "none was held out" in fit.headline()
+    assert fit.to_dict()["accuracy"]["holdout"]["rms_mm"] is None
+
+
+def test_sockets_by_arrays_and_labels_that_are_numbers() -> None:
+    arm, seen = measured("ur10", "closures", noise=NOISE)
+    number = np.unique(seen.data.socket, return_inverse=True)[1]
+    fit = relative(arm.robot, closures(seen.data.at.q, number))
+    same = relative(arm.robot, seen.data)
+    assert_allclose(fit.robot.mdh, same.robot.mdh, rtol=0, atol=1e-9)

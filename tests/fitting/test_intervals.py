@@ -1,0 +1,145 @@
+"""Intervals of held-out accuracy: identities, known laws, and coverage over repeated samples."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy import stats
+
+from minimax_cal.fitting.intervals import (
+    Interval,
+    chance_of_larger,
+    max_interval,
+    rms_interval,
+    top_of_normal,
+)
+from minimax_cal.ground.arrays import Array
+
+RUNS = 300
+CHANCE = 3.3 * np.sqrt(0.95 * 0.05 / RUNS)  # one test in a thousand fails by chance
+
+
+def rng_of(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def both(error: Array, seed: int = 0) -> Array:
+    """Ends of both intervals, (4,)."""
+    out = [f(error, rng=rng_of(seed)) for f in (rms_interval, max_interval)]
+    return np.array([end for interval in out for end in (interval.low, interval.high)])
+
+
+@settings(max_examples=40)
+@given(st.integers(3, 40), st.integers(1, 4), st.floats(1e-7, 1e3), st.integers(0, 99))
+def test_intervals_scale_with_the_errors(m: int, k: int, size: float, seed: int) -> None:
+    error = rng_of(seed).normal(size=(k, m, 3))
+    low, high, least, most = both(error)
+    rms = np.sqrt((error**2).sum(-1).mean())
+    assert 0.0 < low < rms < high
+    assert 0.0 < least < most
+    assert_allclose(both(size * error), size * np.array([low, high, least, most]), rtol=1e-9)
+
+
+def test_the_same_seed_gives_the_same_ends(rng: np.random.Generator) -> None:
+    error = rng.normal(size=(2, 15, 3))
+    assert np.array_equal(both(error, 4), both(error, 4))
+    assert not np.array_equal(both(error, 4), both(error, 5))
+
+
+def test_targets_of_a_pose_are_no_further_poses(rng: np.random.Generator) -> None:
+    error = rng.normal(size=(1, 20, 3))
+    assert_allclose(both(np.repeat(error, 3, axis=0)), both(error), rtol=1e-12)
+
+
+def test_what_was_not_measured_does_not_count(rng: np.random.Generator) -> None:
+    error = rng.normal(size=(3, 20, 3))
+    error[1, ::2] = np.nan
+    padded = np.concatenate([error, np.full((3, 7, 3), np.nan)], axis=1)
+    assert_allclose(both(padded), both(error), rtol=1e-12)
+    turned = error[::-1] @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    assert_allclose(both(turned), both(error), rtol=1e-9)
+
+
+def test_too_few_poses_tell_nothing() -> None:
+    for m in range(3):
+        assert np.isnan(both(np.ones((2, m, 3)))).all()
+    assert rms_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+    assert max_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+
+
+def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generator) -> None:
+    """3m normal coordinates of one variance: its exact interval, within 10 % of its width."""
+    error = rng.normal(size=(1, 2000, 3))
+    found = rms_interval(error, rng=rng_of())
+    total, free = float((error**2).sum()), 6000
+    exact = np.sqrt(total / stats.chi2.ppf([0.975, 0.025], free) * 3.0)
+    assert_allclose([found.low, found.high], exact, rtol=0, atol=0.1 * np.ptp(exact))
+
+
+def test_a_wider_level_is_wider(rng: np.random.Generator) -> None:
+    error = rng.normal(size=(3, 12, 3))
+    for interval in (rms_interval, max_interval):
+        wide, narrow = (interval(error, level, rng=rng_of()) for level in (0.99, 0.8))
+        assert wide.low < narrow.low < narrow.high < wide.high
+
+
+# Known shortfall of each law at these numbers of poses, from 1500 samples each: the method is no
+# better on few skew squares.
+LAWS = {
+    "tracker noise": (lambda rng, n: rng.chisquare(3, n), 3.0, 10, 0.01),
+    "one axis": (lambda rng, n: rng.chisquare(1, n), 1.0, 20, 0.01),
+    "skew": (lambda rng, n: np.exp(0.7 * rng.normal(size=n)), np.exp(0.245), 40, 0.015),
+    "very skew": (lambda rng, n: np.exp(rng.normal(size=n)), np.exp(0.5), 20, 0.03),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_rms_interval_covers(name: str) -> None:
+    """95 % less the known shortfall, within 3.3 standard deviations of the number of runs."""
+    law, mean, poses, loss = LAWS[name]
+    rng, held = rng_of(1), 0
+    for _ in range(RUNS):
+        error = np.zeros((1, poses, 3))
+        error[0, :, 1] = np.sqrt(law(rng, poses))
+        found = rms_interval(error, rng=rng)
+        held += found.low <= np.sqrt(mean) <= found.high
+    assert 0.95 - loss - CHANCE < held / RUNS < 0.95 + loss + CHANCE
+
+
+@pytest.mark.parametrize(("name", "poses"), [("exact", 10), ("exact", 40), ("tracker", 20)])
+def test_the_largest_of_new_poses_is_covered(name: str, poses: int) -> None:
+    """Lognormal distances: 95 %.  Lighter tails, as of noise: up to 3 % more."""
+    rng, held = rng_of(2), 0
+    for _ in range(RUNS):
+        if name == "exact":
+            distance = np.exp(0.6 * rng.normal(size=2 * poses))
+        else:
+            distance = np.sqrt(rng.chisquare(3, 2 * poses))
+        error = np.zeros((1, poses, 3))
+        error[0, :, 2] = distance[:poses]
+        found = max_interval(error, rng=rng)
+        held += found.low <= distance[poses:].max() <= found.high
+    more = 0.0 if name == "exact" else 0.03
+    assert 0.95 - CHANCE < held / RUNS < 0.95 + more + CHANCE
+
+
+def test_the_largest_of_normal_samples_follow_their_law() -> None:
+    """The largest of n has the distribution Phi^n; all of n sorted are a normal sample."""
+    top = top_of_normal(12, 5, rng_of(3))
+    assert np.all(np.diff(top, axis=1) < 0.0)
+    assert stats.kstest(stats.norm.cdf(top[:, 0]) ** 12, "uniform").pvalue > 1e-3
+    fifth = stats.beta(12 - 4, 5)  # the fifth largest of 12 uniform numbers
+    assert stats.kstest(fifth.cdf(stats.norm.cdf(top[:, 4])), "uniform").pvalue > 1e-3
+    every = top_of_normal(6, 6, rng_of(4)).reshape(-1)
+    assert abs(every.mean()) < 4.0 / np.sqrt(len(every))
+    assert abs(every.var() - 1.0) < 4.0 * np.sqrt(2.0 / len(every))
+
+
+def test_chance_of_a_larger_error_is_free_of_the_law(rng: np.random.Generator) -> None:
+    """The next of n + 1 is the largest as often as any other; 4 standard deviations."""
+    runs, n = 20000, 14
+    for sample in (rng.standard_cauchy((runs, n + 1)), rng.uniform(size=(runs, n + 1))):
+        share = float(np.mean(sample[:, n] > sample[:, :n].max(axis=1)))
+        chance = chance_of_larger(n)
+        assert abs(share - chance) < 4.0 * np.sqrt(chance / runs)

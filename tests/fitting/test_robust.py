@@ -1,0 +1,461 @@
+"""Robust fits: against scipy's losses, against fits that know the wrong points, in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared
+from numpy.testing import assert_allclose
+from problems_robust import (
+    EVEN,
+    EXACT,
+    FITTER,
+    NOISE,
+    Case,
+    case_of,
+    misread,
+    shifted,
+    state_of,
+)
+from scipy import integrate, optimize, stats
+
+import minimax_cal as mc
+from minimax_cal import solvers
+from minimax_cal.fitting import robust
+from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.robust import LOSSES, distances, moments, robust_fit
+from minimax_cal.fitting.suspects import unlikely
+from minimax_cal.fitting.trimmed import Weighted
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.model import Prior
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.solvers.minimax import Sqp
+from minimax_cal.solvers.status import Status
+from qp_backends import solve as solve_qp
+
+RHO = {  # rho(u) with rho'(u) = u weight(u), written down anew
+    "huber": lambda u: np.where(u < 1.0, u**2 / 2.0, u - 0.5),
+    "cauchy": lambda u: np.log1p(u**2) / 2.0,
+    "tukey": lambda u: (1.0 - np.maximum(1.0 - u**2, 0.0) ** 3) / 6.0,
+}
+
+
+# ---- the losses ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_weight_and_slope_are_derivatives_of_the_loss(name: str) -> None:
+    u, step = np.linspace(0.05, 2.5, 51), 1e-6  # no knot of a loss is on this grid
+    weight = (RHO[name](u + step) - RHO[name](u - step)) / (2.0 * step) / u
+    assert_allclose(LOSSES[name].weight(u), weight, atol=1e-8)
+    psi = LOSSES[name].weight(u + step) * (u + step) - LOSSES[name].weight(u - step) * (u - step)
+    assert_allclose(LOSSES[name].slope(u), psi / (2.0 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_losses_are_95_percent_efficient_in_three_dimensions(name: str) -> None:
+    """(E psi')^2 / E psi^2, integrated over the chi distribution with three degrees of freedom."""
+    loss = LOSSES[name]
+
+    def mean(function: object) -> float:
+        parts = ((0.0, loss.tuning), (loss.tuning, 40.0))
+        return sum(
+            integrate.quad(lambda r: float(function(r)) * stats.chi.pdf(r, 3), *part)[0]  # type: ignore[operator]
+            for part in parts
+        )
+
+    def slope(r: float) -> Array:
+        u = np.array(r / loss.tuning)
+        return (loss.slope(u) + 2.0 * loss.weight(u)) / 3.0
+
+    def square(r: float) -> Array:
+        return (r * loss.weight(np.array(r / loss.tuning))) ** 2 / 3.0
+
+    assert mean(slope) ** 2 / mean(square) == pytest.approx(0.95, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_moments_are_those_of_the_chi_distribution(robot: mc.Robot, name: str) -> None:
+    """At the truth itself the distances are sigma chi_3; 15000 of them leave 2 % of chance."""
+    case = shifted(robot, 0.0, 0.0, poses=5000, seed=3)
+    state = case.without()
+    slope, square = moments(case.model, state, name, NOISE)
+    assert_allclose(slope**2 * NOISE**2 / square, 0.95, rtol=0.02)
+    one, plain = moments(case.model, state, "square", np.nan)
+    assert_allclose(one, 1.0)
+    assert_allclose(plain, case.model.cost(state) / (3.0 * case.model.counts), rtol=1e-12)
+    assert_allclose(plain, NOISE**2, rtol=0.05)
+
+
+# ---- the same optimum as other solvers find --------------------------------------------------
+
+
+FREE = ("a2", "a3", "theta2", "theta3", "theta4", "theta5", "alpha3", "smr1_x", "smr1_y", "smr1_z")
+
+
+@pytest.fixture(scope="module")
+def small(robot: mc.Robot) -> Case:
+    """Ten parameters of an arm that is otherwise known, one target, a tight prior on a2."""
+    case = shifted(robot, 0.1, 2e-4, poses=30, targets=1, seed=2)
+    cell, names = case.made.cell, case.model.names
+    active = np.isin(names.all, FREE)
+    weight = np.zeros(names.count)
+    weight[names.index("a2")] = (NOISE / 1e-5) ** 2
+    model = case.model.only(active).with_prior(Prior(case.model.prior.mean, weight))
+    truth = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    model, found = FITTER(model, truth)
+    return replace(case, model=model, found=found)
+
+
+def moved(case: Case, x: Array) -> State:
+    """The plain fit moved by steps of the free parameters [0.1 mm, 0.1 mrad].
+
+    Nothing of the base is free: steps simply add up.
+    """
+    step = np.zeros(case.model.names.count)
+    step[case.model.active] = 1e-4 * x
+    return state_of(case.found).step(step)
+
+
+def residuals(case: Case, x: Array, unit: float) -> Array:
+    """Distances, and the prior's roots [unit]."""
+    state = moved(case, x)
+    off = np.sqrt(case.model.prior.weight) * (case.model.values(state) - case.model.prior.mean)
+    return np.concatenate([distances(case.model, state)[case.model.seen], off]) / unit
+
+
+def slopes(case: Case, x: Array, unit: float) -> Array:
+    """Their derivatives (n, free)."""
+    model, state = case.model, moved(case, x)
+    rows = model.jacobian(state)[..., model.active]
+    error = model.error(state)
+    along = error / np.linalg.norm(error, axis=-1, keepdims=True)
+    far = -np.einsum("kmcp,kmc->kmp", rows, along)[model.seen]
+    prior = np.diag(np.sqrt(model.prior.weight))[:, model.active]
+    return np.concatenate([far, prior]) * 1e-4 / unit
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_nothing_near_is_better(small: Case, name: str) -> None:
+    """BFGS on the sum of rho and the prior comes from beside the answer back to it."""
+    found = small.robust(name)
+    unit = found.loss_scale * LOSSES[name].tuning
+    points = int(small.model.seen.sum())
+
+    def objective(x: Array) -> float:
+        parts = residuals(small, x, unit)
+        return float(RHO[name](parts[:points]).sum() + 0.5 * (parts[points:] ** 2).sum())
+
+    def gradient(x: Array) -> Array:
+        u = residuals(small, x, unit)
+        psi = np.append(u[:points] * LOSSES[name].weight(u[:points]), u[points:])
+        return slopes(small, x, unit).T @ psi
+
+    values = [small.model.values(state_of(one)) for one in (found.fit, small.found)]
+    ours = (values[0] - values[1])[small.model.active] / 1e-4
+    beside = ours + 0.05 * np.random.default_rng(0).normal(size=len(ours))
+    other = optimize.minimize(
+        objective, beside, jac=gradient, method="BFGS", options={"gtol": 1e-7, "maxiter": 500}
+    )
+    assert objective(ours) == pytest.approx(other.fun, rel=1e-8)
+    gap = residuals(small, other.x, NOISE)[:points] - residuals(small, ours, NOISE)[:points]
+    assert np.abs(gap).max() < 1e-4  # of the noise
+    assert np.abs(ours).max() > 0.01  # and it is not where least squares is
+
+
+@pytest.mark.parametrize("name", ["huber", "cauchy"])
+def test_scipy_finds_the_same_optimum(small: Case, name: str) -> None:
+    """scipy's loss of the distances themselves is this loss, up to its scale."""
+    none = Prior(small.model.prior.mean, np.zeros(small.model.names.count))
+    model, plain = FITTER(small.model.with_prior(none), state_of(small.found))
+    small = replace(small, model=model, found=plain)
+    found = small.robust(name)
+    unit = found.loss_scale * LOSSES[name].tuning
+    points = int(model.seen.sum())
+    other = optimize.least_squares(
+        lambda x: residuals(small, x, unit)[:points],
+        np.zeros(len(FREE)),
+        lambda x: slopes(small, x, unit)[:points],
+        loss=name, xtol=1e-15, ftol=1e-15, gtol=1e-12, max_nfev=5000,
+    )  # fmt: skip
+    theirs, ours = moved(small, other.x), state_of(found.fit)
+    gap = np.linalg.norm(model.error(theirs) - model.error(ours), axis=-1)
+    assert np.nanmax(gap) < 1e-4 * NOISE
+    weight = LOSSES[name].weight(distances(model, theirs) / unit)
+    assert_allclose(found.weights, weight, atol=1e-4)
+    assert found.weights[small.bad].max() < found.weights[~small.bad].mean()
+
+
+# ---- wrong points do not matter --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("loss", "trim"), [("tukey", 0.0), ("square", 0.25), ("cauchy", 0.25)])
+@pytest.mark.parametrize("size", [1e-3, 1.0])
+def test_a_fifth_of_wrong_points_does_no_harm(
+    robot: mc.Robot, loss: str, trim: float, size: float
+) -> None:
+    case = shifted(robot, 0.2, size)
+    found = case.robust(loss, trim)
+    assert found.fit.status[0] == "converged"
+    knowing = case.miss(case.without())
+    assert case.miss(state_of(found.fit)) < 1.25 * knowing
+    assert case.miss(state_of(case.found)) > 5.0 * knowing
+    assert_allclose(found.scale, NOISE, rtol=0.15)
+    assert (case.listed(found) >= case.bad).all()
+    assert found.weights[case.bad].max() < 0.01
+
+
+@pytest.mark.parametrize(("loss", "trim"), [("tukey", 0.0), ("square", 0.25)])
+def test_misread_joints_are_found(robot: mc.Robot, loss: str, trim: float) -> None:
+    """All targets of a pose are off together, always in the same sense: a fifth of the poses."""
+    case = misread(robot, 0.2, 2e-3)
+    found = case.robust(loss, trim)
+    assert case.miss(state_of(found.fit)) < 1.5 * case.miss(case.without())
+    assert (case.listed(found) == case.bad).all()
+    assert all(one.together for one in found.suspects)
+
+
+@pytest.mark.parametrize(("loss", "trim", "most"), [
+    ("tukey", 0.0, 1e-9), ("square", 0.25, 1e-9), ("cauchy", 0.0, 1e-8), ("huber", 0.0, 1e-6),
+])  # fmt: skip
+def test_without_noise_the_truth_is_found(
+    robot: mc.Robot, loss: str, trim: float, most: float
+) -> None:
+    case = shifted(robot, 0.2, 1e-3, truth=EXACT)
+    found = case.robust(loss, trim)
+    assert case.miss(state_of(found.fit)) < most
+    assert (case.listed(found) == case.bad).all()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_clean_points_are_fitted_as_by_least_squares(robot: mc.Robot, loss: str) -> None:
+    case = shifted(robot, 0.0, 0.0, poses=80)
+    found = case.robust(loss)
+    off = np.linalg.norm(case.model.error(state_of(found.fit))
+                         - case.model.error(state_of(case.found)), axis=-1)  # fmt: skip
+    assert np.sqrt(np.mean(off**2)) < 0.3 * NOISE
+    assert_allclose(found.scale, NOISE, rtol=0.1)
+    aside = case.robust(trim=0.1)
+    assert aside.weights.all() == (not aside.suspects)
+
+
+def test_one_target(robot: mc.Robot) -> None:
+    case = shifted(robot, 0.1, 1e-3, poses=60, targets=1)
+    for found in (case.robust("tukey"), case.robust(trim=0.15)):
+        assert (case.listed(found) == case.bad).all()
+        assert case.miss(state_of(found.fit)) < 1.3 * case.miss(case.without())
+        assert not any(one.together for one in found.suspects)
+
+
+def test_missing_points(robot: mc.Robot) -> None:
+    """A third of the points was not measured; of some poses one target is left."""
+    full = shifted(robot, 0.1, 1e-3, poses=60)
+    y = full.data.y.copy()
+    gone = np.random.default_rng(3).uniform(size=full.bad.T.shape) < 1.0 / 3.0
+    gone[gone.all(axis=1), 0] = False
+    y[gone] = np.nan
+    case = case_of(robot, full.made, full.data.with_y(y), full.bad.T & ~gone)
+    found = case.robust("tukey")
+    assert (found.weights[gone.T] == 0.0).all()
+    assert (case.listed(found) == case.bad).all()
+    alone = (~gone).sum(axis=1) == 1
+    assert not any(one.together for one in found.suspects if alone[one.pose])
+    aside = case.robust(trim=0.2)
+    assert_allclose(aside.model.counts, (~gone.T & ~case.bad).sum(axis=1))
+
+
+def test_weights_of_the_instrument_stay(robot: mc.Robot) -> None:
+    """Points of a tenth the accuracy are no suspects when u95 says so, and wrong good ones are."""
+    made = simulate(robot, 60, 3, 0, EVEN)
+    rng = np.random.default_rng(0)
+    rough, wrong = np.arange(60) % 3 == 0, np.arange(60) % 10 == 1
+    y = made.data.y + 9.95 * NOISE * rough[:, None, None] * rng.normal(size=made.data.y.shape)
+    y[wrong, 0] += [5e-4, 0.0, 0.0]
+    bad = np.zeros((60, 3), dtype=bool)
+    bad[wrong & ~rough, 0] = True
+    u95 = np.where(rough, 10.0, 1.0) * 2.8 * NOISE
+    data = replace(made.data.with_y(y), columns={**made.data.columns, "u95": u95})
+    told = case_of(robot, made, data, bad)
+    found = told.robust("tukey")
+    assert (told.listed(found) == told.bad).all()
+    assert_allclose(found.model.weight, told.model.weight * found.weights)
+    assert_allclose(found.scale, NOISE, rtol=0.1)  # of a point with the typical u95
+    assert told.miss(state_of(found.fit)) < 1.3 * told.miss(told.without())
+
+
+def few_that_tell_the_wrist(
+    robot: mc.Robot, wrist: tuple[float, ...], wrong: int, turn: float, seed: int, targets: int
+) -> Case:
+    """Joint 5 stands still but for the first poses; at `wrong` of these joint 2 is misread."""
+    made = simulate(robot, 60, targets, seed, EVEN)
+    rng = np.random.default_rng(seed)
+    q = made.data.q.copy()
+    q[:, 4] = 0.3 + 0.02 * rng.normal(size=60)
+    q[: len(wrist), 4] = wrist
+    true = q.copy()
+    true[:wrong, 1] += turn
+    y = made.cell.predict(true) + NOISE * rng.normal(size=made.data.y.shape)
+    bad = np.zeros((60, targets), dtype=bool)
+    bad[:wrong] = True
+    return case_of(robot, made, replace(made.data, q=q, y=y), bad)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_bad_pose_that_draws_the_fit_to_itself(robot: mc.Robot, seed: int) -> None:
+    case = few_that_tell_the_wrist(robot, (-1.2,), 1, 2e-3, seed, 1)
+    plain = distances(case.model, state_of(case.found))[0]
+    assert (plain > plain[0]).sum() > 40  # least squares misses most other points by more
+    found = case.robust("tukey")
+    assert (case.listed(found) == case.bad).all()
+    assert found.weights[0, 0] == 0.0
+    assert distances(case.model, state_of(found.fit))[0, 0] > 20.0 * plain[0]
+    assert case.miss(state_of(found.fit)) < 0.3 * case.miss(state_of(case.found))
+
+
+def test_parameters_that_only_suspects_tell_are_named(robot: mc.Robot) -> None:
+    wrist = (-1.2, 1.4, -0.7)
+    for wrong in (1, 3):
+        case = few_that_tell_the_wrist(robot, wrist, wrong, 0.05, 0, 3)
+        for found in (case.robust("tukey"), case.robust(trim=0.1)):
+            assert (case.listed(found) == case.bad).all()
+            told = [note for note in found.notices if "hardly tell" in note]
+            assert len(told) == (wrong == 3)
+            assert all("alpha5" in note for note in told)
+
+
+# ---- points set aside ------------------------------------------------------------------------
+
+
+def test_at_most_the_share_is_set_aside(robot: mc.Robot) -> None:
+    case = shifted(robot, 0.1, 1e-3)
+    for share in (0.02, 0.05, 0.1, 0.2, 0.4):
+        found = case.robust(trim=share)
+        away = (found.weights == 0.0) & case.model.seen
+        assert away.sum() == min(int(share * case.bad.size), case.bad.sum())
+        assert (away <= case.bad).all()
+        assert any("give a larger share" in note for note in found.notices) == (share < 0.1)
+        assert_allclose(found.kept.weight, case.model.weight * ~away)
+
+
+def test_what_is_set_aside_is_a_fixed_point(robot: mc.Robot) -> None:
+    """The final fit itself finds just these points to stand out, and comes out again the same."""
+    case = shifted(robot, 0.1, 3e-4, seed=4)
+    found = case.robust(trim=0.2)
+    last = Weighted(FITTER, found.plain, found.fit, found.weights, np.ones(3, dtype=bool))
+    judged = last.scores()
+    far = unlikely(last.spread(judged).chance(judged))
+    assert (far == (found.weights == 0.0)).all()
+    again = case.robust(trim=0.2)
+    assert_allclose(again.weights, found.weights, rtol=0)
+    assert_allclose(state_of(again.fit).mdh, state_of(found.fit).mdh, rtol=0)
+
+
+def test_points_that_stand_out_but_stay_in_are_told() -> None:
+    """A real arm with an effect that geometry lacks: heavy tails, or outliers?  It depends."""
+    paths = shared("fanuc_r2000")
+    robot, data = mc.load_robot(paths[0]), mc.read_measurements(paths[1])
+    nothing = np.zeros((data.poses, len(data.targets)), dtype=bool)
+    case = case_of(robot, simulate(robot, 1, 1), data, nothing)
+    for share in (0.02, 0.05, 0.1, 0.2):
+        found = case.robust(trim=share)
+        away = int(((found.weights == 0.0) & case.model.seen).sum())
+        told = [note for note in found.notices if "more points stand out" in note]
+        assert bool(told) == (len(found.suspects) > away)
+        assert all(f"{len(found.suspects) - away} more" in note for note in told)
+
+
+@pytest.mark.parametrize("per", ["target", "point"])
+def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot: mc.Robot, per: str) -> None:
+    case = shifted(robot, 0.05, 1e-3, poses=40)
+    found = case.robust(trim=0.1)
+    y = np.where((found.weights > 0.0).T[..., None], case.data.y, np.nan)
+    deleted = case_of(robot, case.made, case.data.with_y(y), case.bad.T)
+    worst = []
+    for model, state in (
+        (found.model, state_of(found.fit)),
+        (deleted.model.only(found.model.active), state_of(deleted.found)),
+    ):
+        assert_allclose(model.counts, (found.weights > 0.0).sum(axis=1))
+        problem = worst_of(model, state, measured_distances(case.data.with_y(y)), "off", per)
+        best = solvers.minimax.solve(problem, state, lambda qp: solve_qp(qp, "daqp"), Sqp())
+        assert best.status == "converged"
+        worst.append(best.f.max() * problem.size)
+    assert worst[0] == pytest.approx(worst[1], rel=1e-6)
+
+
+# ---- the rest of the model -------------------------------------------------------------------
+
+
+def test_effects_are_fitted_along(robot: mc.Robot) -> None:
+    """A made-up effect with one parameter, and wrong points that would spoil it."""
+    case = shifted(robot, 0.1, 1e-3)
+    field = np.random.default_rng(0).normal(size=(1, 3, 3, 50))
+    state = state_of(case.found)
+    lifted = case.model.y + 3e-4 * state.rotation @ field[0]
+    model = replace(
+        case.model,
+        y=lifted,
+        fields=field,
+        names=replace(case.model.names, effects=("wind:all",)),
+        active=np.append(case.model.active, True),
+        prior=Prior(*(np.append(part, 0.0) for part in vars(case.model.prior).values())),
+    )
+    begin = replace(state, effects=np.zeros(1))
+    model, plain = FITTER(model, begin)
+    found = robust_fit(FITTER, model, plain, case.data.line, "tukey")
+    assert_allclose(state_of(found.fit).effects, 3e-4, atol=5 * NOISE / np.sqrt(450))
+    assert (case.listed(found) == case.bad).all()
+
+
+def test_targets_that_follow_are_not_judged(robot: mc.Robot) -> None:
+    """As with objective smr:2: the others have a weight that is nothing beside one."""
+    case = shifted(robot, 0.1, 1e-3)
+    model, plain = FITTER(case.model.emphasise(np.array([1e-9, 1.0, 1e-9])), state_of(case.found))
+    judged = np.array([False, True, False])
+    found = robust_fit(FITTER, model, plain, case.data.line, "tukey", judged=judged)
+    assert {one.target for one in found.suspects} == {"smr2"}
+    assert (case.listed(found)[1] == case.bad[1]).all()
+    assert (found.weights[~judged] == 1.0).all()
+    assert_allclose(found.scale, NOISE, rtol=0.2)
+
+
+def test_a_pose_has_the_least_weight_of_its_targets(robot: mc.Robot) -> None:
+    case = shifted(robot, 0.1, 1e-3)
+    found = case.robust("tukey")
+    assert_allclose(found.by_pose.weight, np.tile(found.weights.min(axis=0), (3, 1)))
+
+
+def test_rounds_that_do_not_settle_are_told(
+    robot: mc.Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(robust, "ROUNDS", 1)
+    found = shifted(robot, 0.1, 1e-3, poses=30).robust("huber")
+    assert found.fit.status == ("iteration_limit",)
+
+
+def test_a_plain_fit_that_diverged_stays_what_it_is(robot: mc.Robot) -> None:
+    case = shifted(robot, 0.1, 1e-3, poses=20)
+    state = state_of(case.found)
+    lost = replace(state, origin=state.origin * np.nan, targets=state.targets * np.nan)
+    failed = replace(case.found, x=lost.batch(), cost=np.array([np.nan]), status=(Status.FAILED,))
+    found = replace(case, found=failed).robust("tukey", 0.1)
+    assert found.fit.status == ("failed",)
+    assert not found.suspects
+    assert found.weights.all()
+
+
+@pytest.mark.parametrize(
+    ("loss", "trim", "say"),
+    [
+        ("l1", 0.0, "no loss 'l1'; choose square, huber, cauchy, tukey"),
+        ("square", -0.1, "trim -0.1"),
+        ("tukey", 0.5, "0 <= trim < 0.5"),
+        ("square", float("nan"), "trim nan"),
+    ],
+)
+def test_wrong_choices_are_refused(robot: mc.Robot, loss: str, trim: float, say: str) -> None:
+    case = shifted(robot, 0.0, 0.0, poses=20)
+    with pytest.raises(mc.OptionError, match=say) as caught:
+        case.robust(loss, trim)
+    assert "\n" not in str(caught.value)

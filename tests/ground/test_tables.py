@@ -1,0 +1,76 @@
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.tables import Table
+
+TABLE = Table(
+    "errors & more",
+    ("name", "RMS mm", "poses"),
+    (("[bold]a|b[/]", 0.12345, 7), ("c_d", math.nan, 10)),
+    ("", ".3f", "d"),
+)
+
+
+def test_one_number_reads_the_same_everywhere() -> None:
+    for text in (TABLE.text(), TABLE.markdown(), TABLE.latex(), TABLE.html()):
+        assert "0.123" in text
+        assert "0.1234" not in text
+        assert "nan" not in text.lower()
+    assert "0.12345" in TABLE.csv()  # full precision for further work
+
+
+def test_cells_are_literal_text() -> None:
+    assert "[bold]a|b[/]" in TABLE.text()
+    assert r"a\|b" in TABLE.markdown()
+    assert r"c\_d" in TABLE.latex()
+    assert r"errors \& more" in TABLE.latex()
+
+
+def test_html_is_a_table_with_headers() -> None:
+    table = Table("a < b", ("name", "size mm"), (("<script>x</script>", 1.5), ('"&', math.nan)))
+    read = ElementTree.fromstring(table.html())  # well formed, and every letter itself again
+    assert read.findtext("caption") == "a < b"
+    assert [cell.attrib for cell in read.iter("th")] == [
+        {"scope": "col"}, {"scope": "col", "class": "right"}, {"scope": "row"}, {"scope": "row"}
+    ]  # fmt: skip
+    rows = [[cell.text for cell in row] for row in read.iter("tr")]
+    assert rows == [["name", "size mm"], ["<script>x</script>", "1.5"], ['"&', "-"]]
+
+
+def test_files_are_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.json"
+    write_whole(path, "first")
+    monkeypatch.setattr("os.replace", lambda *a: (_ for _ in ()).throw(OSError(28, "disk full")))
+    with pytest.raises(CalibrationError, match="disk full"):
+        write_whole(path, "second")
+    assert path.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [path]  # no scrap left
+    monkeypatch.undo()
+    link = tmp_path / "link.json"
+    link.symlink_to(path)
+    write_whole(link, "third")
+    assert link.is_symlink()
+    assert path.read_text() == "third"
+    with pytest.raises(ValueError, match="JSON"):
+        json_text({"x": math.nan})
+
+
+def test_a_pipe_is_written_into_not_replaced(tmp_path: Path) -> None:
+    import os
+    import stat
+    import threading
+
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    received: list[str] = []
+    reader = threading.Thread(target=lambda: received.append(pipe.read_text()))
+    reader.start()
+    write_whole(pipe, "through")
+    reader.join(timeout=10)
+    assert received == ["through"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)

@@ -1,0 +1,257 @@
+"""Maps of the workspace: bins against brute force, and fields that are known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.fitting.uncertainty import Uncertainty
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.judging.maps import (
+    Grid,
+    Predict,
+    Sampled,
+    joint_range,
+    predictor,
+    reached_by,
+    section,
+    tcp_place,
+    unknown,
+    workspace_map,
+)
+from minimax_cal.judging.saved import Saved
+from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.simulate import Simulation, random_poses
+from minimax_cal.reporting.plots.map import hatch, save_map
+from minimax_cal.robots.kinematics import forward
+
+SMALL = Grid(samples=3000, bins=16)
+
+
+@pytest.fixture(scope="module")
+def saved(noisy: Simulation) -> Saved:
+    """Before: a robot that is not quite the one after."""
+    rng = np.random.default_rng(7)
+    mdh = noisy.cell.robot.mdh + 1e-3 * rng.normal(size=(6, 5))
+    before = replace(noisy.cell, robot=noisy.cell.robot.with_mdh(mdh))
+    held = np.arange(60) % 5 == 0
+    return Saved({"before": before, "after": noisy.cell}, noisy.data, held, {}, ())
+
+
+def height_of(cell: mc.Cell) -> Predict:
+    """A field that is known: a thousandth of the height above -3 m."""
+
+    def predict(q: Array) -> Array:
+        return np.asarray(1e-3 * (3.0 + tcp_place(cell, q)[:, 2]))
+
+    return predict
+
+
+def test_the_place_is_that_of_the_centroid(noisy: Simulation) -> None:
+    q = noisy.data.q
+    seen = noisy.cell.predict(q).mean(axis=1)
+    base = noisy.cell.base
+    assert_allclose(tcp_place(noisy.cell, q), (seen - base[:3, 3]) @ base[:3, :3], atol=1e-12)
+
+
+def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
+    noisy: Simulation, robot: mc.Robot
+) -> None:
+    """Parameters drawn from the covariance, and the exact kinematics of each such arm."""
+    fit = mc.calibrate(robot, noisy.data, "sum")
+    names, draws = Names(6, fit.cell.targets), 20_000
+    units = tuple("m" if length else "rad" for length in names.linear)
+    known = Uncertainty(names, units, fit.covariance, Noise(0.0, 1e-10, 0.0), 100.0, "noise")
+    with pytest.raises(OptionError, match="no frame 'table'"):
+        predictor(fit.cell, known, "table")
+    q = noisy.data.q[:4]
+    radius = predictor(fit.cell, known)(q)
+    base = predictor(fit.cell, known, "base")(q)
+    assert radius.shape == (4,)
+    assert np.abs(radius / base - 1.0).max() > 0.05  # the base's pose is part of the first alone
+    state = State(
+        fit.robot.mdh, fit.cell.base[:3, :3], fit.cell.base[:3, 3], fit.cell.spots
+    ).repeat(draws)
+    moved = state.step(np.random.default_rng(3).normal(size=(draws, known.root.shape[1]))
+                       @ known.root.T)  # fmt: skip
+    flange = forward(moved.mdh, np.broadcast_to(q * robot.sign, (draws, *q.shape)), robot.prismatic)
+    centre = moved.targets.mean(axis=1)[:, None, :, None]
+    there = flange[..., :3, 3] + (flange[..., :3, :3] @ centre)[..., 0]
+    seen = there @ np.swapaxes(moved.rotation, 1, 2) + moved.origin[:, None]
+    off = np.linalg.norm(seen - fit.predict(q).mean(axis=1), axis=-1)
+    held = (off <= radius).mean(axis=0)
+    # binomial scatter of the draws, and 0.5 % for the gamma variable that stands for the distance
+    assert np.abs(held - 0.95).max() < 4.0 * np.sqrt(0.95 * 0.05 / draws) + 0.005
+
+
+def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
+    x, y, radius = rng.uniform(-1, 1, (3, 500))
+    reached = rng.uniform(size=500) < 0.4
+    some = Sampled(np.stack([x, y, 0 * x], axis=1), 2.0 + radius, reached)
+    found = section("flat", ("x", "y"), (x, y), some, 0.25)
+    assert found.count.sum() == 500
+    for i in range(len(found.x) - 1):
+        for j in range(len(found.y) - 1):
+            inside = (
+                (found.x[i] <= x) & (x < found.x[i + 1])
+                & (found.y[j] <= y) & (y < found.y[j + 1])
+            )  # fmt: skip
+            assert found.count[i, j] == inside.sum()
+            if inside.any():
+                assert_allclose(found.median[i, j], np.median(some.radius[inside]))
+                assert_allclose(found.worst[i, j], some.radius[inside].max())
+                assert_allclose(found.reached[i, j], reached[inside].mean())
+            else:
+                assert np.isnan([found.median[i, j], found.worst[i, j], found.reached[i, j]]).all()
+
+
+def test_a_known_field_lies_between_the_edges_of_its_bin(saved: Saved) -> None:
+    found = workspace_map(saved, height_of(saved.cells["after"]), SMALL)
+    vertical, horizontal = found.sections
+    for values in (vertical.median, vertical.worst):
+        i, j = np.nonzero(np.isfinite(values))
+        assert len(i) > 50
+        assert np.all(values[i, j] >= 1e-3 * (3.0 + vertical.y[j]) - 1e-15)
+        assert np.all(values[i, j] <= 1e-3 * (3.0 + vertical.y[j + 1]) + 1e-15)
+    level = horizontal.median[np.isfinite(horizontal.median)]
+    middle, half = 1e-3 * (3.0 + found.height), 0.5e-3 * found.slab
+    assert np.abs(level - middle).max() <= half
+    assert vertical.count.sum() == SMALL.samples + 48  # with the training poses
+    assert vertical.x[0] == 0.0
+
+
+def test_reached_is_within_the_ranges_and_near(rng: np.random.Generator) -> None:
+    train, q = rng.uniform(-1, 1, (40, 3)) * [1, 2, 3], rng.uniform(-4, 4, (300, 3))
+    train = np.concatenate([train, train[:7]])  # poses that were visited again
+    found = reached_by(train, q)
+    size = np.ptp(train, axis=0)
+    own = np.linalg.norm((train[:40, None] - train[None, :40]) / size, axis=-1)
+    own[np.diag_indices(40)] = np.inf
+    limit = np.quantile(own.min(axis=1), 0.95)
+    away = np.linalg.norm((q[:, None] - train[None]) / size, axis=-1).min(axis=1)
+    inside = ((q >= train.min(axis=0)) & (q <= train.max(axis=0))).all(axis=1)
+    assert_array_equal(found, inside & (away <= limit))
+    assert 0 < found.sum() < 300
+    assert reached_by(train, train).all()
+
+
+def test_a_joint_that_never_moved_is_not_known_elsewhere() -> None:
+    rng = np.random.default_rng(1)
+    train = rng.uniform(-1, 1, (40, 3)) * [1, 1, 0] + [0, 0, 0.7]
+    elsewhere = train + np.array([0, 0, 0.1])
+    assert reached_by(train, train).all()
+    assert not reached_by(train, elsewhere).any()
+    assert not reached_by(train[:2], train).any()  # two poses tell no spacing
+
+
+def test_joints_are_sampled_within_their_limits(robot: mc.Robot) -> None:
+    low, high = joint_range(robot, np.zeros((0, 6)))
+    assert_allclose(low, np.maximum(robot.lower, -np.pi))
+    assert_allclose(high, np.minimum(robot.upper, np.pi))
+    free = replace(robot, lower=np.full(6, -np.inf), upper=np.full(6, np.inf))
+    poses = np.array([[0.0] * 6, [1.0, 1.0, 1.0, 1.0, 1.0, 3.0]])
+    low, high = joint_range(free, poses)
+    assert_allclose(low, [-0.25] * 5 + [-0.75])
+    assert_allclose(high, [1.25] * 5 + [np.pi])
+    low, high = joint_range(free, np.zeros((0, 6)))
+    assert_allclose([low, high], [[-np.pi] * 6, [np.pi] * 6])
+
+
+@pytest.mark.parametrize("name", ["scara_600", "ur10"])
+def test_other_arms(name: str) -> None:
+    robot = mc.load_robot(name)
+    base, spots = np.eye(4), 0.1 * np.eye(3)
+    cell = mc.Cell(robot, base, ("smr1", "smr2", "smr3"), spots)
+    q = random_poses(robot, 30, np.random.default_rng(0))
+    data = replace(mc.measurements(q, cell.predict(q)), sliding=robot.prismatic)
+    both = Saved({"before": cell, "after": cell}, data, np.zeros(30, dtype=bool), {}, ())
+    found = workspace_map(both, unknown, SMALL)
+    assert found.sections[0].count.sum() == SMALL.samples + 30
+    low, high = joint_range(robot, q)
+    assert np.all(low < high)
+    assert np.all(q >= low - 1e-12)
+    assert np.all(q <= high + 1e-12)
+
+
+def test_observed_errors_are_those_of_the_cells(saved: Saved) -> None:
+    found = workspace_map(saved, unknown, SMALL)
+    for name, cell in saved.cells.items():
+        told = np.linalg.norm(cell.error(saved.data).mean(axis=0), axis=-1)
+        assert_allclose(found.seen.error[name], told, atol=1e-15)
+    assert found.seen.error["after"].mean() < found.seen.error["before"].mean()
+    assert_array_equal(found.seen.held, saved.held)
+    gap = saved.data.y.copy()
+    gap[3, 1] = np.nan
+    part = workspace_map(replace(saved, data=saved.data.with_y(gap)), unknown, SMALL).seen
+    one = saved.cells["after"].error(saved.data)[[0, 2], 3].mean(axis=0)
+    assert_allclose(part.error["after"][3], np.linalg.norm(one), atol=1e-15)
+
+
+def test_a_prediction_that_held_out_poses_belie_is_doubted(saved: Saved) -> None:
+    error = workspace_map(saved, unknown, SMALL).seen.error["after"][saved.held]
+    few, more = np.sort(error)[[7, 8]]  # of 12 by chance: 8 in 0.2 %, 9 in 2 % of all cases
+    for radius, count, doubted in ((few, 8, True), (more, 9, False), (1.0, 12, False)):
+        found = workspace_map(saved, lambda q, r=radius: np.full(len(q), r), SMALL)
+        assert found.inside == (count, 12)
+        assert found.to_dict()["held_out_inside"] == {"count": count, "of": 12}
+        assert any("not 95 %" in notice for notice in found.notices) == doubted
+
+
+def test_the_same_seed_gives_the_same_map(saved: Saved) -> None:
+    field = height_of(saved.cells["after"])
+    maps = [workspace_map(saved, field, replace(SMALL, seed=s)) for s in (1, 1, 2)]
+    texts = [json.dumps(each.to_dict(), allow_nan=False) for each in maps]
+    assert texts[0] == texts[1]
+    assert texts[0] != texts[2]
+
+
+def test_beyond_the_data_is_told_apart(saved: Saved) -> None:
+    """What is reached has joint 1 on the side that was measured, and is told by its bins."""
+    side = saved.data.q[:, 0] > 0.2
+    half = replace(saved, data=saved.data.take(side), held=np.zeros(side.sum(), dtype=bool))
+    found = workspace_map(half, unknown, replace(SMALL, samples=20_000))
+    vertical, horizontal = found.sections
+    share = np.nansum(vertical.reached * vertical.count) / vertical.count.sum()
+    assert share == pytest.approx(found.sampled.reached.mean())
+    q = random_poses(saved.cells["after"].robot, 500, np.random.default_rng(2))
+    assert not reached_by(half.data.q, q[q[:, 0] < 0.2]).any()
+    flat = np.abs(found.sampled.place[:, 2] - found.height) <= 0.5 * found.slab
+    assert horizontal.count.sum() == flat.sum()
+    assert any("J1 moved over" in notice for notice in found.notices)
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf"])
+def test_a_picture_of_each_kind(saved: Saved, suffix: str, tmp_path: Path) -> None:
+    field = height_of(saved.cells["after"])
+    path = tmp_path / f"map.{suffix}"
+    save_map(workspace_map(saved, field, SMALL), path)
+    assert path.read_bytes().startswith({"png": b"\x89PNG", "pdf": b"%PDF"}[suffix])
+
+
+def test_without_a_covariance_only_what_was_observed_is_drawn(saved: Saved, tmp_path: Path) -> None:
+    found = workspace_map(saved, unknown, SMALL)
+    assert not found.predicted
+    for name in ("seen", "again"):
+        save_map(found, tmp_path / f"{name}.svg")
+    text = (tmp_path / "seen.svg").read_text()
+    assert (tmp_path / "again.svg").read_text() == text  # the same picture, the same file
+    assert "observed, after" in text
+    assert "predicted" not in text
+    assert found.to_dict()["sections"][0]["radius95_median_mm"][0][0] is None
+
+
+def test_hatching_covers_what_is_not_reached(saved: Saved) -> None:
+    from matplotlib.figure import Figure
+
+    part = workspace_map(saved, unknown, SMALL).sections[0]
+    axes = Figure().subplots()
+    hatch(axes, part)
+    drawn = {patch.get_hatch(): len(patch.get_path().vertices) // 5 for patch in axes.patches}
+    none, few = part.reached == 0.0, (part.reached > 0.0) & (part.reached < 0.5)
+    assert drawn == {"xxx": none.sum(), "///": few.sum()}

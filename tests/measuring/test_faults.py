@@ -1,0 +1,288 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared
+from numpy.testing import assert_allclose, assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring import faults
+from minimax_cal.measuring.faults import Fault, find_faults, mended
+from minimax_cal.measuring.history import moves
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+
+TRUTH = Truth(noise=17.5e-6, noise_per_metre=0.0)
+RIGID = Truth(noise=17.5e-6, noise_per_metre=0.0, compliance=0.0)
+REAL = ("irb120", "fanuc_r2000", "qkm_hl6", "ur10_b", "meca500_r")
+
+
+def of(found: tuple[Fault, ...], effect: str) -> list[Fault]:
+    return [fault for fault in found if fault.effect == effect]
+
+
+def points(found: tuple[Fault, ...]) -> set[tuple[int, int]]:
+    both = [(f.rows, f.targets) for f in of(found, "outliers")]
+    return {(int(r), int(t)) for rows, targets in both for r, t in zip(rows, targets, strict=True)}
+
+
+def flange(data: Measurements) -> tuple[Array, Array, Array]:
+    """Axes of the targets' triangle at each pose, the third across it: (m, 3) each."""
+    first = data.y[:, 1] - data.y[:, 0]
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    across = np.cross(first, data.y[:, 2] - data.y[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return first, np.cross(across, first), across
+
+
+def displaced(data: Measurements, rows: int | slice, target: int, by: Array) -> Measurements:
+    y = data.y.copy()
+    y[rows, target] += by
+    return data.with_y(y)
+
+
+def pushes(sim: Simulation, data: Measurements) -> Array:
+    """(k, m, 3, n) displacement of each target per joint, by central differences."""
+    step = 1e-6 * np.eye(data.q.shape[1])
+    sides = [(sim.cell.predict(data.q + s), sim.cell.predict(data.q - s)) for s in step]
+    return np.moveaxis(np.stack([(a - b) / 2e-6 for a, b in sides], axis=-1), 1, 0)
+
+
+def test_good_data_are_left_alone(robot: mc.Robot) -> None:
+    for seed in range(40):
+        data = simulate(robot, 100 + 2 * seed, 3, seed=seed, truth=TRUTH).data
+        assert find_faults(data) == ()
+        assert_array_equal(mended(data, ()).y, data.y)
+
+
+def test_a_point_moved_within_the_plane_of_the_targets_is_found(robot: mc.Robot) -> None:
+    rng, hits, named = np.random.default_rng(3), 0, 0
+    for seed in range(40):
+        data = simulate(robot, 120, 3, seed=seed, truth=TRUTH).data
+        row, target, angle = int(rng.integers(120)), int(rng.integers(3)), rng.uniform(0, 2 * np.pi)
+        e1, e2, _ = flange(data)
+        by = 0.3e-3 * (np.cos(angle) * e1[row] + np.sin(angle) * e2[row])
+        found = points(find_faults(displaced(data, row, target, by)))
+        assert {r for r, _ in found} <= {row}
+        hits += (row, target) in found
+        named += found == {(row, target)}
+    assert hits >= 38
+    assert named >= 15  # across an edge one distance changes, and two are suspected
+
+
+def test_a_fit_shows_points_moved_across_the_plane(robot: mc.Robot) -> None:
+    for seed in range(5):
+        data = simulate(robot, 120, 3, seed=seed, truth=RIGID).data
+        across = flange(data)[2]
+        bad = displaced(data, 17, 1, 0.3e-3 * across[17])
+        assert points(find_faults(bad)) == set()  # no distance tells it
+        error = mc.calibrate(robot, bad, "sum", holdout=0.0).cell.error(bad)
+        assert points(find_faults(bad, error)) == {(17, 1)}
+
+
+def test_two_bad_points_in_a_row_and_a_gross_one(robot: mc.Robot) -> None:
+    data = simulate(robot, 120, 4, seed=2, truth=RIGID).data
+    bad = displaced(data, 5, 0, np.array([2e-3, 1e-3, -1e-3]))
+    bad = displaced(bad, 5, 3, np.array([-1e-3, 2e-3, 1e-3]))
+    bad = displaced(bad, 60, 2, np.array([0.05, 0.0, 0.02]))
+    found = find_faults(bad)
+    assert points(found) == {(5, 0), (5, 3), (60, 2)}
+    y = mended(bad, found).y
+    assert np.isnan(y[[5, 5, 60], [0, 3, 2]]).all()
+    assert np.isnan(y).sum() == 9
+    assert_array_equal(y[np.isfinite(y)], data.y[np.isfinite(y)])
+
+
+def test_missing_points_are_no_outliers(robot: mc.Robot, rng: np.random.Generator) -> None:
+    data = simulate(robot, 150, 3, seed=4, truth=TRUTH).data
+    y = data.y.copy()
+    y[rng.uniform(size=(150, 3)) < 0.2] = np.nan
+    data = data.with_y(y)
+    data = data.take(np.asarray(data.seen.any(axis=1)))
+    assert find_faults(data) == ()
+    row = int(np.flatnonzero(data.seen.all(axis=1))[10])
+    bad = displaced(data, row, 2, 0.5e-3 * flange(data)[0][row])
+    assert (row, 2) in points(find_faults(bad))
+
+
+@pytest.mark.parametrize("targets", [1, 2])
+def test_few_targets_need_the_fit(robot: mc.Robot, targets: int) -> None:
+    data = simulate(robot, 80, targets, seed=1, truth=TRUTH).data
+    bad = displaced(data, 11, targets - 1, np.array([0.0, 0.03, 0.02]))
+    error = mc.calibrate(robot, bad, "sum", holdout=0.0).cell.error(bad)
+    assert points(find_faults(bad, error)) == {(11, targets - 1)}
+
+
+def test_swapped_rows_are_found_and_put_right(robot: mc.Robot) -> None:
+    data = simulate(robot, 100, 3, seed=8, truth=TRUTH).data
+    y = data.y.copy()
+    y[[3, 50]] = y[[3, 50]][:, [1, 0, 2]]
+    y[70] = y[70][[2, 0, 1]]
+    bad = data.with_y(y)
+    found = find_faults(bad)
+    assert [fault.effect for fault in found] == ["swapped_rows"]
+    assert_array_equal(found[0].rows, [3, 50, 70])
+    assert_array_equal(mended(bad, found).y, data.y)
+
+
+def test_a_fit_names_the_targets_of_an_even_triangle(robot: mc.Robot) -> None:
+    sim = simulate(robot, 100, 3, seed=8, truth=RIGID)
+    angle = 2.0 * np.pi * np.arange(3) / 3
+    spots = np.stack([np.cos(angle), np.sin(angle) * 1.4, 3.0 + 0.0 * angle], axis=1) * 0.1
+    cell = replace(sim.cell, spots=spots)  # two sides alike
+    rng = np.random.default_rng(0)
+    good = sim.data.with_y(cell.predict(sim.data.q) + 17.5e-6 * rng.normal(size=sim.data.y.shape))
+    y = good.y.copy()
+    y[40] = y[40][[1, 2, 0]]
+    bad = good.with_y(y)
+    (fault,) = faults.swapped_rows(bad, cell.error(bad))
+    assert_array_equal(mended(bad, (fault,)).y, good.y)
+    y[41] = y[41][[0, 2, 1]]  # the exchange of the alike ones shows in no distance
+    assert_array_equal(faults.swapped_rows(good.with_y(y))[0].rows, [40])
+
+
+def test_a_nest_that_moved_is_found_with_its_time_and_size(robot: mc.Robot) -> None:
+    rng, sure = np.random.default_rng(5), 0
+    for seed in range(15):
+        data = simulate(robot, 120, 3, seed=seed, truth=TRUTH).data
+        first, target, angle = int(rng.integers(20, 100)), seed % 3, rng.uniform(0, 2 * np.pi)
+        e1, e2, _ = flange(data)
+        by = 0.2e-3 * (np.cos(angle) * e1 + np.sin(angle) * e2)[first:]
+        bad = displaced(data, slice(first, None), target, by)
+        shuffle = rng.permutation(120)  # the file need not be in visit order
+        found = find_faults(bad.take(shuffle))
+        (fault,) = found
+        assert fault.effect == "target_shift"
+        assert target in fault.targets
+        assert abs(shuffle[fault.rows[0]] - first) <= 2
+        assert_array_equal(np.diff(shuffle[fault.rows]), 1)
+        size = fault.parameters[0]
+        assert size.unit == "m"
+        if len(fault.targets) == 1:  # else its neighbour may have moved, by a little more or less
+            assert_allclose(size.value, 0.2e-3, atol=0.04e-3)
+            sure += 1
+        assert_array_equal(mended(bad, found).y, bad.y)  # fitted later as an effect
+    assert sure >= 8
+
+
+def test_a_nest_that_moved_hides_no_outlier(robot: mc.Robot) -> None:
+    data = simulate(robot, 120, 3, seed=3, truth=TRUTH).data
+    e1, e2, _ = flange(data)
+    bad = displaced(data, slice(50, None), 1, 0.5e-3 * e2[50:])
+    bad = displaced(bad, 80, 0, 0.4e-3 * (e1 + e2)[80])
+    found = find_faults(bad)
+    assert {fault.effect for fault in found} == {"target_shift", "outliers"}
+    assert {row for row, _ in points(found)} == {80}
+
+
+def test_a_steady_drift_is_no_shift(robot: mc.Robot) -> None:
+    data = simulate(robot, 150, 3, seed=3, truth=TRUTH).data
+    grown = flange(data)[0] * np.linspace(0.0, 0.2e-3, 150)[:, None]
+    assert of(find_faults(displaced(data, slice(None), 1, grown)), "target_shift") == []
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_arms_raise_no_false_alarm(name: str) -> None:
+    robot, path = shared(name)
+    data = mc.read_measurements(path)
+    error = mc.calibrate(robot, data, "sum", holdout=0.0).cell.error(data)
+    for found in (find_faults(data), find_faults(data, error)):
+        assert [f.effect for f in found] == (["readback"] if name == "irb120" else [])
+        assert all(fault.notice for fault in found)
+
+
+def test_irb120_with_points_spoilt_on_purpose() -> None:
+    data = mc.read_measurements(shared("irb120")[1])
+    e1, _, _ = flange(data)
+    bad = displaced(data, 100, 1, 0.15e-3 * e1[100])
+    bad = displaced(bad, slice(300, None), 2, 0.05e-3 * e1[300:])
+    found = find_faults(bad)
+    assert (100, 1) in points(found)
+    (shift,) = of(found, "target_shift")
+    assert 2 in shift.targets
+    assert abs(int(shift.rows[0]) - 300) <= 3
+
+
+def test_irb120_read_its_joints_back_too_early() -> None:
+    data = mc.read_measurements(shared("irb120")[1])
+    (late,) = faults.unsettled(data)
+    amounts = {amount.name: amount.value for amount in late.parameters}
+    assert late.notice
+    assert amounts["explained"] > 0.95  # one fraction of the last move in each row
+    assert amounts["fraction"] > 0.0
+    read = {f"qread{j + 1}": data.q[:, j] for j in range(6)}
+    exchanged = replace(data, q=faults.read_back(data), columns={**data.columns, **read})
+    (wrong,) = faults.unsettled(exchanged)
+    assert not wrong.notice
+    assert "give the commanded" in wrong.text
+
+
+@pytest.mark.parametrize("which", ["commanded", "read back"])
+def test_irb120_tells_commanded_from_read_joints_by_its_errors(which: str) -> None:
+    path, file = shared("irb120")
+    robot, data = mc.load_robot(path), mc.read_measurements(file)
+    if which == "read back":
+        data = replace(data, q=faults.read_back(data))
+    cell = mc.calibrate(robot, data, "sum", holdout=0.0).cell
+    found = faults.looks_read_back(data, cell.error(data), pushes(Simulation(data, cell), data))
+    assert bool(found) == (which == "read back")
+
+
+def test_backlash_is_not_taken_for_read_back_joints(robot: mc.Robot) -> None:
+    sim = simulate(robot, 150, 3, seed=1, truth=TRUTH)
+    data, push = sim.data, pushes(sim, sim.data)
+    slack = np.einsum("kmcj,mj->mkc", push, 150e-6 * np.sign(moves(data)))
+    fraction = np.random.default_rng(0).gamma(1.0, 6e-4, size=(150, 1))
+    late = np.einsum("kmcj,mj->mkc", push, fraction * moves(data))
+    for by, expected in ((slack, 0), (late, 1)):
+        bad = data.with_y(data.y + by)
+        error = mc.calibrate(robot, bad, "sum", holdout=0.0).cell.error(bad)
+        assert len(faults.looks_read_back(bad, error, push)) == expected
+
+
+def test_read_joints_that_agree_are_nothing(robot: mc.Robot, rng: np.random.Generator) -> None:
+    data = simulate(robot, 50, 3, seed=1).data
+    for size, count in ((1e-6, 0), (1e-3, 1)):
+        read = data.q + size * rng.normal(size=data.q.shape)
+        columns = {**data.columns, **{f"qread{j + 1}": read[:, j] for j in range(6)}}
+        found = faults.unsettled(replace(data, columns=columns))
+        assert len(found) == count
+        assert all("settled" not in fault.text for fault in found)  # noise is no lag
+
+
+def halves(data: Measurements) -> Measurements:
+    session = np.array(["a"] * (data.poses // 2) + ["b"] * (data.poses - data.poses // 2))
+    return replace(data, columns={**data.columns, "session": session})
+
+
+def test_sessions_in_other_units(robot: mc.Robot) -> None:
+    data = halves(simulate(robot, 100, 3, seed=1).data)
+    assert find_faults(data) == ()
+    later = data.columns["session"] == "b"
+    millimetres = data.with_y(np.where(later[:, None, None], 1e3, 1.0) * data.y)
+    degrees = replace(data, q=np.where(later[:, None], np.degrees(data.q), data.q))
+    for bad in (millimetres, degrees):
+        (fault,) = faults.mixed_units(bad)
+        assert_array_equal(fault.rows, np.flatnonzero(later))
+
+
+def test_a_base_that_jumps_between_sessions(robot: mc.Robot) -> None:
+    data = halves(simulate(robot, 100, 3, seed=1, truth=TRUTH).data)
+    later = (data.columns["session"] == "b")[:, None, None]
+    for jump, count in ((0.0, 0), (0.5e-3, 1)):
+        moved = data.with_y(data.y + np.where(later, [0.0, jump, jump], 0.0))
+        error = mc.calibrate(robot, moved, "sum", holdout=0.0).cell.error(moved)
+        found = faults.session_jumps(moved, error)
+        assert len(found) == count
+        assert all(fault.notice for fault in found)
+
+
+@pytest.mark.parametrize("targets", [1, 3])
+def test_noise_other_than_declared(robot: mc.Robot, targets: int) -> None:
+    data = simulate(robot, 60, targets, seed=1, truth=TRUTH).data
+    twice = data.take(np.repeat(np.arange(60), 2))
+    twice = twice.with_y(twice.y + 17.5e-6 * np.random.default_rng(0).normal(size=twice.y.shape))
+    for declared, count in ((0.04e-3, 0), (0.4e-3, 1)):
+        columns = {**twice.columns, "u95": np.full(120, declared)}
+        assert len(faults.noise(replace(twice, columns=columns))) == count

@@ -1,0 +1,135 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.measuring.measurements import groups, split
+
+HEAD = "q1_rad,q2_rad,smr1_x_mm,smr1_y_mm,smr1_z_mm"
+GOOD = HEAD + "\n0.1,0.2,1,2,3\n0.3,0.4,4,5,6\n"
+
+
+def read(text: str | bytes, tmp_path: Path) -> mc.Measurements:
+    path = tmp_path / "m.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return mc.read_measurements(path)
+
+
+def test_units_stand_in_the_header(tmp_path: Path) -> None:
+    data = read("q1_deg,q2_mm,smr2_x_m,smr2_y_mm,smr2_z_mm,u95_mm\n90,100,1,2,3,0.05\n", tmp_path)
+    assert_allclose(data.q, [[np.pi / 2, 0.1]], rtol=1e-15)
+    assert_allclose(data.y, [[[1.0, 0.002, 0.003]]], rtol=1e-15)
+    assert_array_equal(data.sliding, [False, True])
+    assert data.targets == ("smr2",)
+    assert_allclose(data.columns["u95"], [5e-5])
+
+
+def test_empty_cells_are_targets_not_measured(tmp_path: Path) -> None:
+    head = HEAD + ",smr2_x_mm,smr2_y_mm,smr2_z_mm"
+    data = read(f"{head}\n0,0,,,,1,2,3\n0,1,1,2,3,,,\n1,1,,,,,,\n", tmp_path)
+    assert_array_equal(data.seen, [[False, True], [True, False]])
+    assert "1 rows hold no measured target" in data.notices[0]
+
+
+def test_unknown_columns_are_kept_with_a_notice(tmp_path: Path) -> None:
+    data = read(GOOD.replace("z_mm\n", "z_mm,operator,tempeture_C\n").replace("\n", ",\n")
+                .replace("3,\n", "3,ann,20\n").replace("6,\n", "6,bob,21\n").replace("_C,", "_C"),
+                tmp_path)  # fmt: skip
+    assert list(data.unknown["operator"]) == ["ann", "bob"]
+    assert any("column operator is not used" in note for note in data.notices)
+    assert any("did you mean temperature_C" in note for note in data.notices)
+
+
+def test_byte_order_mark_crlf_and_trailing_commas_are_fine(tmp_path: Path) -> None:
+    text = ("\ufeff" + GOOD.replace("\n", ",\r\n")).encode()
+    assert read(text, tmp_path).poses == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ("", "is empty"),
+        (HEAD + "\n", "no rows"),
+        (GOOD.replace("q2_rad", "q3_rad"), "column q2_rad is missing"),
+        (GOOD.replace("q1_rad,q2_rad", "a,b"), "no joint columns"),
+        (GOOD.replace(",", ";"), "separated by ';'"),
+        (GOOD.replace("q2_rad", "q2_deg"), "mix _rad and _deg"),
+        (GOOD.replace("q2_rad", "q1_rad"), "stands twice"),
+        (GOOD.replace("smr1_y_mm", "smr1_y"), "column smr1_y_mm is missing"),
+        (GOOD.replace("smr1", "tcp"), "no target columns"),
+        (GOOD.replace("0.3,0.4", "0.3,abc"), ":3: column q2_rad: 'abc' is not a number"),
+        (GOOD.replace("0.3,0.4", "0.3,"), ":3: column q2_rad: is empty"),
+        (GOOD.replace("0.3,0.4", "0.3,nan"), ":3: column q2_rad: nan is not a finite"),
+        (GOOD.replace("4,5,6", "4,inf,6"), ":3: column smr1_y_mm: inf is not a finite"),
+        (GOOD.replace("4,5,6", "4,,6"), ":3: smr1 has some of x, y, z only"),
+        (GOOD.replace("4,5,6", "4,5"), ":3: 4 cells, but the header has 5"),
+        (GOOD.replace("4,5,6", "4,5,6,7"), ":3: 6 cells, but the header has 5"),
+        (GOOD.replace("4,5,6", '"4,5",5,6'), "use a decimal point"),
+        (HEAD + "\n0,0,,,\n", "no target was measured"),
+        (HEAD + ",smr2_x_mm,smr2_y_mm,smr2_z_mm\n0,0,1,2,3,,,\n", "smr2 is measured at no pose"),
+        (HEAD + "\n0,0,1,2,3\n1,0,1,2,3\n2,0,1,2,3\n", "all points of smr1 are the same"),
+        (GOOD.replace("4,5,6", "4,5,1e12"), ":3: smr1 is more than 100 km away"),
+        (GOOD.replace("4,5,6", "4,5,1_000"), "'1_000' is not a number"),
+        (
+            GOOD.replace("z_mm", "z_mm,u95_mm").replace("3\n", "3,0\n").replace("6\n", "6,1\n"),
+            ":2: column u95_mm: 0 is not positive",
+        ),
+        (b"\xff\xfe\x00", "is not UTF-8"),
+        (b"q1_rad\x00", "not a text file"),
+    ],
+)
+def test_broken_files_name_line_and_column(text: str | bytes, say: str, tmp_path: Path) -> None:
+    with pytest.raises(mc.DataError) as caught:
+        read(text, tmp_path)
+    assert say in str(caught.value)
+    assert "m.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_written_measurements_come_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    y = rng.normal(size=(5, 2, 3))
+    y[2, 1] = np.nan
+    columns = {"u95": np.full(5, 1e-4), "order": np.arange(5), "session": np.array(list("aabbb"))}
+    columns |= {"tau1": rng.normal(size=5), "qread2": rng.normal(size=5), "time": np.arange(5.0)}
+    data = mc.measurements(rng.normal(size=(5, 3)), y, **columns)
+    mc.write_measurements(tmp_path / "w.csv", data)
+    again = mc.read_measurements(tmp_path / "w.csv")
+    assert again.notices == ()
+    assert_allclose(again.q, data.q, atol=1e-9)
+    assert_allclose(again.y, data.y, atol=1e-9)
+    assert set(again.columns) == set(columns)
+    assert_allclose(again.columns["u95"], columns["u95"], rtol=1e-8)
+    assert_array_equal(again.columns["session"], columns["session"])
+
+
+def test_rows_of_one_pose_stay_together() -> None:
+    rng = np.random.default_rng(2)
+    q = rng.normal(size=(20, 6))[np.repeat(np.arange(20), 3)]
+    data = mc.measurements(q, rng.normal(size=(60, 3)))
+    for seed in range(5):
+        train, held, _ = split(data, 0.3, seed)
+        assert held.poses == 18
+        assert not set(map(tuple, train.q)) & set(map(tuple, held.q))
+    labels = np.array([""] * 58 + ["p", "p"])
+    labels[0] = "p"  # rows 0-2 and 57-59 are the same pose by name
+    named = mc.measurements(q, rng.normal(size=(60, 3)), pose=labels)
+    assert len(np.unique(groups(named))) == 19
+
+
+def test_the_split_column_decides(tmp_path: Path) -> None:
+    text = HEAD + ",split\n0,0,1,2,3,train\n1,0,1,2,3,holdout\n"
+    train, held, notices = split(read(text, tmp_path), 0.5, 0)
+    assert (train.poses, held.poses) == (1, 1)
+    assert "split column" in notices[0]
+    with pytest.raises(mc.DataError, match=":3: column split: 'test'"):
+        split(read(text.replace("holdout", "test"), tmp_path), 0.5, 0)
+
+
+def test_the_same_seed_gives_the_same_split() -> None:
+    data = mc.measurements(np.arange(40.0).reshape(20, 2), np.eye(20)[:, :3])
+    first, second, other = (split(data, 0.25, seed)[1].q for seed in (3, 3, 4))
+    assert_array_equal(first, second)
+    assert not np.array_equal(first, other)

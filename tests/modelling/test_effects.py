@@ -1,0 +1,469 @@
+"""Every effect's law against an independent expectation, and its columns against finite changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects import EFFECTS, Scene, Term
+from minimax_cal.modelling.effects.scene import Columns
+from minimax_cal.modelling.effects.table import Fitted, fitted_from_list, terms
+from minimax_cal.modelling.effects.time import ROOM
+from minimax_cal.modelling.simulate import random_poses
+from minimax_cal.robots.gravity import G
+from minimax_cal.robots.robot import robot_from_dict
+
+DOCS = ROOT / "docs" / "effects.md"
+EXACT = 1e-12  # relative: the same arithmetic by another way
+BASE = (Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix(), np.array([2.5, -1.0, 0.4]))
+SPOTS = np.array([[0.1, 0.0, 0.05], [-0.05, 0.09, 0.05], [-0.05, -0.08, 0.06]])
+MASSES = (100.0, 60.0, 45.0, 20.0, 8.0, 3.0)
+CENTRES = ([-60, 90, 5], [-430, 12, -30], [-70, 0, 40], [8, 250, 3], [0, -10, 25], [0, 4, -40])
+
+
+def weighty(**changes: object) -> mc.Robot:
+    """An IRB 2600 with masses, gear ratios, one reversed joint and a base that is not level."""
+    content = mc.load_robot("irb2600").to_dict() | {"up": [0.1, -0.05, 1.0]}
+    for joint, mass, com in zip(content["joints"], MASSES, CENTRES, strict=True):
+        joint |= {"mass_kg": mass, "com_mm": com, "ratio": 101.0}
+    content["joints"][2]["sign"] = -1
+    return replace(robot_from_dict(content), **changes)  # type: ignore[arg-type]
+
+
+def visited(robot: mc.Robot, poses: int = 40, seed: int = 0) -> mc.Measurements:
+    """Poses in an order, with the columns that laws ask for."""
+    rng = np.random.default_rng(seed)
+    q = random_poses(robot, poses, rng)
+    return mc.measurements(
+        q,
+        np.ones((poses, 3, 3)) * np.arange(1.0, 1.0 + poses)[:, None, None],
+        order=np.arange(poses, dtype=float),
+        time=np.sort(rng.uniform(0.0, 3600.0, poses)),
+        temperature=rng.uniform(18.0, 30.0, poses),
+        payload=rng.choice([0.0, 5.0, 10.0], poses),
+    )
+
+
+def scene_of(robot: mc.Robot, data: mc.Measurements) -> Scene:
+    return Scene.of(robot, data, BASE, SPOTS, data.q * robot.sign)
+
+
+def all_terms(scene: Scene) -> list[Term]:
+    """Every effect at every place, in every variant and some finer ones."""
+    out = []
+    for name, effect in EFFECTS.items():
+        for place in effect.places(scene):
+            for choice in effect.choices(scene, place):
+                out += [Term(name, place, c) for c in (choice, *effect.finer(scene, choice)[:2])]
+    return out
+
+
+ROBOT = weighty()
+DATA = visited(ROBOT)
+SCENE = scene_of(ROBOT, DATA)
+NO_MASSES = replace(ROBOT, mass=np.full(6, np.nan), com=np.full((6, 3), np.nan))
+SLIDING = replace(ROBOT, prismatic=np.arange(6) == 2)
+TAU = {f"tau{j + 1}": np.random.default_rng(j).normal(size=40) for j in range(6)}
+SCENES = {
+    "masses": SCENE,
+    "no masses": scene_of(NO_MASSES, DATA),
+    "a slide": scene_of(SLIDING, visited(SLIDING)),
+    "torques": scene_of(ROBOT, replace(DATA, columns={**DATA.columns, **TAU})),
+}
+
+
+def columns(name: str, place: str, scene: Scene = SCENE, **choice: float) -> Columns:
+    return Term(name, place, choice).columns(scene)
+
+
+def test_the_scene_shows_every_effect() -> None:
+    assert {term.effect for term in all_terms(SCENE)} == set(EFFECTS)
+    assert all(effect.needs(SCENE) == "" for effect in EFFECTS.values())
+
+
+def test_every_effect_is_in_the_guide() -> None:
+    text = DOCS.read_text()
+    for effect in EFFECTS.values():
+        assert f"`{effect.name}`" in text
+
+
+@pytest.mark.parametrize("which", SCENES)
+def test_columns_have_names_units_and_finite_fields(which: str) -> None:
+    scene = SCENES[which]
+    for term in all_terms(scene):
+        found = term.columns(scene)
+        field = found.displacement(scene)
+        assert len(found.names) == len(found.units) == len(field), term
+        assert field.shape[1:] == scene.points.shape, term
+        assert np.all(np.isfinite(field)), term
+        assert np.all(np.abs(field).max(axis=(1, 2, 3)) > 0.0), term
+        assert len(set(found.names)) == len(found.names), term
+        for owner, doubt in found.doubts(scene):
+            assert 0 <= owner < len(found.names), term
+            assert doubt.shape[1:] == scene.points.shape, term
+            assert np.all(np.isfinite(doubt)), term
+
+
+@pytest.mark.parametrize("which", SCENES)
+def test_columns_are_the_derivative_of_the_points(which: str) -> None:
+    """Central difference of the exact points; its own error is of second order in the step."""
+    scene = SCENES[which]
+    for term in all_terms(scene):
+        field = term.columns(scene).displacement(scene)
+        for i, slope in enumerate(field):
+            step = 1e-5 / np.abs(slope).max() * np.eye(len(field))[i]  # moves by 10 um at most
+            up, down = (Fitted((term,), (sign * step,)).points(scene) for sign in (1.0, -1.0))
+            change = (up - down) / (2.0 * step[i])
+            assert_allclose(change, slope, rtol=0, atol=1e-5 * np.abs(slope).max(), err_msg=term)
+
+
+@pytest.mark.parametrize("which", SCENES)
+def test_a_part_of_the_data_sees_the_same_law(which: str) -> None:
+    """With the history kept, a pose's displacement does not depend on which others are there."""
+    scene = SCENES[which]
+    for rows in (np.arange(5, 25), np.array([7])):
+        part = scene_of(scene.robot, scene.data.take(rows))
+        for term in all_terms(scene):
+            whole, some = term.columns(scene), term.columns(part)
+            assert some.names == whole.names, term
+            assert some.units == whole.units, term
+            expected = whole.displacement(scene)[..., rows]
+            size = np.abs(expected).max()
+            found = some.displacement(part)
+            assert_allclose(found, expected, rtol=0, atol=1e-9 * size, err_msg=term)
+
+
+def test_effects_are_read_back_from_their_json() -> None:
+    terms = tuple(all_terms(SCENE))
+    values = tuple(1e-6 * np.ones(len(term.columns(SCENE).names)) for term in terms)
+    told = Fitted(terms, values)
+    again = fitted_from_list(told.to_list())
+    assert_allclose(again.points(SCENE), told.points(SCENE), rtol=0, atol=0)
+
+
+def test_every_term_is_read_back_from_its_text() -> None:
+    for term in all_terms(SCENE):
+        (again,) = terms(SCENE, [term.text])
+        assert (again.label, dict(again.choice)) == (term.label, dict(term.choice))
+
+
+# ---------------------------------------------------------------- weight
+
+
+def potential(scene: Scene, q: Array) -> Array:
+    """(m,) potential energy of links and payload at joint values (m, n), frame by frame [J]."""
+    robot, payload = scene.robot, scene.column("payload")
+    pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    energy = np.zeros(len(q), dtype=q.dtype)
+    for i, (a, d, theta, alpha, beta) in enumerate(robot.mdh):
+        turn = q[:, i] + theta
+        link = np.zeros((len(q), 4, 4), dtype=q.dtype)
+        ca, sa = np.cos(alpha), np.sin(alpha)
+        c, s = np.cos(turn), np.sin(turn)
+        link[:, 0], link[:, 1] = (np.stack(row, axis=-1) for row in (
+            (c, -s * ca, s * sa, a * c), (s, c * ca, -c * sa, a * s)))  # fmt: skip
+        link[:, 2], link[:, 3] = (0.0, sa, ca, d), (0.0, 0.0, 0.0, 1.0)
+        assert beta == 0.0
+        pose = pose @ link
+        centre = pose[:, :3, :3] @ scene.masses[1][i] + pose[:, :3, 3]
+        energy = energy + scene.masses[0][i] * G * (centre @ robot.up)
+    tip = pose[:, :3, :3] @ scene.spots.mean(axis=0) + pose[:, :3, 3]
+    return np.asarray(energy + payload * G * (tip @ robot.up))
+
+
+@pytest.mark.parametrize("which", ["masses", "no masses"])
+def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
+    scene = SCENES[which]
+    step = 1e-30j
+    for j in range(6):
+        moved = scene.q.T + step * np.eye(6)[j]
+        slope = potential(scene, moved).imag / 1e-30
+        assert_allclose(scene.gravity[j], -slope, rtol=0, atol=EXACT * 1e4)
+
+
+def test_torque_is_the_one_of_pinocchio() -> None:
+    pin = pytest.importorskip("pinocchio")
+    data = replace(DATA, columns={k: v for k, v in DATA.columns.items() if k != "payload"})
+    scene = scene_of(ROBOT, data)
+    model = pin.Model()
+    model.gravity.linear = -G * ROBOT.up
+    before = pin.SE3.Identity()  # what lies between the frame before and the joint's axis
+    parent = 0
+    for i, (a, d, theta, alpha, beta) in enumerate(ROBOT.mdh):
+        parent = model.addJoint(parent, pin.JointModelRZ(), before, f"j{i}")
+        turn = Rotation.from_euler("XY", [alpha, beta]).as_matrix()
+        before = pin.SE3(turn, np.array([a, 0.0, d]))
+        turned = Rotation.from_euler("z", theta).as_matrix()
+        before = pin.SE3(turned, np.zeros(3)) * before  # theta after the joint: a fixed turn
+        inertia = pin.Inertia(MASSES[i], before.act(ROBOT.com[i]), np.zeros((3, 3)))
+        model.appendBodyToJoint(parent, inertia, pin.SE3.Identity())
+    memory = model.createData()
+    for m in range(scene.poses):
+        expected = -pin.computeGeneralizedGravity(model, memory, scene.q[:, m])
+        assert_allclose(scene.gravity[:, m], expected, rtol=0, atol=EXACT * 1e4)
+
+
+def test_compliant_joints_turn_with_their_torque() -> None:
+    for j in range(1, 6):
+        (choice,) = EFFECTS["joint_compliance"].choices(SCENE, f"J{j + 1}")
+        found = columns("joint_compliance", f"J{j + 1}", **choice)
+        assert found.names == (f"c{j + 1}",)
+        assert_allclose(found.turn[0, j], SCENE.gravity[j], rtol=EXACT)
+        assert not np.delete(found.turn[0], j, axis=0).any()
+
+
+def test_payload_adds_its_torque_even_where_it_never_changes() -> None:
+    loaded = replace(DATA, columns={**DATA.columns, "payload": np.full(40, 7.0)})
+    empty = replace(DATA, columns={**DATA.columns, "payload": np.zeros(40)})
+    with_load, without = scene_of(ROBOT, loaded), scene_of(ROBOT, empty)
+    centre = SCENE.points.mean(axis=0)
+    pull = np.broadcast_to(-7.0 * G * ROBOT.up[:, None], centre.shape)
+    for j in range(6):
+        arm = centre - SCENE.links.before[j]
+        torque = (SCENE.links.z[j] * np.cross(arm, pull, axis=0)).sum(axis=0)
+        found = with_load.gravity[j] - without.gravity[j]
+        assert_allclose(found, torque, rtol=0, atol=EXACT * 1e4)
+
+
+def test_measured_torques_replace_computed_ones() -> None:
+    scene = SCENES["torques"]
+    for j in range(6):
+        expected = TAU[f"tau{j + 1}"] * ROBOT.sign[j]
+        assert_allclose(scene.gravity[j], expected, rtol=0, atol=0)
+    assert not len(scene.gravity_parts)  # what is measured is not doubted
+
+
+def test_unknown_masses_give_torques_of_parts() -> None:
+    scene = SCENES["no masses"]
+    (choice,) = EFFECTS["joint_compliance"].choices(scene, "J2")
+    found = columns("joint_compliance", "J2", scene, **choice)
+    assert found.names == ("c2 (upper arm)", "c2 (forearm)", "c2 (wrist)")
+    # the parts add up to the torque of all links, and none follows from the others
+    assert_allclose(found.turn[:, 1].sum(axis=0), scene.gravity[1], rtol=0, atol=EXACT * 1e4)
+    assert np.linalg.matrix_rank(found.turn[:, 1]) == 3
+    (choice,) = EFFECTS["joint_compliance"].choices(SCENE, "J2")
+    assert len(columns("joint_compliance", "J2", **choice).names) == 1
+
+
+def test_doubt_is_the_change_of_torque_for_other_masses() -> None:
+    """The doubts kept span the most of what one sigma of every mass and centre adds up to."""
+    parts = SCENE.gravity_parts[:, 1]
+    heavier = ROBOT.mass.copy()
+    heavier[1] *= 1.2
+    expected = SCENE.torque(heavier, ROBOT.com)[1] - SCENE.torque(ROBOT.mass, ROBOT.com)[1]
+    assert_allclose(parts[0], expected, rtol=0, atol=EXACT * 1e4)
+    (choice,) = EFFECTS["joint_compliance"].choices(SCENE, "J2")
+    (kept,) = columns("joint_compliance", "J2", **choice).doubt
+    whole, told = (part.T @ part for part in (parts, kept[:, 1]))
+    left = np.linalg.eigvalsh(whole - told)
+    assert left.min() > -1e-9 * left.max()
+    assert np.trace(told) > 0.95 * np.trace(whole)
+
+
+# ---------------------------------------------------------------- bending
+
+
+def beam(load: float) -> Scene:
+    """Link 1 is a horizontal bar of 2 m along x; link 2 a point mass 0.5 m beyond it."""
+    joints = [
+        {"a": 2000.0, "d": 0, "theta": 0, "alpha": 0, "mass_kg": 9.0, "com_mm": [-1000, 0, 0]},
+        {"a": 500.0, "d": 0, "theta": 0, "alpha": 0, "mass_kg": load, "com_mm": [0, 0, 0]},
+    ]
+    units = {"length": "mm", "angle": "rad"}
+    robot = robot_from_dict({"name": "beam", "units": units, "joints": joints})
+    data = mc.measurements(np.zeros((1, 2)), np.ones((1, 1, 3)))
+    spot = np.array([[-0.5, 0.0, 0.0]])  # at the end of the bar
+    return Scene.of(robot, data, (np.eye(3), np.zeros(3)), spot, data.q)
+
+
+def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
+    """Tip force F and moment F e: FL^3/3 + (F e) L^2/2 down, slope FL^2/2 + F e L, per 1/EI."""
+    load, length, beyond = 4.0, 2.0, 0.5
+    force = load * G
+    scene = beam(load)
+    sag = -columns("link_bending", "L1", scene).displacement(scene)[0, 0, :, 0]
+    expected = force * length**3 / 3.0 + force * beyond * length**2 / 2.0
+    assert_allclose(sag, [0.0, 0.0, expected], rtol=EXACT, atol=1e-12)
+    slope = force * length**2 / 2.0 + force * beyond * length
+    farther = replace(scene, points=scene.points + np.array([[0.25], [0.0], [0.0]]))
+    found = -columns("link_bending", "L1", farther).displacement(farther)[0, 0, 2, 0]
+    assert_allclose(found, expected + 0.25 * slope, rtol=EXACT)
+
+
+def test_links_that_carry_nothing_do_not_bend() -> None:
+    assert EFFECTS["link_bending"].places(beam(0.0)) == ()
+    assert EFFECTS["link_bending"].places(beam(1.0)) == ("L1",)
+
+
+def test_base_tilts_by_the_moment_of_all_weight() -> None:
+    """omega = C M with M = -sum of m (centre of gravity) x g up, payload at the targets."""
+    found = columns("base_flex", "frame").displacement(SCENE)[0]
+    for m in (0, 17, 39):
+        pose, moment = np.eye(4), np.zeros(3)
+        for i in range(6):
+            one = replace(ROBOT, mdh=ROBOT.mdh[: i + 1], sign=ROBOT.sign[: i + 1],
+                          prismatic=ROBOT.prismatic[: i + 1])  # fmt: skip
+            pose = one.pose(DATA.q[m, : i + 1])
+            centre = pose[:3, :3] @ ROBOT.com[i] + pose[:3, 3]
+            moment += np.cross(centre, -MASSES[i] * G * ROBOT.up)
+        tip = pose[:3, :3] @ SPOTS.mean(axis=0) + pose[:3, 3]
+        moment += np.cross(tip, -DATA.columns["payload"][m] * G * ROBOT.up)
+        expected = np.cross(moment, SCENE.points[:, :, m])
+        assert_allclose(found[:, :, m], expected, rtol=0, atol=EXACT * np.abs(expected).max())
+
+
+def test_bracket_sags_to_gravity_and_not_along_it() -> None:
+    """A bracket along the flange's axis turns by s x g: not at all where it hangs or stands."""
+    pose = ROBOT.pose(DATA.q)
+    axis = pose[:, :3, 2]
+    found = columns("tool_flex", "all", lever=1.0).displacement(SCENE)
+    turn = np.cross(axis, -ROBOT.up)
+    arm = SCENE.points - pose[:, :3, 3].T
+    expected = np.cross(turn.T[None], arm, axis=1)
+    assert_allclose(found[0], expected, rtol=0, atol=EXACT)
+    drawn = axis * -(axis @ ROBOT.up)[:, None]
+    assert_allclose(found[1], np.broadcast_to(drawn.T, found[1].shape), rtol=0, atol=EXACT)
+
+
+def test_any_turn_of_the_bracket_contains_the_others() -> None:
+    free = columns("tool_flex", "all", lever=2.0).displacement(SCENE)
+    basis = free.reshape(len(free), -1).T
+    for lever in (0.0, 1.0):
+        for one in columns("tool_flex", "all", lever=lever).displacement(SCENE):
+            rest = np.linalg.lstsq(basis, one.reshape(-1))[1]
+            assert rest < 1e-20 * (one**2).sum()
+
+
+def test_spring_pulls_as_the_length_of_a_real_spring_has_it() -> None:
+    """Torque is the slope of (s - s0)^2 / 2 by the lean, up to the factor a that k holds."""
+    zero, eye, rest = 0.2, 0.5, 0.4
+    lean = ROBOT.mdh[1, 2] + SCENE.q[1] + np.pi / 2  # from the base's own vertical
+    level = scene_of(replace(ROBOT, up=np.array([0.0, 0.0, 1.0])), DATA)
+    found = columns("gravity_compensator", "J2", level, zero=zero, eye=eye, rest=rest)
+    b = lean - zero + 1e-30j
+    length = np.sqrt(1.0 + eye**2 - 2.0 * eye * np.cos(b))
+    slope = (0.5 * (length - rest) ** 2).imag / 1e-30
+    assert_allclose(found.turn[0, 1], slope / eye, rtol=0, atol=EXACT)
+
+
+# ---------------------------------------------------------------- gears
+
+
+def test_waves_repeat_so_many_times_a_turn() -> None:
+    found = columns("gear_error", "J3", turns=2.0)
+    assert_allclose(found.turn[0, 2] + 1j * found.turn[1, 2], np.exp(2j * SCENE.q[2]), rtol=EXACT)
+    assert found.fixed == {"waves_per_turn": 2.0}
+    ratio = EFFECTS["gear_ripple"].choices(SCENE, "J3")
+    assert [choice["turns"] for choice in ratio] == [101.0, 202.0]
+    later = replace(SCENE.data, q=SCENE.data.q + 2.0 * np.pi / 101.0)
+    again = columns("gear_ripple", "J3", scene_of(ROBOT, later), turns=101.0)
+    assert_allclose(again.turn, columns("gear_ripple", "J3", turns=101.0).turn, rtol=0, atol=1e-11)
+
+
+def test_gain_and_coupling_turn_in_proportion() -> None:
+    assert_allclose(columns("encoder_gain", "J3").turn[0, 2], -DATA.q[:, 2], rtol=0, atol=0)
+    turn = columns("joint_coupling", "J5", source=4.0).turn
+    assert_allclose(turn[0, 4], DATA.q[:, 3], rtol=0, atol=0)
+    assert np.count_nonzero(turn.any(axis=2)) == 1
+
+
+def test_play_is_half_the_backlash_towards_the_last_move() -> None:
+    joint, sign = 2, ROBOT.sign[2]
+    turn = columns("backlash", "J3").turn[0, joint]
+    moves = np.sign(np.diff(DATA.q[:, joint])) * sign
+    assert_allclose(turn, [0.0, *(0.5 * moves)], rtol=0, atol=0)
+    side = np.where(np.arange(40) % 3, 1.0, -1.0)
+    told = replace(DATA, columns={**DATA.columns, "approach3": side})
+    found = columns("backlash", "J3", scene_of(ROBOT, told)).turn[0, joint]
+    assert_allclose(found, 0.5 * side * sign, rtol=0, atol=0)
+
+
+def test_settling_is_a_share_of_the_last_move() -> None:
+    turn = columns("settling", "J2").turn[0, 1]
+    assert_allclose(turn, [0.0, *np.diff(DATA.q[:, 1])], rtol=0, atol=0)
+
+
+# ---------------------------------------------------------------- time
+
+
+def test_warm_arm_is_the_arm_with_longer_links() -> None:
+    """A strain of 1e-5 a kelvin against forward kinematics with lengths scaled."""
+    strain = 1e-5
+    term = Term("thermal_growth", "all", {"temperature": 1.0})
+    moved = Fitted((term,), (np.array([strain]),)).points(SCENE)
+    scale = 1.0 + strain * (DATA.columns["temperature"] - ROOM)
+    long = np.array([[0, 1], [1, 0], [0, 0], [0, 1], [0, 0], [0, 0]])  # d1, a2, d4
+    for m in (0, 21):
+        mdh = ROBOT.mdh.copy()
+        mdh[:, :2] *= np.where(long > 0, scale[m], 1.0)
+        pose = ROBOT.with_mdh(mdh).pose(DATA.q[m])
+        assert_allclose(moved[:, :, m], SPOTS @ pose[:3, :3].T + pose[:3, 3], rtol=0, atol=1e-12)
+
+
+def test_strains_apart_add_up_to_the_common_one() -> None:
+    apart = columns("thermal_growth", "all", constant=0.5, apart=1.0)
+    assert apart.names == ("strain d1", "strain a2", "strain d4")
+    common = columns("thermal_growth", "all", constant=0.5).displacement(SCENE)
+    assert_allclose(apart.displacement(SCENE).sum(axis=0), common[0], rtol=0, atol=EXACT)
+
+
+def test_growth_slows_down_with_its_time_constant() -> None:
+    clock = SCENE.column("clock")
+    straight = columns("thermal_growth", "all", constant=np.inf).shift[0, 0]
+    curved = columns("thermal_growth", "all", constant=0.3).shift[0, 0]
+    late = clock > 0.0
+    share = (1.0 - np.exp(-clock / 0.3)) / np.where(late, clock, 1.0)
+    assert_allclose(curved[:, late], (straight * share)[:, late], rtol=1e-10, atol=1e-12)
+    assert_allclose(clock, (DATA.columns["time"] - DATA.columns["time"].min())
+                    / np.ptp(DATA.columns["time"]), rtol=0, atol=EXACT)  # fmt: skip
+
+
+def test_a_temperature_that_was_not_read_is_not_zero_degrees() -> None:
+    term = Term("thermal_growth", "all", {"temperature": 1.0})
+    gone = DATA.columns["temperature"].copy()
+    gone[3] = np.nan
+    scene = scene_of(ROBOT, replace(DATA, columns={**DATA.columns, "temperature": gone}))
+    field, whole = term.columns(scene).shift, term.columns(SCENE).shift
+    ratio = (np.nanmean(gone) - ROOM) / (DATA.columns["temperature"][3] - ROOM)
+    assert_allclose(field[..., 3], ratio * whole[..., 3], rtol=0, atol=EXACT * 100)
+    never = {k: v for k, v in DATA.columns.items() if k != "temperature"}
+    scene = scene_of(ROBOT, replace(DATA, columns=never))
+    assert not term.columns(scene).shift.any()
+
+
+def test_the_base_drifts_as_one_body() -> None:
+    found = columns("frame_drift", "frame", constant=np.inf)
+    clock, p = SCENE.column("clock"), SCENE.points
+    assert_allclose(found.shift[1, :, 1], np.broadcast_to(clock, (3, 40)), rtol=0, atol=EXACT)
+    assert not found.shift[1, :, [0, 2]].any()
+    expected = clock * np.stack([-p[:, 1], p[:, 0], 0.0 * p[:, 2]], axis=1)  # turn about z
+    assert_allclose(found.shift[5], expected, rtol=0, atol=EXACT)
+
+
+def test_a_nest_moves_in_the_flange_after_its_moment() -> None:
+    since = float(SCENE.column("clock")[15])
+    move = np.array([1e-3, -2e-3, 5e-4])
+    term = Term("target_shift", "smr2", {"since": since})
+    moved = Fitted((term,), (move,)).points(SCENE)
+    spots = SPOTS + np.array([[0.0], [1.0], [0.0]]) * move
+    after = scene_of(ROBOT, DATA).robot.pose(DATA.q)
+    there = np.einsum("mij,kj->kim", after[:, :3, :3], spots) + after[:, :3, 3].T
+    assert_allclose(moved[..., 15:], there[..., 15:], rtol=0, atol=EXACT)
+    assert_allclose(moved[..., :15], SCENE.points[..., :15], rtol=0, atol=0)
+
+
+def test_an_offset_lies_on_the_line_of_sight() -> None:
+    """The instrument is the origin of the measurement frame; one target, and all of them."""
+    rotation, origin = BASE
+    seen = np.einsum("ij,kjm->kim", rotation, SCENE.points) + origin[:, None]
+    away = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    for place, chosen in (("smr3", [2]), ("all", [0, 1, 2])):
+        shift = columns("target_offset", place).shift[0]
+        turned = np.einsum("ij,kjm->kim", rotation, shift)
+        assert_allclose(turned[chosen], away[chosen], rtol=0, atol=EXACT)
+        assert not np.delete(turned, chosen, axis=0).any()

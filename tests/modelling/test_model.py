@@ -1,0 +1,188 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.modelling import model
+from minimax_cal.modelling.model import Prior, SumOfSquares, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots import kinematics
+
+
+def gappy(rng: np.random.Generator) -> mc.Measurements:
+    """Three targets, some not measured, and unequal accuracy."""
+    y = rng.normal(size=(40, 3, 3))
+    y[rng.uniform(size=(40, 3)) < 0.2] = np.nan
+    y[:, 0] = np.where(np.isnan(y[:, 0]), 1.0, y[:, 0])
+    return mc.measurements(rng.uniform(-2, 2, (40, 6)), y, u95=rng.uniform(1e-5, 1e-4, 40))
+
+
+def somewhere(robot: mc.Robot, rng: np.random.Generator) -> State:
+    return State(
+        robot.mdh + 0.1 * rng.normal(size=(6, 5)),
+        kinematics.rotation(rng.normal(size=3)),
+        rng.normal(size=3),
+        0.1 * rng.normal(size=(3, 3)),
+    )
+
+
+def test_normal_equations_are_those_of_the_explicit_jacobian(
+    robot: mc.Robot, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model, "BLOCK", 32)  # several blocks
+    this = model_of(robot, gappy(rng))
+    x = somewhere(robot, rng)
+    active = rng.uniform(size=this.names.count) < 0.7
+    found = this.normal(x, active)
+    jacobian = this.jacobian(x)[..., active]
+    error = np.nan_to_num(this.error(x))
+    weight = this.weight
+    assert_allclose(found.cost, np.einsum("km,kmc,kmc->k", weight, error, error), rtol=1e-13)
+    assert_allclose(this.cost(x), found.cost, rtol=1e-13)
+    slope = np.einsum("km,kmcp,kmc->kp", weight, jacobian, error)
+    assert_allclose(found.slope, slope, rtol=0, atol=1e-12 * np.abs(slope).max())
+    gram = np.einsum("km,kmcp,kmcq->kpq", weight, jacobian, jacobian)
+    assert_allclose(found.gram, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
+
+
+def test_weights_come_from_u95(robot: mc.Robot, rng: np.random.Generator) -> None:
+    data = gappy(rng)
+    this = model_of(robot, data)
+    u95 = data.columns["u95"]
+    assert_allclose(this.weight[0], (np.median(u95) / u95) ** 2, rtol=1e-14)
+    assert np.all(this.weight[1][~data.seen[:, 1]] == 0.0)
+
+
+def test_projected_lengths_are_the_linear_least_squares_ones(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    this = model_of(robot, gappy(rng))
+    linear = this.names.linear
+    chosen = np.zeros(this.names.count, dtype=bool)
+    for name in ("a1", "a2", "d4", "base_x", "base_y", "base_z", "smr1_x", "smr2_y", "theta3"):
+        chosen[this.names.index(name)] = True
+    x = somewhere(robot, rng)
+    y, *_ = SumOfSquares(this.only(chosen)).reduced(x.batch(), full=False)
+    root = np.sqrt(this.weight)[..., None]
+    matrix = (root[..., None] * this.jacobian(x))[..., chosen & linear].reshape(-1, 8)
+    right = (root * np.nan_to_num(this.error(x))).reshape(-1)
+    step = np.zeros(this.names.count)
+    step[chosen & linear] = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    best = x.step(step)
+    assert_allclose(y.mdh[0], best.mdh, rtol=0, atol=1e-12)
+    assert_allclose(y.origin[0], best.origin, rtol=0, atol=1e-12)
+    assert_allclose(y.targets[0], best.targets, rtol=0, atol=1e-12)
+
+
+def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    """J'J from Schur complement and coupling against finite differences of the projected residual.
+
+    The residual is P y with lengths eliminated by dense linear algebra, in measurement axes: an
+    independent route to paper S, eq. 18-24.
+    """
+    from minimax_cal.solvers.least_squares import METHODS, examine
+
+    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))
+    this = model_of(robot, data)
+    names = this.names
+    chosen = np.zeros(names.count, dtype=bool)
+    for name in (
+        *("a1", "a2", "a4", "d4", "d5", "theta2", "theta4", "alpha1", "alpha3", "beta2"),
+        *("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz"),
+        *(f"smr{i}_{axis}" for i in (1, 2, 3) for axis in "xyz"),
+    ):
+        chosen[names.index(name)] = True
+    this = this.only(chosen)
+    linear, angles = chosen & names.linear, chosen & ~names.linear
+    x, *_ = SumOfSquares(this).reduced(somewhere(robot, rng).batch(), full=False)
+    x = x.take(np.array(0))
+
+    def residual(dw: np.ndarray) -> np.ndarray:
+        step = np.zeros(names.count)
+        step[angles] = dw
+        at = x.step(step)
+        matrix = np.einsum("ab,kmbp->kmap", at.rotation, this.jacobian(at)[..., linear])
+        matrix = matrix.reshape(-1, linear.sum())
+        error = (this.error(at) @ at.rotation.T).reshape(-1)
+        return np.asarray(error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0])
+
+    step = 1e-6
+    slopes = np.stack(
+        [(residual(step * e) - residual(-step * e)) / (2 * step) for e in np.eye(angles.sum())],
+        axis=1,
+    )
+    for name in ("snllm", "snllm-kaufman"):
+        found = examine(SumOfSquares(this), x.batch(), METHODS[name])
+        gradient = -slopes.T @ residual(np.zeros(angles.sum()))
+        assert_allclose(found.target[0], gradient, rtol=0, atol=1e-6 * np.abs(gradient).max())
+        off = np.abs(found.matrix[0] - slopes.T @ slopes).max() / np.abs(slopes.T @ slopes).max()
+        if name == "snllm":
+            assert off < 1e-7  # finite differences of a problem of size one
+        else:
+            assert off > 1e-3  # Kaufman's really is another matrix
+
+
+def test_prior_rows_count_like_measurements(robot: mc.Robot, rng: np.random.Generator) -> None:
+    this = model_of(robot, gappy(rng))
+    weight = np.where(this.names.links, 2.0, 0.0)
+    with_prior = this.with_prior(Prior(this.prior.mean, weight))
+    x = somewhere(robot, rng)
+    off = this.values(x) - this.prior.mean
+    expected = SumOfSquares(this).cost(x) + (weight * off**2).sum()
+    assert_allclose(SumOfSquares(with_prior).cost(x), expected, rtol=1e-14)
+    cost, slope, gram = SumOfSquares(with_prior).normal(x)
+    _, plain, bare = SumOfSquares(this).normal(x)
+    assert_allclose(cost, expected, rtol=1e-13)
+    assert_allclose(slope - plain, -weight * off, rtol=0, atol=1e-10)
+    assert_allclose(gram - bare, np.diag(weight), rtol=0, atol=1e-10)
+
+
+def test_pose_weights_are_position_and_orientation_errors(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    """A rigid motion of the measured triangle by (shift, small turn) has the cost it should."""
+    from minimax_cal.modelling.model import pose_weights
+
+    y = rng.normal(size=(7, 3, 3))
+    data = mc.measurements(rng.uniform(-2, 2, (7, 6)), y)
+    shift, turn, lever = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), 0.7
+    arm = y - y.mean(axis=1, keepdims=True)
+    error = shift[:, None] + np.cross(turn[:, None], arm)
+    flat = error.reshape(7, 9)
+    cost = np.einsum("ma,mab,mb->m", flat, pose_weights(data, lever), flat)
+    expected = 3 * ((shift**2).sum(1) + lever**2 * (turn**2).sum(1))
+    assert_allclose(cost, expected, rtol=1e-9)
+    bent = rng.normal(size=(7, 9))  # an error of the triangle's own shape
+    pose = np.concatenate([np.tile(np.eye(3), (3, 1))[None].repeat(7, 0),
+                           np.moveaxis(np.stack([np.cross(e, arm) for e in np.eye(3)]), 0, -1)
+                           .reshape(7, 9, 3)], axis=-1)  # fmt: skip
+    bent -= np.einsum("mab,mb->ma", pose @ np.linalg.pinv(pose), bent)
+    cost = np.einsum("ma,mab,mb->m", bent, pose_weights(data, lever), bent)
+    assert_allclose(cost / (bent**2).sum(1), cost[0] / (bent[0] ** 2).sum(), rtol=1e-9)
+    assert cost[0] >= (bent[0] ** 2).sum() * (1 - 1e-9)
+
+
+def test_mixed_normal_equations_are_explicit_ones(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    from minimax_cal.modelling.model import pose_weights, with_poses
+
+    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))
+    plain = model_of(robot, data)
+    weight = pose_weights(data, 0.3)
+    mixed = with_poses(plain, weight)
+    x = somewhere(robot, rng)
+    every = np.ones(plain.names.count, dtype=bool)
+    found = mixed.normal(x, every)
+    jacobian = np.einsum("ab,kmbp->kmap", x.rotation, plain.jacobian(x))
+    flat = np.moveaxis(jacobian, 0, 1).reshape(30, 9, -1)
+    error = np.moveaxis(plain.error(x) @ x.rotation.T, 0, 1).reshape(30, 9)
+    gram = np.einsum("map,mab,mbq->pq", flat, weight, flat)
+    assert_allclose(found.gram.sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())
+    slope = np.einsum("map,mab,mb->p", flat, weight, error)
+    assert_allclose(found.slope.sum(0), slope, rtol=0, atol=1e-11 * np.abs(slope).max())
+    assert_allclose(found.cost.sum(), np.einsum("ma,mab,mb", error, weight, error), rtol=1e-12)
+    batch = mixed.normal(x.repeat(3), every)
+    assert_allclose(batch.gram[1].sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())

@@ -1,0 +1,136 @@
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.diagnosing import curves
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting.plots import diagnosis
+
+ROBOT = mc.load_robot("ur10")
+CASES: dict[str, tuple[str, str, dict[str, float], list[float]]] = {
+    "backlash": ("backlash", "J3", {}, [4e-4]),
+    "shift": ("target_shift", "smr2", {"since": 0.6}, [3e-4, 2e-4, 0.0]),
+    "drift": ("frame_drift", "frame", {"constant": 0.3}, [3e-4, 2e-4, 1e-4, 0.0, 0.0, 1e-4]),
+    "offset": ("target_offset", "smr2", {}, [3e-4]),
+}
+
+
+@cache
+def diagnosed(case: str, targets: int = 3) -> Diagnosis:
+    """A UR10 with one effect, or none."""
+    made = simulate(ROBOT, 60, targets, seed=3, truth=Truth(compliance=0.0))
+    data = made.data
+    if case in CASES:
+        effect, place, choice, values = CASES[case]
+        scene = made.cell.scene(with_history(data))
+        one = Fitted((Term(effect, place, choice),), (np.array(values),))
+        moved = np.moveaxis(one.points(scene) - scene.points, -1, 0)
+        data = data.with_y(data.y + moved @ made.cell.base[:3, :3].T)
+    else:
+        data = replace(data, columns={})
+    return mc.diagnose(ROBOT, data)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_a_picture_of_each_kind(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"gap.{suffix}"
+    diagnosis.save_diagnosis(diagnosed("backlash"), path)
+    start = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[suffix]
+    assert path.read_bytes().startswith(start)
+
+
+def test_the_same_diagnosis_gives_the_same_file(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.svg", tmp_path / "b.svg"
+    for path in (first, second):
+        diagnosis.save_diagnosis(diagnosed("backlash"), path)
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize("targets", [1, 3])
+def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> None:
+    found = diagnosed("none", targets)
+    assert not found.findings
+    diagnosis.save_diagnosis(found, tmp_path / "gap.svg")
+    left = found.leftover()
+    assert len(left.errors) == 1
+    assert len(curves.residual_curve(left).y) == 1
+    assert "no order" in curves.order_curve(left).title
+    assert diagnosis.verdict_of(found) == "nothing beyond geometry and noise was found"
+
+
+def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:
+    left = diagnosed("backlash").leftover()
+    curve = curves.residual_curve(left)
+    assert "joint 3" in curve.title
+    assert curve.xlabel == "last move of joint 3 (deg)"
+    before, after, law = curve.y
+    assert np.std(after) < 0.4 * np.std(before)
+    known = curve.x != 0.0
+    side = law[known] * np.sign(curve.x[known])
+    assert_allclose(np.quantile(side, 0.8), 0.2, rtol=0.1)  # mrad: half of the play on either side
+    assert side.max() < 0.3  # the ridge only ever makes turns less
+
+
+@pytest.mark.parametrize(
+    ("case", "label", "late"),
+    [
+        ("shift", "time in the session", np.hypot(0.3, 0.2)),
+        ("drift", "time in the session", np.nan),
+        ("offset", "distance from the instrument (m)", 0.3),
+    ],
+)
+def test_effects_on_targets_are_drawn_along_their_motion(
+    case: str, label: str, late: float, tmp_path: Path
+) -> None:
+    left = diagnosed(case).leftover()
+    curve = curves.residual_curve(left)
+    assert curve.xlabel.startswith(label)
+    before, after, law = curve.y
+    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
+    if np.isfinite(late):
+        assert curve.x.shape == (1, 60)  # of the one target
+        assert_allclose(np.median(law[curve.x > 0.62]), late, rtol=0.1)
+    diagnosis.save_diagnosis(diagnosed(case), tmp_path / "gap.png")
+    assert (tmp_path / "gap.png").stat().st_size > 50_000
+
+
+def test_errors_are_those_of_the_ladder() -> None:
+    found = diagnosed("backlash")
+    left = found.leftover()
+    for distance, step in zip(left.distances(), (found.ladder[1], found.ladder[-1]), strict=True):
+        assert_allclose(np.sqrt(np.mean(distance[:, found.held] ** 2)), step.holdout.rms_mm)
+    rms = curves.order_curve(left).y[1]
+    assert_allclose(np.sqrt(np.mean(rms[found.held] ** 2)), found.ladder[-1].holdout.rms_mm)
+
+
+def test_visits_are_in_their_order() -> None:
+    found = diagnosed("backlash")
+    order = found.data.columns["order"][::-1].copy()
+    turned = replace(found, data=replace(found.data, columns={
+        **with_history(found.data).columns, "order": order}))  # fmt: skip
+    curve = curves.order_curve(turned.leftover())
+    assert_allclose(curve.x, np.arange(60, 0, -1))
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
+    """With its unit, one number for each pose."""
+    found = diagnosed("backlash")
+    scene = found.leftover().scene
+    effect = EFFECTS[name]
+    place = effect.places(scene)[0]
+    choices = effect.choices(scene, place) or ({"turns": 100.0},)
+    for choice in choices:
+        label, values = curves.against(scene, Term(name, place, choice), 2)
+        assert values.shape == (60,)
+        assert np.isfinite(values).all()
+        assert np.ptp(values) > 0.0
+        assert label.endswith(")")

@@ -1,0 +1,766 @@
+"""A report: what it says stands in the files, and nothing of the files does anything in it."""
+
+import base64
+import copy
+import gzip
+import hashlib
+import html
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from click.testing import CliRunner, Result
+from conftest import SHARED, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from plotly.offline import get_plotlyjs
+
+import minimax_cal as mc
+from minimax_cal.cli.report import report_command
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting.html import (
+    Figure,
+    Section,
+    View,
+    Wording,
+    compose,
+    page,
+    pdf,
+    read_sources,
+)
+from minimax_cal.reporting.html.charts import PALETTE
+from minimax_cal.reporting.html.content import label, some
+from minimax_cal.reporting.html.error_charts import box, cumulative, histogram, trend
+from minimax_cal.reporting.html.fit_tables import correlations
+from minimax_cal.reporting.html.page import script_json
+from minimax_cal.reporting.html.projection import flat
+from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of
+from minimax_cal.reporting.html.schema import Covariance
+from minimax_cal.reporting.html.sources import Sources, visible
+
+SECTIONS = [
+    "verdict", "accuracy", "workspace", "joints", "gap", "causes", "where", "untestable",
+    "suspects", "parameters", "correlations", "iso9283", "solution", "provenance",
+]  # fmt: skip
+NASTY = '<script>alert(1)</script>&amp;"\u2028</script><img src=x onerror=alert(2)>'
+WORDING = Wording("2026-11-21", author="A. Smith", customer="Example Ltd")
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration and a diagnosis of one file of measurements."""
+    folder = tmp_path_factory.mktemp("report")
+    made = simulate(mc.load_robot("ur10"), 50, 3, seed=1, truth=Truth(compliance=2e-6))
+    mc.write_measurements(folder / "poses.csv", made.data)
+    data = mc.read_measurements(folder / "poses.csv")
+    mc.calibrate("ur10", data).save(folder / "fit.json")
+    mc.diagnose("ur10", data).save(folder / "gap.json")
+    return folder
+
+
+@pytest.fixture
+def fit(results: Path) -> dict[str, Any]:
+    """The calibration's JSON, to be changed."""
+    out: dict[str, Any] = json.loads((results / "fit.json").read_text())
+    return out
+
+
+@pytest.fixture
+def gap(results: Path) -> dict[str, Any]:
+    """The diagnosis' JSON, to be changed."""
+    out: dict[str, Any] = json.loads((results / "gap.json").read_text())
+    return out
+
+
+@pytest.fixture(scope="session")
+def sources(results: Path) -> Sources:
+    return read_sources([results / "fit.json", results / "gap.json"])
+
+
+@pytest.fixture(scope="session")
+def sections(sources: Sources) -> dict[str, Section]:
+    return {section.name: section for section in compose(sources, WORDING).sections}
+
+
+@pytest.fixture(scope="session")
+def seen(sources: Sources) -> "Seen":
+    return Seen(page.render(compose(sources, WORDING)))
+
+
+class Seen(HTMLParser):
+    """What a page holds: tables by caption, text by section, scripts, attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tables: dict[str, list[list[str]]] = {}
+        self.text: dict[str, str] = {}
+        self.scripts: list[tuple[dict[str, str | None], str]] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.tags: list[str] = []
+        self.section = self.caption = ""
+        self.cell: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag == "section":
+            self.section = dict(attrs)["id"] or ""
+            self.text[self.section] = ""
+        if tag == "script":
+            self.scripts.append((dict(attrs), ""))
+        if tag in ("caption", "th", "td"):
+            self.cell = []
+        if tag == "tr":
+            self.tables.setdefault(self.caption, []).append([])
+
+    def handle_data(self, data: str) -> None:
+        if self.tags[-1:] == ["script"] and self.scripts:
+            attributes, text = self.scripts[-1]
+            self.scripts[-1] = (attributes, text + data)
+            return
+        self.cell.append(data)
+        if self.section:
+            self.text[self.section] += data
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "script":
+            self.tags.append("")
+        if tag == "caption":
+            self.caption = "".join(self.cell)
+        if tag in ("th", "td"):
+            self.tables[self.caption][-1].append("".join(self.cell))
+
+
+def command(*arguments: object) -> Result:
+    """The command alone; errors of the user are raised."""
+    return CliRunner().invoke(
+        report_command, [str(a) for a in arguments], standalone_mode=False, catch_exceptions=False
+    )
+
+
+def write(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def rendered(tmp_path: Path, *contents: object) -> Seen:
+    paths = [write(tmp_path / f"{i}.json", content) for i, content in enumerate(contents)]
+    return Seen(page.render(compose(read_sources(paths), WORDING)))
+
+
+# ---- what it says ------------------------------------------------------------------------------
+
+
+def test_every_section_is_there_in_order(seen: Seen) -> None:
+    assert [name for name in seen.text if name != "signatures"] == SECTIONS
+    assert seen.tags.count("h1") == 1
+    assert seen.tags.count("h2") == len(SECTIONS) + 2  # signatures, contents
+
+
+def test_accuracy_is_that_of_the_calibration(results: Path, seen: Seen) -> None:
+    own = mc.calibrate("ur10", mc.read_measurements(results / "poses.csv")).accuracy_table()
+    told = {row[0]: dict(zip(own.header, row, strict=True)) for row in own.cells()}
+    found = seen.tables["Position error (distance between measured and predicted points)"]
+    shared = ["count", "RMS mm", "mean mm", "max mm", *(f"smr{i} RMS mm" for i in (1, 2, 3))]
+    assert set(shared) <= set(found[0])
+    for name, *row in found[1:]:
+        kind, cell = name.split(", ")
+        here = dict(zip(found[0][1:], row, strict=True))
+        assert [here[x] for x in shared] == [told[f"{kind}, {cell}"][x] for x in shared]
+    assert [row[0] for row in found[1:3]] == ["held out, nominal", "held out, calibrated"]
+
+
+def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> None:
+    rows = {row[0]: row for row in seen.tables["Parameters"][1:]}
+    kept = {row[0]: row for row in seen.tables["Not identified: kept at the nominal value"][1:]}
+    assert set(rows) == {p["name"] for p in fit["parameters"]}
+    assert set(kept) == {p["name"] for p in fit["parameters"] if not p["identifiable"]}
+    for p in fit["parameters"]:
+        scale = 1e3 if p["unit"] == "rad" else 1.0
+        _, unit, nominal, value, change, sigma, identified = rows[p["name"]]
+        assert unit == {"rad": "mrad", "mm": "mm"}[p["unit"]]
+        assert (nominal, value) == (f"{scale * p['nominal']:.4f}", f"{scale * p['value']:.4f}")
+        assert change == f"{scale * (p['value'] - p['nominal']):+.4f}"
+        assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.4f}")
+        assert identified == ("yes" if p["identifiable"] else "no")
+        if not p["identifiable"]:
+            assert kept[p["name"]][3] == p["reason"]
+
+
+def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
+    for reason in gap["reasons"]:
+        assert reason in seen.text["verdict"]
+    ladder = seen.tables["The gap, step by step"][1:]
+    assert [row[0] for row in ladder[:-1]] == [r["step"] for r in gap["gap"]["ladder"]]
+    for row, rung in zip(ladder, gap["gap"]["ladder"], strict=False):
+        numbers = [rung[p][k] for p in ("holdout", "train") for k in ("rms_mm", "max_mm")]
+        assert row[1:] == [f"{value:.4f}" for value in numbers]
+    assert ladder[-1][1] == f"{gap['gap']['noise_floor_mm']:.4f}"
+    effects = seen.tables["Effects found, the largest first"][1:]
+    assert [row[0] for row in effects] == [e["effect"] for e in gap["effects"]]
+    assert [row[4:6] for row in effects] == [
+        [f"{e['holdout_rms_mm'][k]:.4f}" for k in ("before", "after")] for e in gap["effects"]
+    ]
+    regions = seen.tables["what geometry leaves, by region"][1:]
+    assert [row[-1] for row in regions] == [
+        f"{cell['rms_mm']:.4f}" for cell in gap["where"]["by_region"]["cells"]
+    ]
+
+
+def test_solution_names_the_backend_of_every_step(fit: dict[str, Any], seen: Seen) -> None:
+    steps = seen.tables["Steps of the minimax"][1:]
+    assert [(row[0], row[-1]) for row in steps] == [
+        (str(s["iteration"]), s["backend"]) for s in fit["minimax"]["trace"]
+    ]
+    multipliers = seen.tables["Multipliers of the minimax (they sum to one)"][1:]
+    assert sum(float(row[1]) for row in multipliers) == pytest.approx(1.0, abs=2e-4)  # rounding
+    assert [row[0] for row in multipliers] == fit["minimax"]["functions"]
+
+
+def test_verdict_states_the_held_out_numbers(fit: dict[str, Any], seen: Seen) -> None:
+    text = seen.text["verdict"].replace("\N{NO-BREAK SPACE}", " ")
+    for key in ("nominal", "holdout"):
+        for kind in ("rms_mm", "max_mm"):
+            assert f"{fit['accuracy'][key][kind]:.3f} mm" in text
+    assert "that were not used for the fit" in text
+    glance = {row[0]: row[1:] for row in seen.tables["At a glance"][1:]}
+    assert len(glance) == 4  # held out and training, RMS and largest
+    one, other, change = glance["held-out poses, RMS"]
+    assert float(change) == pytest.approx(100 * (float(other) / float(one) - 1), abs=0.6)
+
+
+def test_provenance_has_the_digests_of_the_files(results: Path, seen: Seen) -> None:
+    files = {row[0]: row[1:] for row in seen.tables["Files"][1:]}
+    for kind, name in (("calibration", "fit.json"), ("diagnosis", "gap.json"),
+                       ("measurements", "poses.csv")):  # fmt: skip
+        raw = (results / name).read_bytes()
+        assert files[kind] == [str(results / name), hashlib.sha256(raw).hexdigest()]
+    chosen = dict(seen.tables["Settings of the calibration"][1:])  # type: ignore[arg-type]
+    assert chosen["seed"] == "0"
+    assert chosen["holdout"] == "0.2"
+
+
+def test_iso_values_are_there_with_their_caveat(seen: Seen) -> None:
+    assert "not a test by the standard" in seen.text["iso9283"]
+    assert any("AP" in title and "7.2" in title for title in seen.tables)
+
+
+def test_what_later_files_tell_is_shown(
+    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
+) -> None:
+    for part in ("nominal", "nominal_train"):
+        fit["accuracy"][part].pop("rms_ci95_mm", None)
+    for part, ends in (("holdout", (0.111, 0.222)), ("train", (0.333, 0.444))):
+        fit["accuracy"][part]["rms_ci95_mm"] = list(ends)
+        fit["accuracy"][part]["max_ci95_mm"] = [ends[1], None]
+    fit["covariance"] = {
+        "names": ["a1", NASTY], "units": ["mm", "rad"], "rows": [[4.0, 3.0], [3.0, 9.0]]
+    }  # fmt: skip
+    gap["suspects"] = [{"line": 7, "target": "smr2", "distance_mm": 1.5, "score": 9.25}]
+    seen = rendered(tmp_path, fit, gap)
+    rows = seen.tables["Position error (distance between measured and predicted points)"]
+    assert rows[0][3:5] == ["RMS from mm", "RMS to mm"]
+    assert rows[2][3:5] == ["0.1110", "0.2220"]
+    assert rows[1][3:5] == ["-", "-"]  # the file does not tell these
+    assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["verdict"]
+    assert seen.tables["Strongest correlations"][1] == ["a1", visible(NASTY), "+0.500"]
+    assert seen.tables["Suspect points"][1][:4] == ["7", "smr2", "1.5000", "9.2"]
+
+
+@pytest.mark.parametrize(("given", "lacking"), [("fit.json", "gap"), ("gap.json", "parameters")])
+def test_one_file_alone_says_what_is_missing(results: Path, given: str, lacking: str) -> None:
+    seen = Seen(page.render(compose(read_sources([results / given]), WORDING)))
+    assert [name for name in seen.text if name != "signatures"] == SECTIONS
+    assert "Not in this report" in seen.text[lacking]
+    assert "Not in this report" not in seen.text["accuracy"] + seen.text["workspace"]
+
+
+def test_old_files_without_poses_give_their_tables(
+    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
+) -> None:
+    for key in ("poses", "nominal_cell", "trace_mm2", "minimax", "advice"):
+        del fit[key]
+    for key in ("poses", "cells", "curves"):
+        del gap[key]
+    seen = rendered(tmp_path, fit, gap)
+    for name in ("accuracy", "workspace", "joints", "iso9283"):
+        assert "holds no poses" in seen.text[name]
+    assert "holds no curves" in seen.text["causes"]
+    assert len(seen.tables["Parameters"]) > 30
+
+
+def test_a_fit_that_did_not_converge_warns(tmp_path: Path, fit: dict[str, Any]) -> None:
+    fit |= {"status": "iteration_limit", "advice": "raise the limit"}
+    fit["accuracy"]["holdout"] = fit["accuracy"]["nominal"]
+    text = rendered(tmp_path, fit).text["verdict"]
+    assert "did not converge (iteration limit): raise the limit." in text
+    assert "the calibration is no improvement" in text
+
+
+def test_nothing_held_out_is_said(tmp_path: Path, results: Path) -> None:
+    data = mc.read_measurements(results / "poses.csv")
+    mc.calibrate("ur10", data, holdout=0.0).save(tmp_path / "all.json")
+    seen = Seen(page.render(compose(read_sources([tmp_path / "all.json"]), WORDING)))
+    assert "No pose was held out" in seen.text["verdict"]
+    assert len(seen.tables["At a glance"]) == 3  # training only, under its header
+
+
+# ---- the numbers of the figures ----------------------------------------------------------------
+
+
+def figures(sections: dict[str, Section]) -> list[Figure]:
+    return [b for section in sections.values() for b in section.blocks if isinstance(b, Figure)]
+
+
+def painted(value: Any, key: str = "") -> Any:
+    """Names of colours as colours, as the page's script has them."""
+    if isinstance(value, dict):
+        return {name: painted(part, name) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [painted(part, key) for part in value]
+    is_colour = isinstance(value, str) and key.endswith(("color", "colorscale"))
+    return "#123456" if is_colour and value in PALETTE else value
+
+
+def test_figures_are_what_plotly_understands(sections: dict[str, Section]) -> None:
+    found = figures(sections)
+    assert len(found) >= 9
+    assert len({figure.name for figure in found}) == len(found)
+    for figure in found:
+        go.Figure(painted(figure.traces), painted(figure.layout))  # raises for a slip
+        assert figure.says
+        assert all(len(t["x"]) == len(t["y"]) for t in figure.traces if t["type"] == "scatter")
+
+
+def test_distributions_are_those_of_the_points(sources: Sources) -> None:
+    poses = sources.poses[0]
+    held = np.linalg.norm(poses.after, axis=-1)[:, poses.held]
+    shown = histogram(poses, ("nominal", "calibrated")).traces[1]
+    edges, share = np.array(shown["x"]), np.array(shown["y"])
+    assert share.sum() == pytest.approx(100.0, abs=1e-3)
+    wide = np.argmax(share)
+    inside = (held >= edges[wide]) & (held < edges[wide + 1])
+    assert share[wide] == pytest.approx(100.0 * inside.mean(), abs=100.0 / held.size)  # one point
+    curve = cumulative(poses, ("nominal", "calibrated")).traces[1]
+    for x, y in zip(curve["x"], curve["y"], strict=True):
+        assert 100.0 * (held <= x * (1 + 1e-5)).mean() == pytest.approx(y, abs=1e-4)
+    assert curve["x"][-1] == pytest.approx(held.max(), rel=1e-5)
+
+
+def test_boxes_are_quartiles(rng: np.random.Generator) -> None:
+    values = rng.exponential(size=(2, 40))
+    values[0, 3] = np.nan
+    values = np.vstack([values, np.full(40, np.nan)])  # a target that was never seen
+    drawn = box("after", "calibrated", ["one", "two", "three"], values, panel=0)
+    assert drawn["x"] == ["one", "two"]
+    parts = [drawn[key] for key in ("lowerfence", "q1", "median", "q3", "upperfence")]
+    assert_allclose(parts, np.nanpercentile(values[:2], [0, 25, 50, 75, 100], axis=1), rtol=1e-5)
+
+
+def test_trend_is_a_running_median() -> None:
+    x = np.arange(60.0)[::-1]
+    at, middle = trend(x, 3.0 * x)
+    assert len(at) == 12
+    assert_allclose(middle, 3.0 * at)
+    assert np.all(np.diff(at) > 0)
+
+
+def test_correlations_of_a_known_covariance() -> None:
+    known = Covariance(names=["a", "b", "c"], units=["mm"] * 3,
+                       rows=[[4, 3, 0], [3, 9, 0], [0, 0, 0]])  # fmt: skip
+    found = correlations(known)
+    assert_allclose(found[:2, :2], [[1.0, 0.5], [0.5, 1.0]])
+    assert np.isnan(found[2]).all()  # what does not vary goes with nothing
+
+
+@given(st.lists(st.floats(0, 1e3), max_size=60), st.integers(4, 20))
+def test_some_keeps_the_largest(size: list[float], most: int) -> None:
+    chosen = some(np.array(size), most)
+    assert len(chosen) == min(most, len(size))
+    assert np.all(np.diff(chosen) > 0)
+    if size:
+        assert max(size) == max(size[i] for i in chosen)
+
+
+# ---- the workspace -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10", "irb120"])
+def test_the_arm_ends_at_the_flange(name: str, rng: np.random.Generator) -> None:
+    robot = mc.load_robot(name)
+    q = rng.uniform(-2, 2, size=(7, robot.joints))
+    arm, corners = skeleton(robot, q)
+    assert_allclose(arm[:, 0], 0.0)
+    assert_allclose(arm[:, -1], 1e3 * robot.pose(q)[:, :3, 3], atol=1e-9)
+    lengths = np.linalg.norm(np.diff(arm, axis=1), axis=-1)
+    assert_allclose(lengths, lengths[:1].repeat(7, axis=0), atol=1e-9)  # links are rigid
+    parts = 1e3 * np.abs(robot.mdh[:, [1, 0]]).ravel()  # d along the axis, then a
+    assert_allclose(lengths[0], parts[parts > 1e-6], atol=1e-9)
+    assert corners[0]
+    assert corners[-1]
+
+
+def test_arrows_lead_from_prediction_to_measurement(sources: Sources) -> None:
+    poses, cell = sources.poses[0], sources.cells[0]
+    space = space_of(poses, cell)
+    predicted = space.points - space.after
+    flange = cell.robot.pose(poses.data.q[space.chosen])
+    spots = np.einsum("mij,kj->mki", flange[:, :3, :3], cell.spots) + flange[:, None, :3, 3]
+    assert_allclose(predicted, 1e3 * spots, atol=1e-6)
+    tracker = np.linalg.solve(cell.base, [0, 0, 0, 1])[:3]  # origin of the measurement frame
+    assert space.away == pytest.approx(1e3 * np.linalg.norm(tracker))
+    off = np.cross(space.tracker - space.centre, 1e3 * tracker - space.centre)
+    assert_allclose(off / space.radius**2, 0.0, atol=1e-9)  # in the true direction
+    assert np.all(np.abs(inside(space) - space.centre) <= 0.8 * (space.high - space.low) + 1e3)
+    times = magnification(space, space.after)
+    sizes = times * np.linalg.norm(space.after, axis=-1)
+    assert 0.03 < np.percentile(sizes, 90) / space.radius < 0.13
+
+
+def test_still_is_a_parallel_projection() -> None:
+    right, up, depth = flat(np.eye(3)).T[0], -flat(np.eye(3)).T[1], np.zeros(3)
+    depth = np.cross(right, up)
+    assert_allclose(np.stack([right, up, depth]) @ np.stack([right, up, depth]).T, np.eye(3),
+                    atol=1e-12)  # fmt: skip
+    assert up[2] > 0.5  # z stays upright
+
+
+def test_view_holds_every_arrow_once(sections: dict[str, Section], fit: dict[str, Any]) -> None:
+    view = next(b for b in sections["workspace"].blocks if isinstance(b, View))
+    rows = fit["poses"]["measured_mm"]
+    count = sum(spot[0] is not None for pose in rows for spot in pose)
+    for key in ("points", "before", "after"):
+        assert len(view.arms[key]) == 3 * count
+    told = np.reshape(view.arms["after"], (-1, 3))
+    real = np.array(fit["poses"]["errors_mm"]["final"]).reshape(-1, 3)
+    assert_allclose(np.sort(np.linalg.norm(told, axis=1)), np.sort(np.linalg.norm(real, axis=1)),
+                    rtol=2e-3)  # fmt: skip
+    assert view.still.startswith("<svg")
+    assert f"magnified {view.arms['start'][1]} times" in view.still
+
+
+def test_many_poses_are_capped_and_that_is_said(tmp_path: Path) -> None:
+    made = simulate(mc.load_robot("ur10"), 700, 1, seed=2)
+    mc.calibrate("ur10", made.data).save(tmp_path / "many.json")
+    report = compose(read_sources([tmp_path / "many.json"]), WORDING)
+    found = {f.name: f for f in figures({s.name: s for s in report.sections})}
+    for name in ("workspace", "joints", "order"):
+        assert "500 of 700 poses are drawn" in found[name].says
+    drawn = sum(len(t["x"]) for t in found["order"].traces if t["mode"] == "markers")
+    assert drawn == 2 * 500
+    assert len(page.render(report)) < 4e6
+
+
+# ---- nothing but text --------------------------------------------------------------------------
+
+
+def hostile(content: dict[str, Any]) -> dict[str, Any]:
+    """The same file with every name of another's choice."""
+    old, new = "smr2", NASTY
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {renamed(key): renamed(part) for key, part in value.items()}
+        if isinstance(value, list):
+            return [renamed(part) for part in value]
+        return new if value == old else value
+
+    out: dict[str, Any] = renamed(copy.deepcopy(content))
+    for robot in (out.get("robot"), out.get("nominal_robot"), *[
+        cell["robot"] for cell in out.get("cells", [])
+    ]):  # fmt: skip
+        if isinstance(robot, dict):
+            robot["name"] = NASTY
+    if isinstance(out["robot"], str):
+        out["robot"] = NASTY
+    out["provenance"] |= {"data": NASTY, "settings": {NASTY: NASTY}, "versions": {NASTY: NASTY}}
+    out["notices"] = [NASTY]
+    return out
+
+
+def test_hostile_names_are_text(tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]) -> None:
+    fit, gap = hostile(fit), hostile(gap)
+    for curve in gap["curves"].values():
+        curve["title"] = curve["x"]["label"] = curve["views"][0]["name"] = NASTY
+    gap["effects"][0]["parameters"][0]["name"] = NASTY
+    gap["not_testable"] = [{"effect": NASTY, "needs": NASTY}]
+    gap["reasons"] = [NASTY]
+    fit["parameters"][0]["name"] = fit["objective"] = fit["qp"] = NASTY
+    fit["minimax"]["trace"][0]["backend"] = NASTY
+    seen = rendered(tmp_path, fit, gap)
+    plain = Seen(page.render(compose(read_sources([tmp_path / "0.json"]), WORDING)))
+    assert "img" not in seen.tags
+    assert not [name for _, name, _ in seen.attributes if name.startswith("on")]
+    kinds = [attributes.get("type") for attributes, _ in seen.scripts]
+    assert kinds.count("application/json") == len(kinds) - 2  # figures, plotly, the page's own
+    assert kinds.count(None) == plain.tags.count("body") == 1
+    text = visible(NASTY)
+    for name in ("verdict", "provenance", "untestable", "solution", "parameters"):
+        assert text in seen.text[name]
+    assert seen.tables["Files"][2][1] == text
+
+
+def test_labels_of_figures_hold_no_marks(
+    tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
+) -> None:
+    paths = [write(tmp_path / "0.json", hostile(fit)), write(tmp_path / "1.json", hostile(gap))]
+    report = compose(read_sources(paths), WORDING)
+
+    def texts(value: Any) -> list[str]:
+        if isinstance(value, dict):
+            return [t for key, part in value.items() for t in texts(part)
+                    if key not in ("legendgroup", "offsetgroup", "hovertemplate")]  # fmt: skip
+        if isinstance(value, list | tuple):
+            return [t for part in value for t in texts(part)]
+        return [value] if isinstance(value, str) else []
+
+    for figure in figures({s.name: s for s in report.sections}):
+        for text in texts([figure.traces, figure.layout]):
+            assert not re.search(r"<(?!br>)|>(?<!<br>)", text), text
+
+
+@given(st.text(max_size=60))
+@settings(max_examples=50)
+def test_label_comes_back_from_its_marks(text: str) -> None:
+    assert html.unescape(label(text)) == html.unescape(html.escape(text, quote=False))
+    assert not {"<", ">"} & set(label(text))
+    assert len(html.unescape(label(text * 50))) <= 70
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda parts: st.lists(parts, max_size=4) | st.dictionaries(st.text(), parts, max_size=4),
+    max_leaves=8,
+)  # fmt: skip
+
+
+@given(JSON)
+def test_json_in_a_script_cannot_end_it(content: Any) -> None:
+    text = script_json(content)
+    assert json.loads(text) == content
+    assert not set("<>&\u2028\u2029") & set(text)
+
+
+@given(st.text())
+@settings(max_examples=200)
+def test_what_is_shown_can_be_written_and_hides_nothing(text: str) -> None:
+    shown = visible(text)
+    shown.encode()  # no lone surrogates
+    assert len(shown) == len(text)
+    assert visible(shown) == shown
+    assert not set("\u202e\u2066\x00\x1b\n") & set(shown)
+
+
+def test_nothing_leads_outside(seen: Seen, sources: Sources) -> None:
+    text = page.render(compose(sources, WORDING))
+    clear = re.sub(r'(id="plotly">)[A-Za-z0-9+/=]+', r"\1", text)
+    assert len(clear) < 0.4 * len(text)
+    for word in ("http:", "https:", "://", "url(",
+                 "@import", "fetch(", "XMLHttpRequest", "WebSocket",
+                 "sendBeacon", "import("):  # fmt: skip
+        assert word not in clear, word
+    for tag, name, value in seen.attributes:
+        assert name not in ("src", "srcset", "action", "formaction", "ping", "background"), tag
+        assert name != "href" or value.startswith("#")
+    anchors = {value for _, name, value in seen.attributes if name == "id"}
+    links = {value[1:] for _, name, value in seen.attributes if name == "href"}
+    assert links <= anchors
+    assert links >= set(SECTIONS) - {"verdict"}
+
+
+def test_policy_allows_two_scripts_and_no_request(seen: Seen) -> None:
+    equivalents = [v for tag, name, v in seen.attributes if (tag, name) == ("meta", "content")]
+    policy = next(v for v in equivalents if v.startswith("default-src 'none'"))
+    parts = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    assert "unsafe" not in parts["script-src"]
+    assert parts["img-src"] == "data: blob:"
+    assert not {"connect-src", "frame-src", "worker-src"} & set(parts)
+    library = next(t for a, t in seen.scripts if a.get("id") == "plotly")
+    unpacked = gzip.decompress(base64.b64decode(library)).decode()
+    assert unpacked == get_plotlyjs()
+    own = next(text for attributes, text in seen.scripts if not attributes)
+    for script in (own, unpacked):
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in parts["script-src"]
+
+
+def test_tables_and_figures_have_words_for_everyone(seen: Seen) -> None:
+    assert ("html", "lang", "en") in seen.attributes
+    assert seen.tags.count("caption") == seen.tags.count("table")
+    scopes = [value for tag, name, value in seen.attributes if (tag, name) == ("th", "scope")]
+    assert len(scopes) == seen.tags.count("th")
+    labels = [v for tag, name, v in seen.attributes if (tag, name) == ("div", "aria-label")]
+    assert all(labels)
+    roles = [v for tag, name, v in seen.attributes if (tag, name) == ("div", "role")]
+    assert roles.count("img") == seen.tags.count("figure")
+
+
+# ---- the command -------------------------------------------------------------------------------
+
+
+def test_the_same_files_give_the_same_page(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    files = (results / "fit.json", results / "gap.json")
+    for name in ("a.html", "b.html"):
+        assert command(*files, "-o", tmp_path / name).return_value == 0
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+    assert "1970-01-02" in (tmp_path / "a.html").read_text()
+    command(*files, "-o", tmp_path / "a.html", "--date", "2026-01-31", "--title", "For <Bob>")
+    text = (tmp_path / "a.html").read_text()
+    assert "2026-01-31" in text
+    assert "<h1>For &lt;Bob&gt;</h1>" in text
+    for day, word in (("yesterday", "--date"), ("", "SOURCE_DATE_EPOCH")):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", "soon")
+        with pytest.raises(OptionError, match=word):
+            command(*files, "-o", tmp_path / "c.html", "--date", day)
+    assert not (tmp_path / "c.html").exists()
+
+
+def test_files_must_belong_together(
+    results: Path, tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
+) -> None:
+    one, other = results / "fit.json", results / "gap.json"
+    with pytest.raises(CalibrationError, match="second calibration"):
+        read_sources([one, one])
+    with pytest.raises(CalibrationError, match="one or two files"):
+        read_sources([one, other, one])
+    with pytest.raises(CalibrationError, match="neither a calibration nor a diagnosis"):
+        read_sources([write(tmp_path / "a.json", {"kind": "evaluation"})])
+    changed = copy.deepcopy(gap)
+    changed["provenance"]["data_sha256"] = "0" * 64
+    with pytest.raises(CalibrationError, match="different measurements"):
+        read_sources([one, write(tmp_path / "a.json", changed)])
+    assert read_sources([other, one]).notices == ()
+    gap["poses"]["split"] = gap["poses"]["split"][::-1]
+    gap["robot"] = "another"
+    told = read_sources([one, write(tmp_path / "a.json", gap)]).notices
+    assert len(told) == 2
+    assert "another" in told[0]
+    assert "held out different poses" in told[1]
+
+
+BROKEN: dict[str, Callable[[dict[str, Any]], object]] = {
+    "no parameters": lambda c: c.pop("parameters"),
+    "text for a number": lambda c: c["accuracy"]["train"].update(rms_mm="much"),
+    "targets differ": lambda c: c["accuracy"]["train"].update(sse_mm2=[1.0]),
+    "no robot": lambda c: c.pop("robot"),
+    "poses are cut": lambda c: c["poses"].update(q=c["poses"]["q"][:5]),
+    "errors are cut": lambda c: c["poses"]["errors_mm"].update(final=[]),
+    "no errors": lambda c: c["poses"].pop("errors_mm"),
+    "poses of another arm": lambda c: c["poses"].update(
+        q=[[0.0]] * len(c["poses"]["q"]), q_units=["rad"]
+    ),
+    "covariance without rows": lambda c: c.update(covariance={"names": ["a"], "rows": []}),
+    "multipliers are cut": lambda c: c["minimax"].update(multipliers=[]),
+    "schema of the future": lambda c: c.update(schema=2),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_file_is_one_line(
+    how: str, tmp_path: Path, fit: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    BROKEN[how](fit)
+    path = write(tmp_path / "fit.json", fit)
+    assert run("report", path, "-o", tmp_path / "report.html") == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith(f"error: {path}: ")
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "NaN", '{"a": NaN}', "[" * 100_000, "\xff", "7" * 5000]
+)
+def test_what_is_no_json_is_said(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "fit.json"
+    path.write_bytes(text.encode("latin-1"))
+    assert run("report", path, "-o", tmp_path / "report.html") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every place in a JSON; of a long list the first entry only."""
+    if not isinstance(value, dict | list):
+        return []
+    parts = value.items() if isinstance(value, dict) else enumerate(value[:1])
+    return [spot for key, part in parts for spot in ((*at, key), *places(part, (*at, key)))]
+
+
+@pytest.mark.parametrize("name", ["fit.json", "gap.json"])
+def test_no_slip_in_a_file_is_a_traceback(name: str, results: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    whole = json.loads((results / name).read_text())
+    spots = places(whole)
+    odd = [None, "x", -1, 1e30, [], {}, [None], True]
+    for _ in range(60):
+        content = copy.deepcopy(whole)
+        *way, last = spots[rng.integers(len(spots))]
+        part = content
+        for key in way:
+            part = part[key]
+        part[last] = odd[rng.integers(len(odd))]
+        path = write(tmp_path / "slip.json", content)
+        with suppress(CalibrationError):
+            compose(read_sources([path]), WORDING)
+
+
+def test_what_is_not_installed_is_said(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, results: Path
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(OptionError, match=r"none was found; .* print it"):
+        command(results / "fit.json", "-o", tmp_path / "a.html", "--pdf", tmp_path / "a.pdf")
+    assert list(tmp_path.iterdir()) == []  # before any work
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    with pytest.raises(OptionError, match=r"pip install minimax-cal\[report\]"):
+        page.render(compose(sources, WORDING))
+
+
+def test_a_browser_that_fails_leaves_no_pdf(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="could not print it"):
+        pdf.print_pdf("<p>", tmp_path / "a.pdf", "/bin/false")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_paths_are_checked_first(results: Path, tmp_path: Path) -> None:
+    for options in (("-o", "a.txt"), ("-o", tmp_path / "none" / "a.html"), ("--pdf", "a.html")):
+        with pytest.raises(CalibrationError):
+            command(results / "fit.json", *options)
+
+
+def test_real_arm_in_three_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = SHARED / "irb120"
+    if not folder.is_dir():
+        pytest.skip(f"real measurements {folder} are not on this machine")
+    lines = (folder / "measurements.csv").read_text().splitlines()[:81]  # 80 poses do
+    data, robot = tmp_path / "poses.csv", folder / "robot.json"
+    data.write_text("\n".join(lines) + "\n")
+    fit, gap, out = (tmp_path / name for name in ("fit.json", "gap.json", "report.html"))
+    assert run("calibrate", robot, data, "-o", fit, "-q") == 0
+    assert run("diagnose", robot, data, "-o", gap, "-q") == 0
+    assert run("report", fit, gap, "-o", out) == 0
+    seen = Seen(out.read_text())
+    told = json.loads(fit.read_text())["accuracy"]["holdout"]
+    assert math.isfinite(told["rms_mm"])
+    assert f"{told['rms_mm']:.3f}" in seen.text["verdict"]
+    assert hashlib.sha256(data.read_bytes()).hexdigest() in seen.text["provenance"]
+    assert list(seen.text) == [SECTIONS[0], "signatures", *SECTIONS[1:]]

@@ -1,0 +1,281 @@
+"""A report in a real browser: everything is drawn, nothing is sent, names do nothing."""
+
+import io
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import run
+from test_report import NASTY, WORDING, hostile, results, write
+
+from minimax_cal.ground.tables import Table
+from minimax_cal.reporting.html import compose, read_sources, render
+from minimax_cal.reporting.html.content import Figure
+from minimax_cal.reporting.html.sources import visible
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
+DRIVER = shutil.which("chromedriver") or ""
+pytestmark = pytest.mark.skipif(
+    not (BROWSER and DRIVER), reason="no Chromium with its chromedriver on this machine"
+)
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-gpu",
+    "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--window-size=1100,1400",
+)  # fmt: skip
+PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
+
+__all__ = ["results"]  # the fixture
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[Any]:
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    service = webdriver.ChromeService(DRIVER)
+    found = webdriver.Chrome(options=options, service=service)
+    yield found
+    found.quit()
+
+
+@pytest.fixture(scope="module")
+def folder(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Reports of good files and of hostile ones."""
+    out = tmp_path_factory.mktemp("pages")
+    files = [results / name for name in ("fit.json", "gap.json")]
+    bad = [write(out / path.name, hostile(json.loads(path.read_text()))) for path in files]
+    for name, paths in (("good", files), ("bad", bad)):
+        (out / f"{name}.html").write_text(render(compose(read_sources(paths), WORDING)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def opened(driver: Any, folder: Path) -> Any:
+    """The browser with the good report, drawn; logs are of this page alone."""
+    open_page(driver, folder / "good.html")
+    return driver
+
+
+def open_page(driver: Any, path: Path) -> None:
+    for kind in ("browser", "performance"):
+        driver.get_log(kind)
+    driver.get(path.as_uri())
+    end = time.monotonic() + PATIENCE
+    while not driver.execute_script("return document.body.dataset.drawn"):
+        assert time.monotonic() < end, "the charts were not drawn in time"
+        time.sleep(0.1)
+
+
+def colour(driver: Any, selector: str, key: str) -> tuple[int, ...]:
+    script = "return getComputedStyle(document.querySelector(arguments[0]))[arguments[1]]"
+    text = driver.execute_script(script, selector, key)
+    return tuple(map(int, re.findall(r"\d+", text)[:3]))
+
+
+def scheme(driver: Any, name: str, media: str = "") -> None:
+    feature = {"name": "prefers-color-scheme", "value": name}
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": [feature]})
+
+
+def sent(driver: Any) -> list[str]:
+    """Addresses that the page asked for."""
+    events = [json.loads(entry["message"])["message"] for entry in driver.get_log("performance")]
+    return [
+        event["params"]["request"]["url"]
+        for event in events
+        if event["method"] == "Network.requestWillBeSent"
+    ]
+
+
+def test_opens_without_a_complaint_and_asks_for_nothing(opened: Any, folder: Path) -> None:
+    assert opened.execute_script("return document.body.dataset.drawn") == "yes"
+    assert [e for e in opened.get_log("browser") if e["level"] == "SEVERE"] == []
+    asked = sent(opened)
+    assert asked[0] == (folder / "good.html").as_uri()
+    assert not [url for url in asked[1:] if not url.startswith(("data:", "blob:"))]
+
+
+def test_every_section_shows_the_numbers_of_the_files(opened: Any, results: Path) -> None:
+    files = [results / name for name in ("fit.json", "gap.json")]
+    for section in compose(read_sources(files), WORDING).sections:
+        rows = opened.execute_script(
+            "return [...document.getElementById(arguments[0]).querySelectorAll('table')].map(t => "
+            "[t.caption.textContent, [...t.rows].map(r => [...r.cells].map(c => c.textContent))])",
+            section.name,
+        )
+        own = [block for block in section.blocks if isinstance(block, Table)]
+        assert rows == [[t.title, [list(t.header), *t.cells()]] for t in own]
+
+
+def test_every_chart_is_drawn(opened: Any, results: Path) -> None:
+    files = [results / name for name in ("fit.json", "gap.json")]
+    report = compose(read_sources(files), WORDING)
+    names = [b.name for s in report.sections for b in s.blocks if isinstance(b, Figure)]
+    assert len(names) >= 9
+    for name in names:
+        marks, wide = opened.execute_script(
+            "const e = document.getElementById('chart-' + arguments[0]);"
+            "return [e.querySelectorAll('.main-svg path[d]').length, e.offsetWidth]",
+            name,
+        )
+        assert marks > 0, name
+        assert wide > 600, name
+    assert opened.execute_script("return document.querySelectorAll('.waiting').length") == 0
+
+
+def test_the_view_in_space_is_not_empty(opened: Any) -> None:
+    image = pytest.importorskip("PIL.Image", reason="pillow reads the screenshot")
+    chart = opened.find_element("id", "chart-workspace")
+    scheme(opened, "light")
+    before = np.asarray(image.open(io.BytesIO(chart.screenshot_as_png)).convert("RGB"), dtype=int)
+    blue = (before[..., 2] - before[..., 0]) > 60
+    assert blue.sum() > 300  # the arrows
+    choice = opened.find_element("css selector", "input[name=shown][value='0']")
+    opened.execute_script("arguments[0].focus()", choice)
+    choice.send_keys(" ")
+    time.sleep(1.0)
+    after = np.asarray(image.open(io.BytesIO(chart.screenshot_as_png)).convert("RGB"), dtype=int)
+    red = (after[..., 0] - after[..., 2]) > 60
+    assert red.sum() > 300  # those of the nominal robot instead
+    opened.find_element("css selector", "input[name=shown][value='1']").send_keys(" ")
+
+
+def test_controls_work_by_keyboard(opened: Any) -> None:
+    keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
+    for name in ("times", "pose"):
+        told = opened.find_element("id", f"{name}-told")
+        before = told.text
+        opened.find_element("id", name).send_keys(keys.ARROW_LEFT)
+        assert told.text != before
+    assert re.fullmatch(
+        "\N{MULTIPLICATION SIGN} [125]0*", opened.find_element("id", "times-told").text
+    )
+    line = r"line \d+ \((held out|training)\): nominal [\d.]+ mm, calibrated [\d.]+ mm"
+    assert re.fullmatch(line, opened.find_element("id", "pose-told").text)
+    drawn = opened.execute_script(
+        "return document.getElementById('chart-workspace').data.map(t => t.x.length)"
+    )
+    assert drawn[0] == 0  # only the errors asked for
+    assert drawn[1] > 100
+
+
+def test_dark_and_light_follow_system_and_button(opened: Any) -> None:
+    keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
+
+    def state() -> tuple[bool, bool]:
+        time.sleep(0.5)
+        text = ".chart .main-svg text"
+        return sum(colour(opened, "body", "backgroundColor")) < 200, (
+            sum(colour(opened, text, "fill")) > 500
+        )
+
+    scheme(opened, "dark")
+    assert state() == (True, True)
+    scheme(opened, "light")
+    assert state() == (False, False)
+    button = opened.find_element("id", "theme")
+    button.send_keys(keys.ENTER)
+    assert state() == (True, True)
+    assert button.get_attribute("aria-pressed") == "true"
+    button.send_keys(keys.ENTER)
+    assert state() == (False, False)
+    opened.execute_script("delete document.documentElement.dataset.theme")
+
+
+def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
+    shown = "return getComputedStyle(document.querySelector(arguments[0])).display"
+    scheme(opened, "dark", "print")
+    opened.execute_script("window.dispatchEvent(new Event('beforeprint'))")
+    assert sum(colour(opened, "body", "backgroundColor")) == 3 * 255
+    assert sum(colour(opened, ".chart .main-svg text", "fill")) < 200
+    assert opened.execute_script(shown, ".view .flat") == "block"
+    assert opened.execute_script(shown, ".view .live") == "none"
+    assert opened.execute_script(shown, "#theme") == "none"
+    wide = opened.execute_script(
+        "return [...document.querySelectorAll('.chart:not(#chart-workspace) .main-svg')]"
+        ".map(s => Number(s.getAttribute('width')))"
+    )
+    assert set(wide) == {680}
+    opened.execute_script("window.dispatchEvent(new Event('afterprint'))")
+    scheme(opened, "light")
+    assert opened.execute_script(shown, ".view .flat") == "none"
+
+
+def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
+    found = opened.execute_async_script(
+        """
+        const done = arguments[arguments.length - 1], broken = [];
+        document.addEventListener("securitypolicyviolation", (e) =>
+          broken.push(e.effectiveDirective));
+        const script = document.createElement("script");
+        script.textContent = "window.intruder = 1";
+        document.body.append(script);
+        new Image().src = "http://127.0.0.1:9/x.png";
+        fetch("http://127.0.0.1:9/").catch(() => {}).finally(() =>
+          setTimeout(() => done([window.intruder ?? 0, broken]), 200));
+        """
+    )
+    assert found[0] == 0
+    assert set(found[1]) == {"script-src-elem", "img-src", "connect-src"}
+    opened.get_log("browser")
+
+
+def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> None:
+    open_page(driver, folder / "bad.html")
+    with pytest.raises(Exception, match="alert"):
+        assert driver.switch_to.alert
+    assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
+    assert not [url for url in sent(driver)[1:] if not url.startswith(("data:", "blob:"))]
+    text = visible(NASTY)
+    assert text in driver.execute_script("return document.querySelector('h1').textContent")
+    assert driver.execute_script("return document.images.length") == 0
+    labels = driver.execute_script(
+        "return [...document.querySelectorAll('#chart-boxes .xtick text')].map(t => t.textContent)"
+    )
+    assert any("<script>alert(1)</script>" in shown for shown in labels)
+    assert driver.execute_script("return document.querySelectorAll('svg a').length") == 0
+
+
+def test_without_depth_the_still_view_stands(driver: Any, folder: Path) -> None:
+    blind = "HTMLCanvasElement.prototype.getContext = ((old) => function (kind, ...rest) {" \
+        "return /webgl/.test(kind) ? null : old.call(this, kind, ...rest); })(" \
+        "HTMLCanvasElement.prototype.getContext);"  # fmt: skip
+    added = driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": blind})
+    try:
+        open_page(driver, folder / "good.html")
+        assert driver.find_element("css selector", "svg.still").is_displayed()
+        assert not driver.find_element("id", "times").is_displayed()
+        assert driver.find_elements("css selector", "#chart-boxes .main-svg")
+    finally:
+        driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+
+
+def test_without_scripts_the_tables_and_the_still_view_stand(driver: Any, folder: Path) -> None:
+    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        driver.get((folder / "good.html").as_uri())
+        assert driver.find_element("css selector", "#accuracy table").is_displayed()
+        assert driver.find_element("css selector", "svg.still").is_displayed()
+    finally:
+        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+
+
+def test_pdf_holds_the_whole_report(results: Path, tmp_path: Path) -> None:
+    out, printed = tmp_path / "a.html", tmp_path / "a.pdf"
+    assert run("report", results / "fit.json", "-o", out, "--pdf", printed) == 0
+    raw = printed.read_bytes()
+    assert raw.startswith(b"%PDF")
+    assert raw.rstrip().endswith(b"%%EOF")
+    assert len(re.findall(rb"/Type /Page\b", raw)) >= 5
+    assert len(raw) > 200_000  # the charts' lines and the letters

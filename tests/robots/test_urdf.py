@@ -1,0 +1,259 @@
+"""URDF as robot: any chain, the same poses, and clear words for what is not one."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.transforms import from_rpy, link, link_to, to_rpy
+from minimax_cal.robots.urdf import random_joints, tip_poses, to_robot
+from minimax_cal.robots.urdf_file import edited, origin_edit, parse_urdf
+
+EXACT = dict(rtol=0, atol=1e-9)
+ARM = (  # made up: a root off the axis, a downward axis, a slide, a bent tip
+    ("fixed", "0.1 0.2 0", "0 0 0.3", "", ""),
+    ("revolute", "0 0 0.4", "0 0 0", "0 0 -1", 'lower="-2" upper="2.5"'),
+    ("continuous", "0.05 0.1 0.2", "1.5708 0 0", "0 0 2", ""),
+    ("fixed", "0 0 0.1", "0 0.4 0", "", ""),
+    ("prismatic", "0.3 0 0", "0 0 0", "0 -1 0", 'lower="-0.1" upper="0.4"'),
+    ("revolute", "0.2 0 0.1", "0 1e-6 0", "1 0 0", 'lower="-1" upper="1"'),
+    ("revolute", "0 0.3 0.1", "0.3 0.2 0.1", "0.6 0 0.8", 'lower="-3" upper="3"'),
+    ("fixed", "0.01 0.02 0.1", "0.1 0.2 0.3", "", ""),
+)
+
+
+def urdf_of(rows: tuple[tuple[str, ...], ...], masses: bool = False) -> str:
+    lines = ['<?xml version="1.0"?>', "<!-- made up -->", '<robot name="made up">']
+    for i in range(len(rows) + 1):
+        mass = f'<inertial><origin xyz="0.0{i} 0 0.1"/><mass value="{i + 1}"/></inertial>'
+        lines.append(f'  <link name="l{i}">{mass if masses else ""}</link>')
+    for i, (kind, xyz, rpy, axis, limit) in enumerate(rows):
+        lines.append(f'  <joint name="j{i}" type="{kind}">')
+        lines.append(f'    <origin rpy="{rpy}" xyz="{xyz}" /> <!-- as drawn -->')
+        lines.append(f'    <parent link="l{i}"/><child link="l{i + 1}"/>')
+        lines += [f'    <axis xyz="{axis}"/>'] * bool(axis)
+        lines += [f'    <limit {limit} effort="1" velocity="1"/>'] * bool(limit)
+        lines.append("  </joint>")
+    return "\n".join([*lines, "</robot>", ""])
+
+
+def same_poses(text: str, tip: str = "") -> mc.Robot:
+    model = to_robot(parse_urdf(text.encode()), tip)
+    robot = robot_from_dict(model.content)
+    q = random_joints(robot.lower, robot.upper)
+    poses = model.base @ robot.pose(q) @ model.tool
+    assert_allclose(poses, tip_poses(model.chain, q), **EXACT)
+    return robot
+
+
+def test_a_chain_of_every_joint() -> None:
+    robot = same_poses(urdf_of(ARM))
+    assert robot.joints == 5
+    assert list(robot.sign) == [-1, 1, -1, 1, 1]  # z of the base stays upright
+    assert_allclose(robot.up, [0, 0, 1], atol=1e-12)
+    assert list(robot.prismatic) == [False, False, True, False, False]
+    assert_allclose(robot.lower, [-2, -np.inf, -0.1, -1, -3])
+    assert np.abs(robot.mdh[:, :2]).max() < 2  # nearly parallel axes do not explode
+
+
+def test_pinocchio_reads_the_same_poses() -> None:
+    pinocchio = pytest.importorskip("pinocchio")
+    text = urdf_of([row for row in ARM if row[0] != "continuous"])
+    model = to_robot(parse_urdf(text.encode()))
+    robot = robot_from_dict(model.content)
+    theirs = pinocchio.buildModelFromXML(text)
+    data, frame = theirs.createData(), theirs.getFrameId(model.chain[-1].child)
+    for q in random_joints(robot.lower, robot.upper, 20):
+        pinocchio.framesForwardKinematics(theirs, data, q)
+        ours = model.base @ robot.pose(q) @ model.tool
+        assert_allclose(ours, data.oMf[frame].homogeneous, **EXACT)
+
+
+def test_masses_of_fixed_links_are_lumped() -> None:
+    text = urdf_of(ARM, masses=True)
+    model = to_robot(parse_urdf(text.encode()))
+    robot = robot_from_dict(model.content)
+    assert_allclose(robot.mass, [3, 4 + 5, 6, 7, 8 + 9])
+    # the centre of gravity of the last body, by the URDF's own frames and by ours
+    q = random_joints(robot.lower, robot.upper, 5)
+    ends = {j.child: tip_poses(model.chain[: i + 1], q) for i, j in enumerate(model.chain)}
+    theirs = sum(
+        m * (ends[f"l{k}"] @ [0.01 * k, 0, 0.1, 1])[:, :3] for k, m in ((7, 8), (8, 9))
+    ) / (8 + 9)  # fmt: skip
+    ours = (model.base @ robot.pose(q) @ np.append(robot.com[-1], 1.0))[:, :3]
+    assert_allclose(ours, theirs, **EXACT)
+
+
+numbers = st.floats(-1.0, 1.0)
+vectors = st.tuples(numbers, numbers, numbers)
+quarters = st.sampled_from([-np.pi / 2, 0.0, np.pi / 2, np.pi, 1.5708, 1e-7])
+turns = st.one_of(vectors, st.tuples(quarters, quarters, quarters))
+axes = st.sampled_from(["1 0 0", "0 1 0", "0 0 1", "0 0 -1", "-1 0 0", "0.6 0 0.8"])
+kinds = st.sampled_from(["revolute", "prismatic", "continuous", "fixed"])
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(kinds, vectors, turns, axes), min_size=1, max_size=7))
+def test_any_chain(rows: list[tuple[str, tuple[float, ...], tuple[float, ...], str]]) -> None:
+    text = urdf_of(
+        tuple(
+            (kind, " ".join(map(repr, xyz)), " ".join(map(repr, rpy)), axis, "")
+            for kind, xyz, rpy, axis in [*rows, ("revolute", (0, 0, 1), (0, 0, 0), "0 0 1")]
+        )
+    )
+    same_poses(text)
+
+
+def test_rpy_comes_back_near_what_stood_there(rng: np.random.Generator) -> None:
+    steep = np.array(list(itertools.product((0.3, np.pi / 2, -np.pi / 2, np.pi), repeat=3)))
+    for rpy in (*rng.uniform(-4, 4, (200, 3)), *steep):
+        pose = from_rpy(np.zeros(3), rpy)
+        assert_allclose(from_rpy(np.zeros(3), to_rpy(pose)), pose, rtol=0, atol=1e-14)
+        again = to_rpy(pose, rpy)
+        assert_allclose(from_rpy(np.zeros(3), again), pose, rtol=0, atol=1e-14)
+        if abs(np.cos(rpy[1])) > 1e-3:
+            assert_allclose(again, rpy, rtol=0, atol=1e-9)
+
+
+def test_a_link_reaches_any_line(rng: np.random.Generator) -> None:
+    for size in (1.0, 0.05, 1e-3, 1e-9, 0.0):
+        axis = np.array([*(size * rng.normal(size=2)), 1.0])
+        axis /= np.linalg.norm(axis)
+        point = rng.normal(size=3)
+        pose = link(link_to(point, axis))
+        assert_allclose(pose[:3, 2], axis, rtol=0, atol=1e-12)
+        off = pose[:3, 3] - point
+        assert_allclose(off - (off @ axis) * axis, 0, rtol=0, atol=1e-12)
+
+
+def test_load_robot_takes_a_urdf_and_a_tip(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf_of(ARM))
+    assert mc.load_robot(path).joints == 5
+    assert mc.load_robot(f"{path}#l5").joints == 3
+    assert mc.load_robot(path).name == "made up"
+
+
+TWO_HANDS = """<robot name="r"><link name="a"/><link name="b"/><link name="left"/>
+<link name="right"/><link name="plate"/><joint name="j" type="continuous"><parent link="a"/>
+<child link="b"/><axis xyz="0 0 1"/></joint><joint name="jl" type="continuous"><parent link="b"/>
+<child link="left"/></joint><joint name="jr" type="continuous"><parent link="b"/>
+<child link="right"/></joint><joint name="p" type="fixed"><parent link="a"/>
+<child link="plate"/></joint></robot>"""
+
+
+def test_the_chain_is_named_where_there_are_several() -> None:
+    urdf = parse_urdf(TWO_HANDS.encode(), "hands.urdf")
+    with pytest.raises(mc.RobotError, match=r"several chains: they end in left, right; name .*tip"):
+        to_robot(urdf)
+    model = to_robot(urdf, "left")
+    assert [j.name for j in model.chain] == ["j", "jl"]
+    assert any("jr" in notice for notice in model.notices)
+    with pytest.raises(mc.RobotError, match="no link 'hand'; its ends are left, plate, right"):
+        to_robot(urdf, "hand")
+    with pytest.raises(mc.RobotError, match="no moving joint leads to 'plate'"):
+        to_robot(urdf, "plate")
+
+
+def test_of_frames_on_one_body_tool0_is_meant() -> None:
+    text = TWO_HANDS.replace('"jr" type="continuous"', '"jr" type="fixed"').replace(
+        '"jl" type="continuous"', '"jl" type="fixed"'
+    )
+    assert to_robot(parse_urdf(text.encode())).chain[-1].child == "b"
+    text = text.replace("left", "tool0")
+    assert to_robot(parse_urdf(text.encode())).chain[-1].child == "tool0"
+
+
+JOINT = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>{}</joint>'
+BROKEN = {
+    "": r":1: is not XML \(no element found\)",
+    "<robot><link": ":1: is not XML",
+    "<html/>": "its root is <html>, expected <robot>",
+    "<robot/>": "expected one root link, found none",
+    '<robot><link name="a"/></robot>': "has no revolute, continuous or prismatic joint",
+    "<robot><link/></robot>": "<link> has no name",
+    '<robot><xacro:macro name="x"/></robot>': "this is xacro, not URDF; expand it first",
+    f'<robot><link name="a"/>{JOINT}</robot>': "joint 'j': no link 'b'",
+    '<robot><link name="a"/><link name="a"/></robot>': "a second link 'a'",
+    '<robot><link name="a"/><link name="b"/></robot>': "expected one root link, found a, b",
+    '<robot><link name="a"/><joint name="j" type="fixed"/></robot>': "'j' has no <parent>",
+    f'<robot><link name="a"/><link name="b"/>{JOINT}</robot>'.replace(
+        "revolute", "ball"
+    ): "no joint type 'ball'",
+    **{
+        f'<robot><link name="a"/><link name="b"/>{JOINT.format(inner)}</robot>': words
+        for inner, words in {
+            '<origin xyz="1 2"/>': ":1: joint 'j': xyz='1 2': expected 3 numbers",
+            '<origin xyz="1 nan 2"/>': "expected 3 numbers",
+            '<origin rpy="0 ${pi} 0"/>': "is xacro; expand it first",
+            '<axis xyz="0 0 0"/>': "its axis is a zero vector",
+            '<limit lower="1" upper="-1"/>': "limit lower is not below upper",
+            '<limit lower="one"/>': "expected a number",
+            '<mimic joint="k"/>': "is mimic; only",
+            '<origin xyz="1e300 0 0"/>': "is off by|over 1 km|check units",
+        }.items()
+    },
+}
+
+
+@pytest.mark.parametrize("text", BROKEN, ids=range(len(BROKEN)))
+def test_a_broken_file_is_one_clear_line(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "broken.urdf"
+    path.write_text(text)
+    with pytest.raises(mc.RobotError, match=BROKEN[text]) as caught:
+        mc.load_robot(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_origins_change_and_no_other_byte() -> None:
+    raw = """\ufeff<?xml version='1.0'?>
+<robot name="é > '"><!-- <origin xyz="1 2 3"/> -->
+  <link name="a"><visual><origin xyz="9 9 9"/></visual></link><link name="b"/><link name="c"/>
+\t<joint name="j" type="continuous" comment="a > b">
+    <parent link="a"/><child link="b"/>
+  </joint>
+  <joint name="k" type="continuous"><parent link="b"/><child link="c"/><origin/></joint>
+</robot>""".encode()
+    urdf = parse_urdf(raw)
+    same = [origin_edit(raw, joint, lambda _: ("1 0 0", "0 0 1")) for joint in urdf.joints]
+    made = edited(raw, same)
+    origin = b'<origin xyz="1 0 0" rpy="0 0 1"/>'
+    expected = raw.replace(b'b">\n', b'b">\n\t  ' + origin + b"\n", 1)
+    assert made == expected.replace(b"<origin/>", origin)
+    for joint in parse_urdf(made).joints:
+        assert_allclose(joint.origin, from_rpy(np.array([1, 0, 0]), np.array([0, 0, 1])))
+
+
+HOSTILE = (
+    '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="&x;"/>',
+    '<!DOCTYPE r SYSTEM "http://localhost:1/x.dtd"><robot/>',
+    '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot>&b;</robot>',
+    '<!DOCTYPE r [<!ENTITY % p SYSTEM "file:///etc/hostname"> %p;]><robot/>',
+)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_hostile_xml_is_refused(text: str) -> None:
+    with pytest.raises(mc.RobotError, match="DOCTYPE or entities"):
+        parse_urdf(text.encode(), "x.urdf")
+    with pytest.raises(mc.RobotError, match="undefined entity"):
+        parse_urdf(b'<robot name="&x;"/>', "x.urdf")
+
+
+def test_not_text_and_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.urdf"
+    with pytest.raises(mc.RobotError, match="cannot be read"):
+        mc.load_robot(path)
+    path.write_bytes(b"\xff\xfe<\x00")
+    with pytest.raises(mc.RobotError, match="not UTF-8"):
+        mc.load_robot(path)
+    path.write_bytes(b"<robot>" + b"<a>" * 200_000)  # depth costs no stack
+    with pytest.raises(mc.RobotError, match="is not XML"):
+        mc.load_robot(path)

@@ -1,0 +1,154 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems import CLASSICS, Classic
+from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, approx_fprime
+from scipy.sparse import csr_array
+
+import minimax_cal as mc
+from minimax_cal.solvers.minimize import complex_step
+
+
+@pytest.mark.parametrize("name", CLASSICS)
+def test_complex_step_is_the_gradient(name: str) -> None:
+    """Central differences in the complex plane against central differences on the line."""
+    classic = CLASSICS[name]
+    rng = np.random.default_rng(0)
+    x = np.array(classic.start, dtype=float) + 0.01 * rng.normal(size=len(classic.start))
+    if name in ("MAD4", "MAD5"):
+        x[1] = abs(x[1])  # inside the domain of the logarithm
+    exact = complex_step(classic.fun, x)
+    step = 1e-6 * np.maximum(1.0, np.abs(x))
+    for i, e in enumerate(np.diag(step)):
+        slope = (np.asarray(classic.fun(x + e)) - np.asarray(classic.fun(x - e))) / (2 * step[i])
+        scale = max(1.0, np.abs(exact).max(), np.abs(np.asarray(classic.fun(x))).max())
+        assert_allclose(exact[:, i], slope, rtol=0, atol=1e-7 * scale)
+
+
+def solve(classic: Classic, **more: object):  # type: ignore[no-untyped-def]
+    return mc.minimize_max(
+        classic.fun,
+        classic.start,
+        jac="cs",
+        bounds=classic.bounds,
+        constraints=classic.constraints,
+        **more,  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.parametrize("name", CLASSICS)
+def test_classics_reach_their_published_optimum(name: str) -> None:
+    classic = CLASSICS[name]
+    found = solve(classic)
+    assert found.success, found.message
+    assert abs(found.fun - classic.best) <= 1e-6 * max(1.0, abs(classic.best))
+    assert found.fun == np.max(classic.fun(found.x))
+    # a certificate from outside the solver: KKT with the multipliers it reports
+    slopes = complex_step(classic.fun, found.x)
+    gradient = found.multipliers @ slopes
+    rows = np.zeros((0, len(found.x)))
+    if classic.bounds is not None:
+        rows = np.eye(len(found.x))
+    rows = np.concatenate([rows, *(c.A for c in classic.constraints)])
+    gradient = gradient + found.constraint_multipliers @ rows
+    assert np.abs(gradient).max() <= 1e-6 * max(1.0, np.abs(slopes).max())
+    assert_allclose(found.multipliers.sum(), 1.0, rtol=1e-12)
+    assert found.multipliers.min() >= 0.0
+
+
+@pytest.mark.parametrize("qp", ["clarabel", "osqp", "proxqp"])
+def test_other_backends_reach_it_too(qp: str) -> None:
+    for name in ("Rosen-Suzuki", "MAD4", "Bard"):
+        found = solve(CLASSICS[name], qp=qp)
+        assert found.success
+        assert_allclose(found.fun, CLASSICS[name].best, rtol=1e-6)
+
+
+def test_user_jacobian_arguments_and_callback() -> None:
+    seen = []
+    found = mc.minimize_max(
+        lambda x, c: np.array([(x[0] - c) ** 2, (x[0] + c) ** 2]),
+        [3.0],
+        jac=lambda x, c: csr_array(np.array([[2 * (x[0] - c)], [2 * (x[0] + c)]])),
+        args=(2.0,),
+        callback=lambda r: seen.append((r.nit, r.fun)),
+    )
+    assert found.success
+    assert_allclose([found.x[0], found.fun], [0.0, 4.0], atol=1e-8)
+    assert [nit for nit, _ in seen] == list(range(1, len(seen) + 1))
+    assert seen[0][1] == 25.0
+
+
+def test_finite_differences_are_the_default() -> None:
+    found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), tol=1e-6)
+    assert_allclose(found.fun, 1.9522245, rtol=1e-6)
+
+
+def test_linear_and_nonlinear_constraints_with_bounds() -> None:
+    """min max(x, y) with x^2 + y^2 = 1, x - y >= 0.4, y >= -0.5: y = -0.5 is active at a corner."""
+    found = mc.minimize_max(
+        lambda x: x,
+        [1.0, -0.1],
+        jac="cs",
+        bounds=Bounds([-np.inf, -0.5], [np.inf, np.inf]),
+        constraints=[
+            LinearConstraint([[1.0, -1.0]], 0.4, np.inf),
+            NonlinearConstraint(lambda x: x[0] ** 2 + x[1] ** 2, 1.0, 1.0, jac="cs"),
+        ],
+    )
+    assert found.success
+    assert_allclose(found.x, [np.sqrt(0.75), -0.5], atol=1e-8)
+    assert found.violation < 1e-8
+
+
+def test_start_outside_the_bounds_is_brought_in() -> None:
+    seen = []
+
+    def fun(x: np.ndarray) -> np.ndarray:
+        seen.append(x.real.copy())
+        return np.array([np.sqrt(x[0])])  # no number below zero
+
+    found = mc.minimize_max(fun, [-3.0], jac="cs", bounds=Bounds([0.25], [4.0]))
+    assert found.success
+    assert_allclose(found.x, [0.25])
+    assert min(x[0] for x in seen) >= 0.25 - 1e-9
+
+
+def test_no_feasible_point_is_said() -> None:
+    found = mc.minimize_max(
+        lambda x: x, [0.0], jac="cs", constraints=NonlinearConstraint(lambda x: x**2, -5, -1)
+    )
+    assert not found.success
+    assert found.status == "infeasible"
+    assert found.violation == pytest.approx(1.0, abs=1e-6)
+
+
+def test_unbounded_problem_does_not_claim_success() -> None:
+    found = mc.minimize_max(lambda x: -x, [1.0], jac=lambda x: -np.eye(1), maxiter=30)
+    assert not found.success
+
+
+@pytest.mark.parametrize(
+    ("options", "say"),
+    [
+        ({"jac": "exact"}, "jac 'exact'"),
+        ({"x0": [np.nan]}, "x0"),
+        ({"fun": lambda x: x * np.nan}, "finite"),
+        ({"constraints": [{"type": "ineq"}]}, "not dict"),
+        ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
+        ({"bounds": Bounds([1.0], [0.0])}, "above"),
+    ],
+)
+def test_wrong_arguments_are_refused(options: dict, say: str) -> None:  # type: ignore[type-arg]
+    arguments = {"fun": lambda x: x, "x0": [1.0], **options}
+    with pytest.raises(mc.OptionError, match=say):
+        mc.minimize_max(**arguments)
+
+
+def test_a_wrong_gradient_is_not_called_optimal() -> None:
+    """The KKT test trusts jac; with a wrong one the line search must stop, not claim success."""
+    found = mc.minimize_max(
+        lambda x: np.array([x @ x]), [1.0, 1.0], jac=lambda x: -np.array([2 * x])
+    )
+    assert not found.success
+    assert approx_fprime(found.x, lambda x: float(x @ x)) @ found.x >= 0

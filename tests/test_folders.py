@@ -1,0 +1,56 @@
+"""Imports point down: a folder imports only folders above it in this list."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = (
+    "ground",
+    "solvers",
+    "robots",
+    "measuring",
+    "modelling",
+    "evidence",
+    "fitting",
+    "judging",
+    "diagnosing",
+    "planning",
+    "correcting",
+    "reporting",
+    "cli",
+)
+MODULES = sorted((ROOT / "minimax_cal").rglob("*.py"))
+
+
+def imported(path: Path) -> set[str]:
+    """Modules that a file imports, dotted."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+    return found
+
+
+def test_every_folder_has_its_place() -> None:
+    inside = (ROOT / "minimax_cal").iterdir()
+    assert {p.name for p in inside if p.is_dir() and p.name != "__pycache__"} == set(FOLDERS)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT / "minimax_cal")))
+def test_imports_point_down(path: Path) -> None:
+    folder = path.relative_to(ROOT / "minimax_cal").parts[0]
+    allowed = {*FOLDERS[: FOLDERS.index(folder) + 1], "__init__"} if folder in FOLDERS else FOLDERS
+    for module in imported(path):
+        package, _, inner = module.partition(".")
+        assert package not in ("experiments", "tests")
+        if package == "minimax_cal" and inner:
+            assert inner.partition(".")[0] in allowed, f"{folder} imports {module}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "qp_backends").glob("*.py")), ids=lambda p: p.stem)
+def test_qp_backends_knows_no_robot(path: Path) -> None:
+    assert not any(module.startswith(("minimax_cal", "experiments")) for module in imported(path))
