@@ -21,7 +21,7 @@ from experiments import sweep
 from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
 from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.start import fit_frame, search
+from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.robots import kinematics
@@ -101,7 +101,7 @@ def run(trial: Trial) -> Result:
 def truth_cost(robot: Robot, model: Model) -> float:
     """The global minimum, reached from the nominal geometry's closed-form start."""
     points = float(model.counts.sum())
-    begin = fit_frame(model, robot.mdh).state
+    begin = fit_base(model, robot.mdh).state
     found = least_squares.solve(SumOfSquares(model), begin.batch(), 1, points, trace=False)
     return float(found.cost[0])
 

@@ -22,7 +22,7 @@ from experiments.conditions import ROBOTS, SHARED, shared
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import split
 from minimax_cal.modelling.model import SumOfSquares, model_of
@@ -71,7 +71,7 @@ def run(job: Job) -> Process:
     values = 1e3 * np.sqrt(squares.trace[:, 0] / points)
     status, x = str(squares.status[0]), squares.x.take(np.array(0))
     if job.kind == "backend":
-        problem = worst_of(model, x, measured_distances(fitted), "two-sided", "target")
+        problem = minimax_problem(model, x, measured_distances(fitted), "two-sided", "target")
         loose = job.way == "subgradient"
         qp = partial(solve_qp, name=job.way, tolerance=1e-7 if loose else 1e-9, fallback=not loose)
         best = minimax.solve(problem, x, qp, minimax.Sqp(tolerance=1e-6 if loose else 1e-8))

@@ -179,7 +179,9 @@ def reference(arm: Cell, case: Case) -> Fit:
 def along(axes: Array, x: State) -> Array:
     """(p,) parameters, the base's along given axes, as `calibrate.parameter_table` tells them."""
     turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
-    return np.concatenate([links_of(x.mdh), axes.T @ x.origin, turn, x.targets.reshape(-1)])
+    return np.concatenate(
+        [links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1)]
+    )
 
 
 def known_by_noise(fit: Fit) -> Uncertainty:
@@ -190,12 +192,12 @@ def known_by_noise(fit: Fit) -> Uncertainty:
         Poses.of(fit.estimator, fit.state), fit.uncertainty.noise
     )
     told = fit.uncertainty
-    return Uncertainty(told.names, told.units, out, told.noise, told.spare, "noise")
+    return Uncertainty(told.names, told.units, out, told.noise, told.dof, "noise")
 
 
 def in_base(cell: Cell) -> Cell:
     """The cell seen from its base."""
-    return Cell(cell.robot, np.eye(4), cell.targets, cell.spots)
+    return Cell(cell.robot, np.eye(4), cell.target_names, cell.target_positions)
 
 
 def rng_of(batch: Batch, number: int) -> np.random.Generator:
@@ -209,7 +211,7 @@ def run(batch: Batch) -> Runs:
     arm, robot = arm_of(case, batch.seed), mc.load_robot(case.robot)
     true = reference(arm, case)
     active = true.identification.active
-    ideal = Cell.of(robot, true.state, arm.targets)
+    ideal = Cell.of(robot, true.state, arm.target_names)
     rows = []
     for number in range(batch.count):
         rng = rng_of(batch, number)
@@ -220,13 +222,13 @@ def run(batch: Batch) -> Runs:
         axes = fit.nominal.rotation
         error = along(axes, fit.state)[active] - along(axes, true.state)[active]
         told = (fit.uncertainty, known_by_noise(fit))
-        cell = Cell.of(robot, fit.state, arm.targets)
+        cell = Cell.of(robot, fit.state, arm.target_names)
         inside = [positions(cell, known, ideal, case, rng) for known in told]
         rows.append(
             (
                 error,
                 np.array([known.sigma[active] for known in told]),
-                quantile(LEVEL, told[0].spare),
+                quantile(LEVEL, told[0].dof),
                 np.array(inside)[:, :3],
                 inside[0][3]
                 if case.compliance == 0.0
@@ -271,7 +273,7 @@ def whole_arm(
 def inside(error: Array, covariance: Array, known: Uncertainty) -> float:
     """Share of coordinates within their intervals.  error: (m, k, 3), covariance: (m, k, 3, 3)."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    return float(np.mean(np.abs(error) <= quantile(LEVEL, known.spare) * sigma))
+    return float(np.mean(np.abs(error) <= quantile(LEVEL, known.dof) * sigma))
 
 
 def judged(cell: Cell, arm: Cell, case: Case, rng: np.random.Generator) -> Array:
@@ -310,7 +312,7 @@ def resampled(batch: Batch) -> tuple[Array, Array]:
     case = batch.case
     arm, robot = arm_of(case, batch.seed), mc.load_robot(case.robot)
     true = reference(arm, case)
-    ideal = Cell.of(robot, true.state, arm.targets)
+    ideal = Cell.of(robot, true.state, arm.target_names)
     place = np.flatnonzero(true.identification.active)
     held, share = [], []
     for number in range(batch.count):

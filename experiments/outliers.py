@@ -96,7 +96,7 @@ def spoilt(data: Measurements, job: Job) -> tuple[Measurements, set[tuple[int, s
         1e-3 * job.shift * way / np.linalg.norm(way, axis=1, keepdims=True)
     )
     wrong = {
-        (int(data.line[row]), data.targets[column])
+        (int(data.line[row]), data.target_names[column])
         for row, column in zip(rows[chosen], columns[chosen], strict=True)
     }
     return data.with_y(y), wrong

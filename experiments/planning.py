@@ -189,7 +189,12 @@ def trial(
     cell = task.ground.cell
     n = cell.robot.joints
     off = rng.normal(size=(n, 5)) * ([TRUTH.length] * 2 + [TRUTH.angle] * 3)
-    real = Cell(cell.robot.with_mdh(cell.robot.mdh + off), cell.base, cell.targets, cell.spots)
+    real = Cell(
+        cell.robot.with_mdh(cell.robot.mdh + off),
+        cell.base,
+        cell.target_names,
+        cell.target_positions,
+    )
     random = (rng.choice(found.drawn, count, replace=False) for count in (POSES, 2 * POSES))
     truth = real.predict(bent(real, fresh, compliance))
     out = []
@@ -216,7 +221,9 @@ def measured(
     spread = noise.noise + noise.per_metre * np.linalg.norm(y, axis=-1, keepdims=True)
     y = np.where(seen[..., None], y + spread * rng.normal(size=y.shape), np.nan)
     lines = np.arange(len(q)) + 1
-    return Measurements(q, y, real.targets, real.robot.prismatic, lines, {}, source="simulated")
+    return Measurements(
+        q, y, real.target_names, real.robot.prismatic, lines, {}, source="simulated"
+    )
 
 
 # ---- poses that were measured ------------------------------------------------------------------
@@ -250,7 +257,7 @@ def run_real(job: Real) -> dict[str, float]:
     pool, judge = data.take(order[third:]), data.take(order[:third])
     cell = calibrate(robot, pool.take(np.arange(FEW)), "sum", holdout=0.0).cell
     cell = with_effects(cell, job.effects, pool.q)
-    seen = np.ones((pool.poses, len(pool.targets)), dtype=bool)
+    seen = np.ones((pool.poses, len(pool.target_names)), dtype=bool)
     ahead = prospect(cell, Instrument(), pool.q, seen)
     menu = Menu(ahead.ahead(pool.q, seen), np.zeros((len(ahead.scale),) * 2))
     b = ahead.predictions(judge.q)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 from scipy.io import loadmat
 
-from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import load_robot
@@ -37,7 +37,7 @@ def recorded(per: str, poses: int, seed: int) -> list[Case]:
     robot = load_robot("irb2600")
     data = simulate(robot, poses, 3, seed).data
     model, state = fitted(robot, data)
-    problem = worst_of(model, state, measured_distances(data), "two-sided", per)
+    problem = minimax_problem(model, state, measured_distances(data), "two-sided", per)
     seen: list[Problem] = []
 
     def listen(qp: Problem) -> Solution:

@@ -42,7 +42,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements, split
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity, random_poses
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -362,9 +361,9 @@ def tracked(arm: Arm, rng: np.random.Generator, checks: Array, nominal: Array) -
     q = random_poses(arm.robot, POSES, rng)
     y = arm.place(q) + NOISE * rng.normal(size=(POSES, 3))
     fit = calibrate(arm.robot, measurements(q, y), objective="sum")
-    found, shape = true_errors(arm, fit.robot, fit.cell.spots[0], checks)
+    found, shape = true_errors(arm, fit.robot, fit.cell.target_positions[0], checks)
     cell, model = fit.cell, model_of(arm.robot, fit.data)
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     return Outcome(
         numbers=3 * fit.accuracy["train"].poses,
         parameters=len(fit.parameters),
@@ -435,11 +434,11 @@ def run_real(job: RealJob) -> RealOutcome:
     data = read_measurements(SHARED / job.robot / "measurements.csv").only(0)
     train, held, _ = split(data, job.held, job.seed)
     fit = calibrate(robot, train, objective="sum", holdout=0.0)
-    nominal = after_base(held, robot, fit.nominal.spots[0])
+    nominal = after_base(held, robot, fit.nominal.target_positions[0])
     if job.kind == "tracker":
         identified = sum(p.identifiable for p in fit.parameters)
         held_mm = rms_mm(np.linalg.norm(fit.cell.error(held)[0], axis=1))
-        after = after_base(held, fit.robot, fit.cell.spots[0])
+        after = after_base(held, fit.robot, fit.cell.target_positions[0])
         return RealOutcome(train.poses, identified, held_mm, (nominal, after))
     other = relative(robot, seen_from(data, job.kind), seed=job.seed, holdout=job.held)
     return RealOutcome(
@@ -457,7 +456,7 @@ def seen_from(data: Measurements, kind: str) -> RelativeData:
     three = y.mean(axis=0) + 3.0 * y.std(axis=0).max() * around
     anchors = three if kind == "wires_3" else np.zeros((1, 3))
     length = np.linalg.norm(y[:, None] - anchors, axis=-1)
-    at = replace(data, y=data.y[:, :0], targets=())
+    at = replace(data, y=data.y[:, :0], target_names=())
     return RelativeData(at, "distances", wire_names(range(1, len(anchors) + 1)), length)
 
 

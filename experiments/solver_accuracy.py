@@ -32,7 +32,7 @@ from experiments.qp_cases import SETS, Case
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.simulate import simulate
@@ -357,7 +357,7 @@ def sqp_values(backends: Sequence[str], seed: int) -> Table:
     robot = load_robot("irb2600")
     data = simulate(robot, 100, 3, seed).data
     model, state = fitted(robot, data)
-    problem = worst_of(model, state, measured_distances(data), "two-sided", "target")
+    problem = minimax_problem(model, state, measured_distances(data), "two-sided", "target")
     rows: list[tuple[Cell, ...]] = []
     best = np.nan
     for backend in backends:

@@ -23,7 +23,7 @@ from experiments import sweep
 from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify, start
-from minimax_cal.fitting.minimax_problem import Worst, measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
@@ -43,7 +43,7 @@ class Case:
     robot: Robot
     model: Model
     begin: State
-    worst: Callable[[State], Worst]
+    worst: Callable[[State], MinimaxProblem]
 
 
 def case_of(poses: int, seed: int) -> Case:
@@ -52,13 +52,15 @@ def case_of(poses: int, seed: int) -> Case:
     data = simulate(robot, poses, 3, seed).data
     model, begin = identified(robot, data)
     distances = measured_distances(data)
-    return Case(robot, model, begin, lambda x: worst_of(model, x, distances, "two-sided", "target"))
+    return Case(
+        robot, model, begin, lambda x: minimax_problem(model, x, distances, "two-sided", "target")
+    )
 
 
 def identified(robot: Robot, data: Measurements) -> tuple[Model, State]:
     """The model with its identified parameters free, and the nominal start."""
     model = model_of(robot, data)
-    begin = start.fit_frame(model, robot.mdh).state
+    begin = start.fit_base(model, robot.mdh).state
     found = identify.identify(
         model,
         begin,
@@ -157,12 +159,12 @@ def slsqp_minimax(case: Case, begin: State) -> float:
     def both(u: Array) -> tuple[Array, Array]:
         return problem.evaluate(problem.step(begin, u[:size]))
 
-    def slopes(u: Array) -> tuple[Array, Array]:
+    def jacobians(u: Array) -> tuple[Array, Array]:
         at = problem.linearise(problem.step(begin, u[:size]))
         first = int(np.flatnonzero(np.flatnonzero(case.model.active) == 5 * 6 + 3)[0])
         turn = right_jacobian((u[:size] / problem.scale)[first : first + 3])
         move = kinematics.rotation((u[:size] / problem.scale)[first : first + 3]).T
-        f, c = at.slope.copy(), at.normal
+        f, c = at.jacobian.copy(), at.normal
         s = problem.scale[first : first + 3]
         f[:, first : first + 3] = f[:, first : first + 3] * s @ turn / s
         s = problem.scale[first - 3 : first]
@@ -174,7 +176,7 @@ def slsqp_minimax(case: Case, begin: State) -> float:
         return np.concatenate([u[size] - f, c - lower, upper - c])
 
     def inequality_slope(u: Array) -> Array:
-        f, c = slopes(u)
+        f, c = jacobians(u)
         zero = np.zeros((len(c), 1))
         return np.block([[-f, np.ones((len(f), 1))], [c, zero], [-c, zero]])
 

@@ -28,7 +28,7 @@ from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.certificate import PointCones, certify
-from minimax_cal.fitting.minimax_problem import Worst, measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements
@@ -65,7 +65,7 @@ class Case:
 
     data: Measurements
     start: State
-    worst: Worst
+    worst: MinimaxProblem
 
 
 def case_of(points: int, seed: int) -> Case:
@@ -73,7 +73,9 @@ def case_of(points: int, seed: int) -> Case:
     robot = load_robot("irb2600")
     data = simulate(robot, round(points / 3), 3, seed).data
     model, start = fitted(robot, data)
-    return Case(data, start, worst_of(model, start, measured_distances(data), "two-sided", "point"))
+    return Case(
+        data, start, minimax_problem(model, start, measured_distances(data), "two-sided", "point")
+    )
 
 
 def by_sqp(case: Case) -> float:
@@ -117,10 +119,10 @@ def linear_optimum(rows: Rows, lower: Array, upper: Array) -> tuple[Array, float
     return np.asarray(d.value), float(problem.value)
 
 
-def scaled(case: Case) -> Worst:
+def scaled(case: Case) -> MinimaxProblem:
     """The problem scaled anew, which is part of the work."""
     worst = case.worst
-    return worst_of(worst.model, case.start, worst.distances, worst.form, worst.per)
+    return minimax_problem(worst.model, case.start, worst.distances, worst.form, worst.per)
 
 
 WAYS: dict[str, Callable[[Case], float]] = {SQP: by_sqp, CONES: by_cones, CVXPY: by_cvxpy}

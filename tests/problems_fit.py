@@ -18,7 +18,7 @@ from minimax_cal.solvers.least_squares import METHODS
 def identified(robot: mc.Robot, data: mc.Measurements) -> tuple[Model, State]:
     """The model with its identified parameters free, and the nominal start."""
     model = model_of(robot, data)
-    begin = start.fit_frame(model, robot.mdh).state
+    begin = start.fit_base(model, robot.mdh).state
     found = identify.identify(
         model,
         begin,

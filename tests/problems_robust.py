@@ -44,7 +44,7 @@ class Case:
     def miss(self, state: State) -> float:
         """RMS distance from the true robot's points, at new poses [m]."""
         q = np.random.default_rng(1).uniform(-2.0, 2.0, (100, self.robot.joints))
-        cell = Cell.of(self.robot, state, self.data.targets)
+        cell = Cell.of(self.robot, state, self.data.target_names)
         error = cell.predict(q) - self.made.cell.predict(q)
         return float(np.sqrt((error**2).sum(axis=-1).mean()))
 
@@ -52,7 +52,7 @@ class Case:
         """(k, m) True for the suspects."""
         out = np.zeros_like(self.bad)
         for one in found.suspects:
-            out[self.data.targets.index(one.target), one.pose] = True
+            out[self.data.target_names.index(one.target), one.pose] = True
         return out
 
 
@@ -76,7 +76,7 @@ FITTER: Fitter = fit
 def case_of(robot: mc.Robot, made: Simulation, data: mc.Measurements, bad: Array) -> Case:
     """The identifiable parameters and the plain fit of some measurements.  bad: (m, k)."""
     base = model_of(robot, data)
-    begin = start.fit_frame(base, robot.mdh).state
+    begin = start.fit_base(base, robot.mdh).state
     every = np.ones(base.names.count, dtype=bool)
     chosen = identify.identify(
         base,

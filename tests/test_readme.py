@@ -51,7 +51,7 @@ def test_the_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
-    assert mc.load_cell(tmp_path / "fit.json").targets == ("smr1", "smr2", "smr3")
+    assert mc.load_cell(tmp_path / "fit.json").target_names == ("smr1", "smr2", "smr3")
 
 
 def test_the_example_is_what_its_script_makes(

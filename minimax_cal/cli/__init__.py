@@ -90,7 +90,7 @@ def evaluate_command(fit: Path, data: Path, as_json: bool, output: Path | None, 
         }
     )
     if options.deliver(text, output, as_json=as_json):
-        show(found.table(f"{cell.robot.name} on {data}", measured.targets))
+        show(found.table(f"{cell.robot.name} on {data}", measured.target_names))
     return 0
 
 

@@ -142,7 +142,7 @@ def calibrate_command(
     options.writable(output)
     options.writable(figure, kinds=PICTURES)
     millimetres = float("nan") if distance_tolerance is None else distance_tolerance
-    with options.stages(quiet=quiet) as report:
+    with options.stages(quiet=quiet) as progress:
         fit = calibrate(
             robot,
             data,
@@ -152,10 +152,12 @@ def calibrate_command(
             priors=dict(map(prior_of, prior)),
             distance_tolerance=millimetres * 1e-3,
             lever=float("nan") if lever is None else lever * 1e-3,
-            report=report,
+            progress=progress,
             **choices,
         )
-        drawn = [] if replicates is None else [bootstrap(fit, replicates, choices["seed"], report)]
+        drawn = (
+            [] if replicates is None else [bootstrap(fit, replicates, choices["seed"], progress)]
+        )
     options.notify(fit.notices, quiet=quiet)
     if figure:
         save_errors(fit, figure)

@@ -88,7 +88,7 @@ def read_targets(path: Path | str) -> TargetFile:
     data = Measurements(
         q=q,
         y=np.zeros((len(q), 0, 3)),
-        targets=(),
+        target_names=(),
         sliding=sliding,
         line=file.line,
         columns=columns,

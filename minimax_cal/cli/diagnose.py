@@ -48,14 +48,14 @@ def diagnose_command(
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
     options.writable(output)
     options.writable(figure, kinds=PICTURES)
-    with options.stages(quiet=quiet) as report:
+    with options.stages(quiet=quiet) as progress:
         found = diagnose(
             robot,
             data,
             seed=seed,
             holdout=holdout,
             exclude=options.names_of(without),
-            report=report,
+            progress=progress,
         )
     options.notify(found.notices, quiet=quiet)
     if figure:

@@ -86,7 +86,7 @@ def content(found: Imported, output: Path | None) -> dict[str, object]:
         "output": str(output) if output else None,
         "poses": found.data.poses,
         "joints": found.data.q.shape[1],
-        "targets": list(found.data.targets),
+        "targets": list(found.data.target_names),
         "files": [
             {
                 **dict(zip(files.header, row, strict=True)),

@@ -262,13 +262,13 @@ def plan_command(
         raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")
     arm = load_robot(robot)
     degree = float(np.radians(1.0))
-    with options.stages(quiet=quiet) as report:
+    with options.stages(quiet=quiet) as progress:
         found = plan(
             arm,
             poses,
             fit=fit or "",
             data=data or "",
-            report=report,
+            progress=progress,
             criterion=criterion,
             effects=options.names_of(effects),
             separate=tuple(separate or ()),

@@ -71,11 +71,11 @@ def relative_command(
     flange_x_mm, flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
     """
     options.writable(output)
-    with options.stages(quiet=quiet) as report:
+    with options.stages(quiet=quiet) as progress:
         fit = relative(
             robot,
             data,
-            report,
+            progress,
             holdout=holdout,
             seed=seed,
             fix=options.names_of(fix),

@@ -44,8 +44,8 @@ def tradeoff_command(
     """Small RMS or small largest error: what ROBOT could have, by the measurements in DATA."""
     options.writable(output)
     options.writable(figure, kinds=PICTURES)
-    with options.stages(quiet=quiet) as report:
-        found = tradeoff(robot, data, steps, qp, holdout, seed, report)
+    with options.stages(quiet=quiet) as progress:
+        found = tradeoff(robot, data, steps, qp, holdout, seed, progress)
     options.notify(found.notices, quiet=quiet)
     if figure:
         save_tradeoff(found, figure)

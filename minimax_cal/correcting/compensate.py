@@ -234,7 +234,11 @@ def compensate(
     base, tool, said = placed(cell, arm, robots[0], drawn, frame)
     goal = base @ robots[0].pose(data.q) @ tool
     if np.isnan(lever):
-        own = rms(np.linalg.norm(cell.spots, axis=1)) if len(cell.spots) else 0.0
+        own = (
+            rms(np.linalg.norm(cell.target_positions, axis=1))
+            if len(cell.target_positions)
+            else 0.0
+        )
         lever = own if own > LEAST_LEVER else USUAL_LEVER
     reach = Reach(arm, data, goal, lever, tolerance, most_change)
     q, outcome = reach.best()
@@ -282,14 +286,14 @@ def nominal_cell(cell: Cell, robot: Robot, content: Mapping[str, Any]) -> tuple[
         at, was = (np.array([told[f"base_{a}"][k] for a in "xyz"], dtype=float) * 1e-3
                    for k in ("value", "nominal"))  # fmt: skip
         turn = np.array([told[f"base_r{a}"]["value"] for a in "xyz"], dtype=float)
-        spots = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.targets]
+        spots = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.target_names]
         base = np.eye(4)
         base[:3, :3] = cell.base[:3, :3] @ kinematics.rotation(-turn)
         base[:3, 3] = base[:3, :3] @ was
         apart = np.abs(base[:3, :3] @ at - cell.base[:3, 3]).max()
         if not apart < 1e-5:
             return ()
-        return (Cell(robot, base, cell.targets, np.array(spots, dtype=float) * 1e-3),)
+        return (Cell(robot, base, cell.target_names, np.array(spots, dtype=float) * 1e-3),)
     except (KeyError, TypeError, ValueError):
         return ()
 
@@ -347,14 +351,19 @@ def arm_of(cell: Cell) -> Cell:
 
     They tell the flange's pose.  Of the effects those that move the flange.
     """
-    middle = cell.spots.mean(axis=0) if len(cell.spots) else np.zeros(3)
+    middle = cell.target_positions.mean(axis=0) if len(cell.target_positions) else np.zeros(3)
     kept = [
         (term, value)
         for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term.effect not in SEEN_ONLY and term.place not in cell.targets
+        if term.effect not in SEEN_ONLY and term.place not in cell.target_names
     ]
     effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
-    return replace(cell, targets=CORNERS, spots=middle + USUAL_LEVER * TETRAHEDRON, effects=effects)
+    return replace(
+        cell,
+        target_names=CORNERS,
+        target_positions=middle + USUAL_LEVER * TETRAHEDRON,
+        effects=effects,
+    )
 
 
 def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
@@ -400,20 +409,27 @@ def placed(
         return np.eye(4), np.eye(4), ()
     if drawn:
         base = np.linalg.inv(cell.base) @ drawn[0].base
-        return base, motion(cell.spots, drawn[0].spots) if frame == "best-fit" else np.eye(4), ()
+        return (
+            base,
+            motion(cell.target_positions, drawn[0].target_positions)
+            if frame == "best-fit"
+            else np.eye(4),
+            (),
+        )
     q = random_poses(nominal, SAMPLE, np.random.default_rng(0))
-    turn, moved = bent(arm, still(q, arm.targets, arm.robot))
+    turn, moved = bent(arm, still(q, arm.target_names, arm.robot))
     flange = moved @ kinematics.forward(
         arm.robot.mdh, q * arm.robot.sign + turn, arm.robot.prismatic
     )
     pose, tool = nominal.pose(q), np.eye(4)
     for _ in range(1 if frame == "flange" else 50):
         base = motion(
-            seen(pose @ tool, arm.spots).reshape(-1, 3), seen(flange, arm.spots).reshape(-1, 3)
+            seen(pose @ tool, arm.target_positions).reshape(-1, 3),
+            seen(flange, arm.target_positions).reshape(-1, 3),
         )
         if frame == "best-fit":
-            wanted = seen(np.linalg.inv(base @ pose) @ flange, arm.spots).mean(axis=0)
-            tool = motion(arm.spots, wanted)
+            wanted = seen(np.linalg.inv(base @ pose) @ flange, arm.target_positions).mean(axis=0)
+            tool = motion(arm.target_positions, wanted)
     said = (
         f"the nominal base was placed by {SAMPLE} poses of the two models, not by the measurements"
     )
@@ -471,7 +487,7 @@ def bent(arm: Cell, data: Measurements) -> tuple[Array, Array]:
     if not shift.any():
         return turn, still_there
     mdh, prismatic = arm.robot.mdh, arm.robot.prismatic
-    before = seen(kinematics.forward(mdh, scene.q.T + turn, prismatic), arm.spots)
+    before = seen(kinematics.forward(mdh, scene.q.T + turn, prismatic), arm.target_positions)
     return turn, motion(before, before + np.moveaxis(shift, -1, 0))
 
 
@@ -564,14 +580,14 @@ class Reach:
     def outcomes(self, q: Array, good: Array, settled: Array) -> tuple[Outcome, ...]:
         """How each target ended."""
         turn, moved = bent(self.arm, self.at(q))
-        residual, slope = examine(self, q, np.linalg.inv(moved) @ self.goal, turn)
+        residual, jacobian = examine(self, q, np.linalg.inv(moved) @ self.goal, turn)
         robot, (lower, upper) = self.arm.robot, self.box
-        force = np.einsum("mij,mi->mj", slope, residual)
-        size = np.linalg.norm(slope, axis=1) * np.linalg.norm(residual, axis=1)[:, None]
+        force = np.einsum("mij,mi->mj", jacobian, residual)
+        size = np.linalg.norm(jacobian, axis=1) * np.linalg.norm(residual, axis=1)[:, None]
         down, up = force < -1e-2 * size, force > 1e-2 * size
         limit = ((q <= robot.lower) & down) | ((q >= robot.upper) & up)
         bound = ((q <= lower) & down) | ((q >= upper) & up)
-        singular = np.linalg.svd(slope, compute_uv=False)
+        singular = np.linalg.svd(jacobian, compute_uv=False)
         whole = singular[:, -1] > 1e-2 * singular[:, 0]
         out = []
         for i in range(len(q)):
@@ -600,8 +616,10 @@ def examine(reach: Reach, q: Array, goal: Array, turn: Array) -> tuple[Array, Ar
     slides = robot.prismatic[:, None, None]
     moves = np.where(slides, links.z, cross(links.z, links.origin - links.before))
     turns = np.where(slides, 0.0, lever * links.z)
-    slope = np.concatenate([moves, turns], axis=1) * robot.sign[:, None, None]
-    return np.concatenate([missing, lever * away], axis=1), np.moveaxis(slope, -1, 0).swapaxes(1, 2)
+    jacobian = np.concatenate([moves, turns], axis=1) * robot.sign[:, None, None]
+    return np.concatenate([missing, lever * away], axis=1), np.moveaxis(jacobian, -1, 0).swapaxes(
+        1, 2
+    )
 
 
 def newton(reach: Reach, begin: Array, goal: Array, turn: Array, soft: Array) -> Array:
@@ -618,16 +636,16 @@ def newton(reach: Reach, begin: Array, goal: Array, turn: Array, soft: Array) ->
     todo = np.arange(len(q))
 
     def look(rows: Array, at: Array) -> tuple[Array, Array, Array]:
-        residual, slope = examine(reach, at, goal[rows], turn[rows])
+        residual, jacobian = examine(reach, at, goal[rows], turn[rows])
         cost = (residual**2).sum(1) + price[rows] * ((at - rest[rows]) ** 2).sum(1)
-        return residual, slope, cost
+        return residual, jacobian, cost
 
-    residual, slope, cost = look(todo, q)
+    residual, jacobian, cost = look(todo, q)
     for _ in range(STEPS):
         here, weight = q[todo], price[todo]
-        force = np.einsum("mij,mi->mj", slope, residual) - weight[:, None] * (here - rest[todo])
+        force = np.einsum("mij,mi->mj", jacobian, residual) - weight[:, None] * (here - rest[todo])
         free = ~(((here <= lower[todo]) & (force < 0)) | ((here >= upper[todo]) & (force > 0)))
-        gram = np.swapaxes(slope, 1, 2) @ slope + weight[:, None, None] * eye
+        gram = np.swapaxes(jacobian, 1, 2) @ jacobian + weight[:, None, None] * eye
         scale = np.maximum(np.trace(gram, axis1=1, axis2=2) / len(eye), 1e-12)
         gram = np.where(free[:, :, None] & free[:, None, :], gram, 0.0)
         force = np.where(free, force, 0.0)
@@ -642,10 +660,10 @@ def newton(reach: Reach, begin: Array, goal: Array, turn: Array, soft: Array) ->
         q[todo[better]] = trial[better]
         pick = better[:, None]
         residual = np.where(pick, new_residual, residual)
-        slope = np.where(pick[..., None], new_slope, slope)
+        jacobian = np.where(pick[..., None], new_slope, jacobian)
         cost = np.where(better, new_cost, cost)
         damping[todo] = np.clip(damping[todo] * np.where(better, 0.1, 10.0), 1e-12, 1e9)
-        todo, residual, slope, cost = (part[~done] for part in (todo, residual, slope, cost))
+        todo, residual, jacobian, cost = (part[~done] for part in (todo, residual, jacobian, cost))
         if not len(todo):
             break
     return q

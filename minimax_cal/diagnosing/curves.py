@@ -115,9 +115,9 @@ def turns(left: Leftover) -> list[Array]:
     Of all views at once, so that one ridge serves them all and they compare.
     """
     views = (*left.errors, *left.law)
-    slope = np.concatenate([left.scene.slope] * len(views), axis=-1)
+    jacobian = np.concatenate([left.scene.jacobian] * len(views), axis=-1)
     together = np.concatenate(views, axis=1)
-    return np.split(joint_equivalent(together, slope, left.noise), len(views), axis=0)
+    return np.split(joint_equivalent(together, jacobian, left.noise), len(views), axis=0)
 
 
 def guilty(left: Leftover, turn: list[Array]) -> int:
@@ -128,7 +128,7 @@ def guilty(left: Leftover, turn: list[Array]) -> int:
     place = left.term[0].place if left.term else ""
     if place[:1] == "J":
         return int(place[1:]) - 1
-    lever = np.sqrt(np.nanmean((left.scene.slope**2).sum(axis=2), axis=(1, 2)))
+    lever = np.sqrt(np.nanmean((left.scene.jacobian**2).sum(axis=2), axis=(1, 2)))
     fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
     size = fell * lever**2
     effect = left.term[0].effect if left.term else ""
@@ -181,7 +181,7 @@ def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
 
 def along_motion(left: Leftover, term: Term) -> Curve:
     """What is left of the targets along the motion that an effect gives them."""
-    scene, names = left.scene, left.scene.data.targets
+    scene, names = left.scene, left.scene.data.target_names
     chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
     sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
     if term.effect == "target_offset":

@@ -16,10 +16,10 @@ from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import ENOUGH, resemblances, rivals
+from minimax_cal.evidence.alternatives import ENOUGH, alternatives, resemblances
 from minimax_cal.evidence.noise import Noise, Rows, linearised
 from minimax_cal.evidence.selection import Choice, Library
-from minimax_cal.fitting.calibrate import Fit, Options, Report, fit_cell, silent
+from minimax_cal.fitting.calibrate import Fit, Options, Progress, fit_cell, silent
 from minimax_cal.fitting.calibration import Provenance
 from minimax_cal.fitting.exchanged import misplaced, put_right
 from minimax_cal.fitting.plausibility import check_sense
@@ -70,24 +70,24 @@ class Study:
         """
         active = self.fit.identification.active
         state, effects = refitted(self.robot, data, self.fit.state, active, terms, usual)
-        return Cell.of(self.robot, state, self.data.targets, effects)
+        return Cell.of(self.robot, state, self.data.target_names, effects)
 
     @property
     def geometric(self) -> Cell:
         """The calibrated robot without effects."""
-        return Cell.of(self.robot, self.fit.state, self.data.targets, NOTHING)
+        return Cell.of(self.robot, self.fit.state, self.data.target_names, NOTHING)
 
     @property
     def nominal(self) -> Cell:
         """The nominal robot with its best base and targets."""
-        return Cell.of(self.robot, self.fit.nominal, self.data.targets, NOTHING)
+        return Cell.of(self.robot, self.fit.nominal, self.data.target_names, NOTHING)
 
 
 def studied(robot: Robot, data: Measurements, fit: Fit) -> Study:
     """A geometric fit linearised."""
     model, state = model_of(robot, data), fit.state
     scene = scene_of(robot, data, model, state)
-    return Study(robot, data, model, fit, scene, linearised(model, state, scene.slope))
+    return Study(robot, data, model, fit, scene, linearised(model, state, scene.jacobian))
 
 
 def diagnose(
@@ -97,7 +97,7 @@ def diagnose(
     seed: int = 0,
     holdout: float = 0.2,
     exclude: Sequence[str] = (),
-    report: Report = silent,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
@@ -113,7 +113,7 @@ def diagnose(
     checks.check_joints(robot, given)
     checks.check_spread(given)
     with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
-        return examined(robot, given, seed, holdout, exclude, report, began)
+        return examined(robot, given, seed, holdout, exclude, progress, began)
 
 
 def examined(
@@ -122,31 +122,31 @@ def examined(
     seed: int,
     holdout: float,
     exclude: Sequence[str],
-    report: Report,
+    progress: Progress,
     began: float,
 ) -> Diagnosis:
     """The diagnosis of checked measurements.  began: when the work did [s]."""
-    report("data faults")
+    progress("data faults")
     raw = with_history(given)
-    sound, faults, remarks, fits = cleaned(robot, raw, seed, holdout, report)
+    sound, faults, remarks, fits = cleaned(robot, raw, seed, holdout, progress)
     train, held, notices = split(sound, holdout, seed)
     if not held.poses:
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
-    study = studied(robot, train, fits or fit_cell(robot, train, SUM, report))
-    report("effects")
+    study = studied(robot, train, fits or fit_cell(robot, train, SUM, progress))
+    progress("effects")
     library, choice = chosen(study, exclude)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         library, choice = chosen(study, (*exclude, "backlash"))
-    report("what remains")
+    progress("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     order = by_weight(study, choice)
     effects = merged([finding(study, choice, i) for i in order])
-    report("gap ladder")
+    progress("gap ladder")
     wrong = [*faults, *read_back]
     steps, cells, raw_error = ladder(robot, raw, study, held, wrong, effects, seed, holdout)
     floor, source = noise_floor(study.rows, choice.noise, sound, cells[-1], steps[-1].train)
@@ -195,7 +195,7 @@ def located(study: Study) -> Where:
     return where(
         study.data,
         study.model.error(state),
-        study.scene.slope,
+        study.scene.jacobian,
         base,
         float("nan"),
         fitted=study.model.jacobian(state)[..., study.fit.identification.active],
@@ -207,7 +207,7 @@ def located(study: Study) -> Where:
 
 
 def cleaned(
-    robot: Robot, data: Measurements, seed: int, holdout: float, report: Report
+    robot: Robot, data: Measurements, seed: int, holdout: float, progress: Progress
 ) -> tuple[Measurements, list[Fault], tuple[str, ...], Fit | None]:
     """The data with rows and points put right or left out, the faults, and remarks.
 
@@ -227,9 +227,9 @@ def cleaned(
     data = mended(data, found)
     check_sense(robot, data)
     train, _, _ = split(data, holdout, seed)
-    report("geometry")
-    fit = fit_cell(robot, train, SUM, report)
-    error = Cell.of(robot, fit.state, data.targets).error(data)
+    progress("geometry")
+    fit = fit_cell(robot, train, SUM, progress)
+    error = Cell.of(robot, fit.state, data.target_names).error(data)
     more = tuple(fault for fault in find_faults(data, error) if fault.effect == "outliers")
     faults += in_lines(data, more, "outliers")
     data = mended(data, more)
@@ -261,7 +261,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
     error = np.where(study.model.seen[..., None], error, np.nan)
     error = error @ study.fit.state.rotation.T
-    push = np.einsum("ab,nkbm->kman", study.fit.state.rotation, study.scene.slope)
+    push = np.einsum("ab,nkbm->kman", study.fit.state.rotation, study.scene.jacobian)
     found = looks_read_back(study.data, error, push * study.robot.sign)
     return in_lines(study.data, found, "readback")
 
@@ -281,7 +281,7 @@ def fault_findings(faults: Sequence[Fault]) -> list[Finding]:
                 values=tuple(a.value for a in amounts),
                 sigmas=tuple(a.sigma for a in amounts),
                 size=float("nan"),
-                chance=float("nan"),
+                p_value=float("nan"),
                 rows=tuple(sorted({int(row) for fault in same for row in fault.rows})),
             )
         )
@@ -313,7 +313,7 @@ def by_weight(study: Study, choice: Choice) -> list[int]:
 def finding(study: Study, choice: Choice, number: int) -> Finding:
     """An effect with its rivals, and what would tell the nearest of them apart."""
     one, table = choice.fits[number], choice.benches[number]
-    found = rivals(table, one)
+    found = alternatives(table, one)
     advice = [""] * len(found)
     unclear = [i for i, (_, _, power) in enumerate(found) if power < ENOUGH][:ADVISED]
     if unclear:
@@ -331,7 +331,7 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
         values=tuple(float(v) for v in one.value),
         sigmas=tuple(float(v) for v in one.sigma),
         size=size,
-        chance=table.chance(one),
+        p_value=table.p_value(one),
         alternatives=tuple(
             Alternative(
                 other.candidate.term.effect,
@@ -369,7 +369,7 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
             values=(*first.values, *found.values),
             sigmas=(*first.sigmas, *found.sigmas),
             size=first.size + found.size,
-            chance=max(first.chance, found.chance),
+            p_value=max(first.p_value, found.p_value),
             alternatives=tuple(others.values()),
             fixed={**first.fixed, **found.fixed},
         )
@@ -447,8 +447,8 @@ def ladder(
     if real:
         first, rest, _ = split(raw, holdout, seed)
         fit = fit_cell(robot, first, SUM, silent)
-        wrong = Cell.of(robot, fit.state, raw.targets)
-        start = Cell.of(robot, fit.nominal, raw.targets)
+        wrong = Cell.of(robot, fit.state, raw.target_names)
+        start = Cell.of(robot, fit.nominal, raw.target_names)
         steps.append(Step("nominal", accuracy(start.error(first)), accuracy(start.error(rest))))
         steps.append(Step("geometric", accuracy(wrong.error(first)), accuracy(wrong.error(rest))))
         error = wrong.error(rest)
@@ -499,21 +499,21 @@ def noise_floor(
     enough; from the noise of the final fit where that is less, because nobody repeats better.
     Where the fit still has structure it is an upper bound.  fitted: of the final fit.
     """
-    spread = noise.variance * (1.0 + noise.ratio * rows.stretch).sum() / max(rows.count, 1)
+    spread = noise.variance * (1.0 + noise.ratio * rows.variance_ratio).sum() / max(rows.count, 1)
     model = min(1e3 * float(np.sqrt(3.0 * spread)), fitted.rms_mm)
     group = groups(data)
     error = np.moveaxis(cell.error(data), 1, 0).reshape(data.poses, -1)
-    total, freedom, again = 0.0, 0, 0
+    total, dof, again = 0.0, 0, 0
     names, counts = np.unique(group, return_counts=True)
     for name in names[counts > 1]:
         mine = error[group == name]
         whole = np.isfinite(mine).all(axis=0)
         off = mine[:, whole] - mine[:, whole].mean(axis=0)
         total += float((off**2).sum())
-        freedom += (len(mine) - 1) * int(whole.sum())
+        dof += (len(mine) - 1) * int(whole.sum())
         again += len(mine) - 1
-    if again >= REVISITS and freedom:
-        revisits = 1e3 * float(np.sqrt(3.0 * total / freedom))
+    if again >= REVISITS and dof:
+        revisits = 1e3 * float(np.sqrt(3.0 * total / dof))
         if revisits < model:
             return revisits, REPEATS
     return model, "noise of the fit"

@@ -44,7 +44,7 @@ def probes(scene: Scene) -> Iterator[Probe]:
     powers = [*bare, *(u * u for u in bare), *(u * v for u, v in combinations(bare, 2))]
     load, move, side = scene.gravity, scene.each("move"), scene.each("approach")
     for j in range(scene.joints):
-        motion, name = scene.slope[j : j + 1], f"J{j + 1}"
+        motion, name = scene.jacobian[j : j + 1], f"J{j + 1}"
         yield Probe(f"{name} with its own angle", motion, by_itself(scene.q[j]))
         others = [row for i, rows in circle.items() if i != j for row in rows]
         if others:
@@ -73,7 +73,7 @@ def probes(scene: Scene) -> Iterator[Probe]:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
         twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
-        yield Probe("the joints with time", scene.slope, np.array(course))
+        yield Probe("the joints with time", scene.jacobian, np.array(course))
     yield from at_targets(scene, np.array(course))
 
 
@@ -85,7 +85,7 @@ def at_targets(scene: Scene, course: Array) -> Iterator[Probe]:
     seen = scene.points - scene.instrument[:, None]
     away = np.linalg.norm(seen, axis=1, keepdims=True)
     ray = seen / away
-    for i, name in enumerate(scene.data.targets):
+    for i, name in enumerate(scene.data.target_names):
         alone = np.zeros((3, *scene.points.shape))
         alone[:, i] = axes
         yield Probe(f"{name} with the tool's attitude", alone, np.array([*attitude, *course]))
@@ -143,13 +143,13 @@ class Rest:
     """What is left, white under the null hypothesis.
 
     rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
-    the weights.  spare: degrees of freedom.
+    the weights.  dof: degrees of freedom.
     """
 
     rows: Array
     basis: Array
     root: Array
-    spare: int
+    dof: int
 
     @property
     def total(self) -> float:
@@ -194,14 +194,14 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     if not features.shape[1]:
         return 1.0, 0.0
     values, vectors = np.linalg.eigh(features.T @ features)
-    most = max(int(SHARE * rest.spare), 1)
+    most = max(int(SHARE * rest.dof), 1)
     kept = np.flatnonzero(values > 1e-6 * max(float(values[-1]), 1e-4))[::-1][:most]
     pull = (vectors[:, kept].T @ (features.T @ rest.rows)) / np.sqrt(values[kept])
     inside, d = float(pull @ pull), len(kept)
     outside = max(rest.total - inside, 1e-300)
-    if d == 0 or rest.spare - d < 5:
+    if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0
-    p = stats.f.sf((inside / d) / (outside / (rest.spare - d)), d, rest.spare - d)
+    p = stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d)
     return float(p), inside - d
 
 
@@ -209,7 +209,7 @@ def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
     """The strongest wave cos(a q_i + b q_j) of any joint, all waves tried."""
     angles = turning(scene)
     r = rows.weight.shape[1]
-    arms = rows.of(scene.slope) * rest.root[:, None]
+    arms = rows.of(scene.jacobian) * rest.root[:, None]
     score = (arms * rest.rows[:, None]).reshape(-1, r, scene.joints).sum(axis=1)
     size = (arms**2).reshape(-1, r, scene.joints).sum(axis=1)
     harmonic = np.exp(1j * np.arange(FASTEST + 1)[:, None, None] * scene.q[angles])  # (f, a, m)
@@ -239,7 +239,7 @@ def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
         found += [(float(each.max()), 2, each.size), (float(both.max()), 4, both.size)]
     best = (1.0, 0.0)
     for most, d, tries in found:
-        free = max(rest.spare - d, 1)
+        free = max(rest.dof - d, 1)
         ratio = (most / d) / (max(rest.total - most, 1e-300) / free)
         p = float(min(1.0, stats.f.sf(ratio, d, free) * tries * len(found)))
         best = min(best, (p, most - d))
@@ -251,13 +251,13 @@ def repeats(scene: Scene, rest: Rest) -> tuple[float, float]:
     group = groups(scene.data)
     names, count = np.unique(group, return_counts=True)
     block = rest.rows.reshape(scene.poses, -1)
-    pure, freedom = 0.0, 0
+    pure, pure_dof = 0.0, 0
     for name in names[count > 1]:
         mine = block[group == name]
         pure += float(((mine - mine.mean(axis=0)) ** 2).sum())
-        freedom += (len(mine) - 1) * int(np.count_nonzero(np.ptp(mine, axis=0) > 0.0))
-    spare = rest.spare - freedom
-    if freedom < 20 or spare < 20:
+        pure_dof += (len(mine) - 1) * int(np.count_nonzero(np.ptp(mine, axis=0) > 0.0))
+    dof = rest.dof - pure_dof
+    if pure_dof < 20 or dof < 20:
         return 1.0, 0.0
-    ratio = ((rest.total - pure) / spare) / (pure / freedom)
-    return float(stats.f.sf(ratio, spare, freedom)), (rest.total - pure) * (1.0 - 1.0 / ratio)
+    ratio = ((rest.total - pure) / dof) / (pure / pure_dof)
+    return float(stats.f.sf(ratio, dof, pure_dof)), (rest.total - pure) * (1.0 - 1.0 / ratio)

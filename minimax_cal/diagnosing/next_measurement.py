@@ -90,19 +90,19 @@ class Site:
         """The scene of all rows of the plan."""
         robot, base = self.scene.robot, (self.scene.rotation, self.scene.origin)
         data = self.plan.data
-        return Scene.of(robot, data, base, self.scene.spots, data.q * robot.sign)
+        return Scene.of(robot, data, base, self.scene.target_positions, data.q * robot.sign)
 
     @cached_property
     def turned(self) -> Rows:
         """Rotations of the rows that make both noises diagonal."""
         k, _, m = self.whole.points.shape
         nothing = np.zeros((k, 0, 3, m))
-        return rows_of(np.zeros((k, 3, m)), nothing, self.whole.slope, self.plan.weight)
+        return rows_of(np.zeros((k, 3, m)), nothing, self.whole.jacobian, self.plan.weight)
 
     @cached_property
     def root(self) -> Array:
         """(N,) square roots of the weights of rows [1/m]."""
-        joints = self.noise.jitter**2 * self.turned.stretch * self.turned.size
+        joints = self.noise.jitter**2 * self.turned.variance_ratio * self.turned.size
         return np.asarray(1.0 / np.sqrt(self.noise.variance + joints))
 
     @cached_property
@@ -283,7 +283,7 @@ def predicted(scene: Scene, data: Measurements) -> dict[str, Array]:
     if not scene.measured_torques:
         return {}
     robot, base = scene.robot, (scene.rotation, scene.origin)
-    there = Scene.of(robot, data, base, scene.spots, data.q * robot.sign)
+    there = Scene.of(robot, data, base, scene.target_positions, data.q * robot.sign)
     mass, com = scene.masses
     links = np.diag(mass)
     known, new = ([s.torque(one, com) for one in links] for s in (scene, there))
@@ -343,9 +343,9 @@ def at_foot(site: Site, probes: Array, centre: Array) -> Array:
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     feet = FOOT * site.scene.robot.reach() * np.stack([np.cos(angle), np.sin(angle)], 1) @ across
     mean = probes[..., rows].mean(axis=1)
-    slope = 0.5 * (probes[:, :3, :, rows] - probes[:, 3:, :, rows])
+    jacobian = 0.5 * (probes[:, :3, :, rows] - probes[:, 3:, :, rows])
     arm = feet[:, :, None] - centre[None, :, rows]
-    return np.asarray(mean[:, None] + np.einsum("fam,dacm->dfcm", arm, slope))
+    return np.asarray(mean[:, None] + np.einsum("fam,dacm->dfcm", arm, jacobian))
 
 
 def beside(site: Site, known: Sequence[tuple[Term, Array]]) -> list[Fields]:

@@ -52,7 +52,7 @@ class Finding:
     """One effect found, or a fault of the data.
 
     terms: what is fitted; several lines of one gear are one effect.  values, sigmas, names, units:
-    of its parameters, SI.  size: lambda, the weighed square of its projected motion.  chance:
+    of its parameters, SI.  size: lambda, the weighed square of its projected motion.  p_value:
     probability of so much by accident, the whole library tried.  share: of the gap that it closes
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
     known [mm].  rows: of a data fault.
@@ -64,7 +64,7 @@ class Finding:
     values: tuple[float, ...]
     sigmas: tuple[float, ...]
     size: float
-    chance: float
+    p_value: float
     alternatives: tuple[Alternative, ...] = ()
     share: float = float("nan")
     before: float = float("nan")
@@ -85,7 +85,7 @@ class Finding:
             "place": self.term.place,
             "share": finite(self.share),
             "lambda": finite(self.size),
-            "chance": finite(self.chance),
+            "chance": finite(self.p_value),
             "parameters": [
                 {
                     "name": name,

@@ -13,7 +13,7 @@ ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidenc
 BAND = 12.0  # of evidence: what fits worse by less may be the truth
 
 
-def rivals(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
+def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
     """Other effects or places that may be the truth, with rho^2 and the power to tell them apart.
 
     Those that do nearly as well; and those that do worse by some luck, the data having too little
@@ -21,7 +21,7 @@ def rivals(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
     """
     out, seen = [], {one.candidate.key, *(c.key for c in table.chosen)}
     for other in table.everyone:
-        if other.candidate.key in seen or other.evidence <= 0.0 or table.chance(other) > LEVEL:
+        if other.candidate.key in seen or other.evidence <= 0.0 or table.p_value(other) > LEVEL:
             continue
         close = near(one, other)
         alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one

@@ -27,14 +27,14 @@ class Rows:
     """Rows of a linear fit, poses rotated so that both noises are diagonal.
 
     error: (N,) what the geometry leaves [m].  basis: (N, p) orthonormal span of the geometry.
-    stretch: (N,) variance of a row per variance of the joints, relative to its mean.
+    variance_ratio: (N,) variance of a row per variance of the joints, relative to its mean.
     size: the mean [m^2/rad^2].  count: rows that were measured.
     turn: (m, r, r) the rotations, r = 3k.  weight: (m, r) square roots of the points' weights.
     """
 
     error: Array
     basis: Array
-    stretch: Array
+    variance_ratio: Array
     size: float
     count: int
     turn: Array
@@ -54,14 +54,16 @@ class Rows:
         return np.asarray(plain.T.reshape(r // 3, 3, m))
 
 
-def rows_of(error: Array, jacobian: Array, slope: Array, weight: Array) -> Rows:
+def rows_of(error: Array, jacobian: Array, joint_jacobian: Array, weight: Array) -> Rows:
     """Rows from an error (k, 3, m), geometry's Jacobian (k, p, 3, m), slope (n, k, 3, m).
 
     weight: (k, m) of each point, 0 where not measured.
     """
     k, _, m = error.shape
     root = np.repeat(np.sqrt(weight)[:, None], 3, axis=1).reshape(3 * k, m).T
-    arm = np.moveaxis(slope.reshape(len(slope), 3 * k, m), -1, 0) * root[:, None, :]
+    arm = (
+        np.moveaxis(joint_jacobian.reshape(len(joint_jacobian), 3 * k, m), -1, 0) * root[:, None, :]
+    )
     spread, turn = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)
     spread = np.maximum(spread, 0.0).reshape(-1)
     count = 3 * int(np.count_nonzero(weight))
@@ -72,11 +74,11 @@ def rows_of(error: Array, jacobian: Array, slope: Array, weight: Array) -> Rows:
     return Rows(rest, orthonormal(matrix), spread / size, size, count, turn, root)
 
 
-def linearised(model: Model, state: State, slope: Array) -> Rows:
-    """The rows of a model at a fitted state.  slope: (n, k, 3, m) as `effects.scene.Scene`."""
+def linearised(model: Model, state: State, joint_jacobian: Array) -> Rows:
+    """The rows of a model at a fitted state.  joint_jacobian: (n, k, 3, m) as `Scene.jacobian`."""
     error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
     jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
-    return rows_of(error, jacobian, slope, model.weight)
+    return rows_of(error, jacobian, joint_jacobian, model.weight)
 
 
 def orthonormal(matrix: Array, rank: float = RANK) -> Array:
@@ -102,26 +104,26 @@ class Noise:
 
     def weights(self, rows: Rows) -> Array:
         """(N,) inverse variances [1/m^2]."""
-        return np.asarray(1.0 / (self.variance * (1.0 + self.ratio * rows.stretch)))
+        return np.asarray(1.0 / (self.variance * (1.0 + self.ratio * rows.variance_ratio)))
 
 
 def restricted(rows: Rows, known: Array) -> Noise:
     """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
     p = columns.shape[1] - 1
-    spare = rows.count - p
-    if spare < 3:
+    dof = rows.count - p
+    if dof < 3:
         return Noise(0.0, float(rows.error @ rows.error) / max(rows.count, 1) + 1e-18, 0.0)
 
     def parts(ratio: float) -> tuple[float, float]:
-        spread = 1.0 + ratio * rows.stretch
+        spread = 1.0 + ratio * rows.variance_ratio
         gram = columns.T @ (columns / spread[:, None])
         gram[-1, -1] += 1e-300
         scale = np.sqrt(np.diag(gram))
         factor = np.linalg.cholesky(gram / np.outer(scale, scale) + 1e-13 * np.eye(p + 1))
         logs = np.log(np.diag(factor)) + np.log(scale)
         squares = float(np.exp(2.0 * logs[-1]))
-        cost = spare * np.log(squares) + np.log(spread).sum() + 2.0 * logs[:-1].sum()
+        cost = dof * np.log(squares) + np.log(spread).sum() + 2.0 * logs[:-1].sum()
         return float(cost), squares
 
     costs = [parts(ratio)[0] for ratio in RATIOS]
@@ -135,5 +137,5 @@ def restricted(rows: Rows, known: Array) -> Noise:
                 options={"xatol": 0.05},
             )  # fmt: skip
             ratio = float(np.exp(found.x))
-    variance = parts(ratio)[1] / spare
+    variance = parts(ratio)[1] / dof
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))

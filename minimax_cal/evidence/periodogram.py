@@ -34,7 +34,7 @@ def lines(
     """
     pull = leftover(rows, noise, known)
     weight = noise.weights(rows)
-    arms = rows.of(scene.slope)
+    arms = rows.of(scene.jacobian)
     poses = scene.poses
     found = []
     for j in sweeping(scene):

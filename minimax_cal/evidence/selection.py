@@ -205,7 +205,7 @@ class Setting:
         value = (inverse @ pull[..., None])[..., 0]
         return value, np.einsum("cdd->cd", inverse), (value * pull).sum(axis=1)
 
-    def added_all(self, same: Sequence[Candidate], spare: int) -> tuple[Array, Array, Array, Array]:
+    def added_all(self, same: Sequence[Candidate], dof: int) -> tuple[Array, Array, Array, Array]:
         """Decrease of the square by each candidate; values, their variances; Occam's factor.
 
         Doubts have the prior that the values found imply.  same: of equal numbers of columns.
@@ -215,7 +215,7 @@ class Setting:
         value, inverse, gain = self.solve(index, np.zeros(index.shape))
         if not len(same[0].doubt):
             return gain, value, inverse, np.zeros(len(same))
-        variance = np.maximum(self.total - gain, 1e-300)[:, None] / spare
+        variance = np.maximum(self.total - gain, 1e-300)[:, None] / dof
         doubt = np.array([c.doubt for c in same])
         owner = np.array([c.owner for c in same])
         size = np.maximum(np.abs(np.take_along_axis(value, owner, axis=1)), 1e-30)
@@ -225,8 +225,8 @@ class Setting:
         part = self.part[:, doubt.reshape(-1)].T.reshape(*doubt.shape, -1)
         loose = own @ np.swapaxes(own, 1, 2) - part @ np.swapaxes(part, 1, 2)
         loose = loose * size[:, :, None] * size[:, None, :] / variance[..., None]
-        occam = np.linalg.slogdet(np.eye(doubt.shape[1]) + loose)[1]
-        return gain, value[:, :d], inverse[:, :d], occam
+        volume = np.linalg.slogdet(np.eye(doubt.shape[1]) + loose)[1]
+        return gain, value[:, :d], inverse[:, :d], volume
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -245,20 +245,20 @@ class Setting:
 class Bench:
     """Where candidates are compared: beside what was chosen, over several ratios of the noises.
 
-    tries: candidates that are compared, for the chance of a false name.  spare: degrees of freedom.
+    tries: candidates that are compared, for the chance of a false name.  dof: degrees of freedom.
     """
 
     library: Library
     chosen: tuple[Candidate, ...]
     noise: Noise
     settings: tuple[Setting, ...]
-    spare: int
+    dof: int
     tries: float
 
     @cached_property
     def base(self) -> float:
         """-2 log restricted likelihood without a further effect."""
-        return float(min(self.spare * np.log(s.total) + s.logs for s in self.settings))
+        return float(min(self.dof * np.log(s.total) + s.logs for s in self.settings))
 
     @cached_property
     def everyone(self) -> list[Added]:
@@ -286,33 +286,34 @@ class Bench:
         best = np.full(len(same), np.inf)
         out: list[Added | None] = [None] * len(same)
         for s in self.settings:
-            gain, value, inverse, occam = s.added_all(same, self.spare)
+            gain, value, inverse, volume = s.added_all(same, self.dof)
             rest = np.maximum(s.total - gain, 1e-300)
-            cost = self.spare * np.log(rest) + s.logs
+            cost = self.dof * np.log(rest) + s.logs
             for i in np.flatnonzero(cost < best):
                 best[i] = cost[i]
-                c, variance = same[i], float(rest[i] / self.spare)
+                c, variance = same[i], float(rest[i] / self.dof)
                 up = max(self.base - float(cost[i]), 0.0)
                 sigma = np.sqrt(np.maximum(inverse[i] * variance, 0.0))
-                worth = up - float(occam[i]) - freedom(c, up) - strangeness(c, value[i], sigma)
+                penalty = occam(c, up) + prior_penalty(c, value[i], sigma)
+                worth = up - float(volume[i]) - penalty
                 out[i] = Added(c, up, worth, s.ratio, variance, value[i], sigma)
         return [one for one in out if one is not None]
 
-    def chance(self, one: Added) -> float:
+    def p_value(self, one: Added) -> float:
         """Probability that a candidate without effect gains so much, the best of all tries."""
         d = len(one.candidate.main)
-        free = max(self.spare - d, 1)
-        ratio = np.expm1(min(one.gain / self.spare, 50.0)) * free / d
+        free = max(self.dof - d, 1)
+        ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d
         return float(min(1.0, stats.f.sf(ratio, d, free) * self.tries * one.candidate.tries))
 
 
-def freedom(c: Candidate, gain: float) -> float:
+def occam(c: Candidate, gain: float) -> float:
     """What d free parameters must gain to be worth it: d (1 + log of the gain of each)."""
     d = len(c.main)
     return d * (1.0 + float(np.log(max(gain / d, 1.0)))) + 2.0 * float(np.log(c.tries))
 
 
-def strangeness(c: Candidate, value: Array, sigma: Array) -> float:
+def prior_penalty(c: Candidate, value: Array, sigma: Array) -> float:
     """What values far beyond the usual cost, and signs that no body has."""
     effect = EFFECTS[c.term.effect]
     cost = float(((value / effect.typical) ** 2).sum())
@@ -331,11 +332,11 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     noise = restricted(rows, lib.columns[:, main])
     fixed = np.concatenate([rows.basis, lib.columns[:, main]], axis=1)
     doubt = lib.columns[:, loose]
-    spare = rows.count - fixed.shape[1]
+    dof = rows.count - fixed.shape[1]
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     settings = []
     for ratio in ratios:
-        spread = 1.0 + ratio * rows.stretch
+        spread = 1.0 + ratio * rows.variance_ratio
         root = 1.0 / np.sqrt(spread)
         matrix = np.concatenate([fixed, doubt], axis=1) * root[:, None]
         error, columns = rows.error * root, lib.columns * root[:, None]
@@ -353,7 +354,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         settings.append(
             Setting(float(ratio), columns, basis.T @ columns, error, float(logs), whole)
         )
-    return Bench(lib, tuple(chosen), noise, tuple(settings), spare, float(len(lib.candidates)))
+    return Bench(lib, tuple(chosen), noise, tuple(settings), dof, float(len(lib.candidates)))
 
 
 def columns_of(chosen: Sequence[Candidate], fits: Sequence[Added]) -> tuple[Array, Array, Array]:
@@ -457,8 +458,8 @@ def addition(lib: Library, table: Bench, fits: Sequence[Added]) -> tuple[Library
     open_ones = [
         one for one in ranked
         if not repeated(one.candidate, table.chosen)
-        and table.chance(one) < LEVEL
-        and one.gain > SMALL * (table.spare - PLENTY)
+        and table.p_value(one) < LEVEL
+        and one.gain > SMALL * (table.dof - PLENTY)
     ]  # fmt: skip
     if not open_ones:
         return lib, []
@@ -529,7 +530,7 @@ def refined(lib: Library, fits: list[Added]) -> list[Added]:
             top = next(o for o in table.everyone if not repeated(o.candidate, chosen))
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 fits[number], changed = top, True
-            elif table.chance(own) > LEVEL:
+            elif table.p_value(own) > LEVEL:
                 fits = others
                 return refined(lib, fits)
             else:

@@ -22,11 +22,11 @@ from minimax_cal.fitting.minimax_problem import (
     DISTANCE_FORMS,
     Distances,
     measured_distances,
-    worst_of,
+    minimax_problem,
 )
 from minimax_cal.fitting.plausibility import POOR_FIT, check_sense
 from minimax_cal.fitting.robust import SQUARE, Robust, check_robust, flatness, robust_fit
-from minimax_cal.fitting.start import Frame
+from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -105,7 +105,7 @@ class Options:
     trim: float = 0.0
 
 
-Report = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 def silent(message: str) -> None:
@@ -117,14 +117,14 @@ def calibrate(
     data: Measurements | str | Path,
     objective: str = "minimax",
     qp: str = "daqp",
-    report: Report = silent,
+    progress: Progress = silent,
     **options: object,
 ) -> Calibration:
     """Calibrate a robot from measurements.
 
-    robot, data: loaded, or a name or path.  options: the fields of `Options`.  report: called with
-    a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended is in the
-    result's `status`.
+    robot, data: loaded, or a name or path.  options: the fields of `Options`.  progress: called
+    with a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended
+    is in the result's `status`.
     """
     for name in ("fix", "free", "effects"):
         if isinstance(options.get(name), str):
@@ -144,16 +144,16 @@ def calibrate(
     notices = (*data.notices, *checks.limit_notices(robot, data), *notices)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
-        names = ", ".join(np.array(data.targets)[few])
+        names = ", ".join(np.array(data.target_names)[few])
         notices += (f"left out: {names}, measured at fewer than {LEAST_POSES} training poses",)
         data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
         objective_of(chosen.objective, data)
     if len(np.unique(groups(train))) >= LEAST_POSES:
         check_sense(robot, data)
-    report("start")
-    fit = fit_cell(robot, train, chosen, report)
-    calibrated = Cell.of(robot, fit.state, data.targets, fit.effects)
-    nominal = Cell.of(robot, fit.nominal, data.targets)
+    progress("start")
+    fit = fit_cell(robot, train, chosen, progress)
+    calibrated = Cell.of(robot, fit.state, data.target_names, fit.effects)
+    nominal = Cell.of(robot, fit.nominal, data.target_names)
     errors = {
         "nominal": nominal.error(held),
         "train": calibrated.error(train),
@@ -205,7 +205,7 @@ def remarks(
     out = []
     if not held.poses:
         out.append("no pose is held out: nothing here says how the fit does on new poses")
-    if options.objective == "minimax" and len(data.targets) == 1:
+    if options.objective == "minimax" and len(data.target_names) == 1:
         out.append("there is one target: minimax and sum are the same")
     if checks.collinear(train):
         out.append(
@@ -224,12 +224,12 @@ def objective_of(objective: str, data: Measurements) -> int:
         raise OptionError(
             f"no objective {objective!r}; choose sum, minimax, point, pose or smr:K (K as in smr1)"
         )
-    if f"smr{which}" not in data.targets:
+    if f"smr{which}" not in data.target_names:
         raise OptionError(
             f"objective {objective}: {data.source} has no target smr{which}; "
-            f"it has {', '.join(data.targets)}"
+            f"it has {', '.join(data.target_names)}"
         )
-    return data.targets.index(f"smr{which}")
+    return data.target_names.index(f"smr{which}")
 
 
 def check_options(options: Options) -> None:
@@ -306,21 +306,21 @@ class Fit:
         return found.widened(flatness(self.robust, self.state))
 
 
-def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report) -> Fit:
+def fit_cell(robot: Robot, data: Measurements, options: Options, progress: Progress) -> Fit:
     """Fit the chosen objective to all poses of the data."""
     base = model_of(robot, data)
-    names, k = base.names, len(data.targets)
+    names, k = base.names, len(data.target_names)
     allowed, order, sigma = wishes(robot, base, options)
     reference = identify.plenty_of_poses(robot, base)
     unknowns = identify.generic_count(robot, reference, order, allowed)
     only = objective_of(options.objective, data)
     telling = data if only < 0 else data.only(only)
-    spare = 0 if only < 0 else 3 * (k - 1)  # coordinates of targets that follow
+    following = 0 if only < 0 else 3 * (k - 1)  # coordinates of targets that follow
     poses, known = len(np.unique(groups(telling))), int(np.isfinite(sigma[allowed]).sum())
-    checks.check_count(telling, poses, unknowns - spare, known)
-    frame = start.fit_frame(base, robot.mdh)
+    checks.check_count(telling, poses, unknowns - following, known)
+    frame = start.fit_base(base, robot.mdh)
 
-    report("identifiable parameters")
+    progress("identifiable parameters")
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
     weights = NO_MIX
     aside, model = share, base.emphasise(share)
@@ -336,7 +336,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
         known=np.isfinite(sigma),
         resolution=options.resolution,
     )
-    report("least squares")
+    progress("least squares")
     model, squares = least(model.only(found.active), frame, sigma, options)
 
     def resist(model: Model, found: LeastSquares[State], sigma: Array) -> Robust:
@@ -347,15 +347,15 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
 
     robust = resist(model, squares, sigma)
     # a few gross outliers are no reason to search: what counts is how the believed points are met
-    squares, notices = wider(robot, robust.model, robust.fit, report)
+    squares, notices = wider(robot, robust.model, robust.fit, progress)
     if squares is not robust.fit:
         robust = resist(robust.plain, squares, sigma)
     terms: tuple[Term, ...] = ()
     if options.effects:
-        report("effects")
+        progress("effects")
         here = robust.fit.x.take(np.array(0))
         scene = scene_of(robot, data, model, here)
-        rows = linearised(robust.model, here, scene.slope)
+        rows = linearised(robust.model, here, scene.jacobian)
         terms = terms_of(scene, options.effects, partial(best_variant, scene, rows))
         known_ones = np.isfinite(sigma)
         for _ in range(PASSES):
@@ -396,13 +396,13 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
     proofs: tuple[Certificate, ...] = ()
     per = {"minimax": "target", "point": "point"}.get(options.objective, "")
     if per == "point" or (per == "target" and k > 1):
-        report("minimax")
-        minimax_problem = worst_of(model, state, distances, options.distance, per)
+        progress("minimax")
+        worst_case = minimax_problem(model, state, distances, options.distance, per)
         name, said = usable(options.qp)
         qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
-        best = minimax.solve(minimax_problem, state, qp, Sqp(hessian=options.hessian))
+        best = minimax.solve(worst_case, state, qp, Sqp(hessian=options.hessian))
         if per == "point" and best.status is not Status.FAILED:
-            proofs = (certify(minimax_problem, best, data.line),)
+            proofs = (certify(worst_case, best, data.line),)
         state, status, worst = best.x, best.status, (best,)
         iterations += best.iterations
         if per == "target":
@@ -439,7 +439,7 @@ def fit_cell(robot: Robot, data: Measurements, options: Options, report: Report)
 
 def check_poses(data: Measurements) -> None:
     """Raise OptionError if the targets give no orientation."""
-    if len(data.targets) < 3 or checks.collinear(data):
+    if len(data.target_names) < 3 or checks.collinear(data):
         raise OptionError("objective pose needs three targets that are not on a line")
     whole = int(data.seen.all(axis=1).sum())
     if whole < LEAST_POSES:
@@ -470,7 +470,7 @@ def wishes(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
 
 
 def least(
-    model: Model, frame: Frame, sigma: Array, options: Options
+    model: Model, frame: BaseFit, sigma: Array, options: Options
 ) -> tuple[Model, LeastSquares[State]]:
     """Least squares from the nominal start; with priors, weighed against the noise that remains."""
     points = float(model.counts.sum())
@@ -486,15 +486,15 @@ def least(
         weight = np.diag(model.prior.weight[model.active])
         fitted = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
         previous = mean_square
-        spare = max(3.0 * points - fitted, 1.0)
-        mean_square = max(float(model.cost(state).sum()) / spare, LEAST_NOISE**2)
+        dof = max(3.0 * points - fitted, 1.0)
+        mean_square = max(float(model.cost(state).sum()) / dof, LEAST_NOISE**2)
         if abs(mean_square - previous) <= 0.01 * previous:
             break
     return model, found
 
 
 def wider(
-    robot: Robot, model: Model, found: LeastSquares[State], report: Report
+    robot: Robot, model: Model, found: LeastSquares[State], progress: Progress
 ) -> tuple[LeastSquares[State], tuple[str, ...]]:
     """The fit, or a better one from a search over base rotations where it misses grossly."""
     points = float(model.counts.sum())
@@ -505,7 +505,7 @@ def wider(
 
     if miss(found) <= limit:
         return found, ()
-    report("search over base rotations")
+    progress("search over base rotations")
     wide = start.search(model, robot.mdh, points, limit)
     notices: tuple[str, ...] = ()
     if wide.cost[0] < 0.99 * found.cost[0]:
@@ -553,7 +553,7 @@ def parameter_table(robot: Robot, fit: Fit) -> tuple[Parameter, ...]:
 
     def values(x: State) -> Array:
         turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
-        parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.targets.reshape(-1))
+        parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
         return np.concatenate([*parts, x.effects if len(x.effects) else np.zeros(len(fit.units))])
 
     before, linear = values(fit.nominal), names.linear

@@ -163,7 +163,7 @@ class Calibration:
                 for f, m in zip(a.sse_mm2, a.counts, strict=True)
             ]
             rows.append((title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *each))
-        targets = tuple(f"{name} RMS mm" for name in self.cell.targets)
+        targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(
             f"{self.robot.name}: position accuracy, objective {self.objective}",
             ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
@@ -248,9 +248,9 @@ class Calibration:
     def labels(self) -> tuple[str, ...]:
         """Names of the functions of the minimax: targets, or points by line of the file."""
         if self.objective != "point":
-            return self.cell.targets
+            return self.cell.target_names
         return tuple(
-            f"{self.cell.targets[target]} line {self.data.line[~self.held][pose]}"
+            f"{self.cell.target_names[target]} line {self.data.line[~self.held][pose]}"
             for target, pose in np.argwhere(self.weights > 0.0)
         )
 
@@ -336,7 +336,7 @@ class Calibration:
                 "active": [self.labels[i] for i in np.flatnonzero(active)],
                 "distances": [
                     {
-                        "pair": [self.cell.targets[a], self.cell.targets[b]],
+                        "pair": [self.cell.target_names[a], self.cell.target_names[b]],
                         "measured_mm": float(mean) * 1e3,
                         "tolerance_mm": float(tolerance) * 1e3,
                         "multiplier": float(lam),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.minimax_problem import Worst
+from minimax_cal.fitting.minimax_problem import MinimaxProblem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.parameters import State
@@ -32,11 +32,11 @@ class PointCones:
     white: (free, free) from a whitened step to one scaled as in `worst`.
     """
 
-    worst: Worst
+    worst: MinimaxProblem
     white: Array
 
     @staticmethod
-    def of(worst: Worst) -> PointCones:
+    def of(worst: MinimaxProblem) -> PointCones:
         """Whitened where the problem was scaled."""
         count = len(worst.first.f)
         mean = 0.5 * worst.linearise(worst.start).curvature(np.full(count, 1.0 / count))
@@ -61,9 +61,9 @@ class PointCones:
         turned = np.concatenate([part for _, part in rows], axis=-1)
         r = np.moveaxis(error, 1, 2)[model.seen]
         J = -np.moveaxis(turned, (1, 2), (3, 2))[model.seen]
-        known, slope = self.prior(x)
+        known, jacobian = self.prior(x)
         r = np.concatenate([r, np.broadcast_to(known, (len(r), len(known)))], axis=1)
-        J = np.concatenate([J, np.broadcast_to(slope, (len(J), *slope.shape))], axis=1)
+        J = np.concatenate([J, np.broadcast_to(jacobian, (len(J), *jacobian.shape))], axis=1)
         c, normal = self.worst.deviation(x)
         J = J @ (self.white / self.worst.scale[:, None])
         return Rows(r / size, J / size, c, normal @ self.white)
@@ -73,8 +73,8 @@ class PointCones:
         model = self.worst.model
         chosen = model.prior.weight > 0.0
         root = np.sqrt(model.prior.weight[chosen] / model.counts.sum())
-        slope = -root[:, None] * np.eye(model.names.count)[np.ix_(chosen, model.active)]
-        return root * (model.prior.mean - model.values(x))[chosen], slope
+        jacobian = -root[:, None] * np.eye(model.names.count)[np.ix_(chosen, model.active)]
+        return root * (model.prior.mean - model.values(x))[chosen], jacobian
 
     def step(self, x: State, d: Array) -> State:
         """The state moved by a whitened step."""
@@ -137,7 +137,7 @@ class Certificate:
         }
 
 
-def certify(problem: Worst, best: Optimum[State], line: Array) -> Certificate:
+def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certificate:
     """The certificate of an answer of the SQP.
 
     problem: of points, scaled at any state of the same model.  line: (m,) of the file, pose by
@@ -153,7 +153,7 @@ def certify(problem: Worst, best: Optimum[State], line: Array) -> Certificate:
     target, pose = np.argwhere(model.seen)[chosen].T
     distance = np.linalg.norm(model.error(best.x), axis=-1)
     return Certificate(
-        target=tuple(model.names.targets[i] for i in target),
+        target=tuple(model.names.target_names[i] for i in target),
         line=line[pose],
         multiplier=mu[chosen],
         distance=distance[target, pose],
@@ -167,6 +167,6 @@ def gradients(rows: Rows) -> Linear:
     """The norms as plain functions; a norm of zero has no gradient."""
     norms = rows.norms
     unit = rows.r / np.where(norms > 0.0, norms, 1.0)[:, None]
-    slope = np.einsum("nw,nwp->np", unit, rows.J)
+    jacobian = np.einsum("nw,nwp->np", unit, rows.J)
     unknown: Callable[[Array], Array] = lambda weights: np.zeros((0, 0))  # noqa: E731
-    return Linear(norms, slope, rows.c, rows.C, unknown)
+    return Linear(norms, jacobian, rows.c, rows.C, unknown)

@@ -29,9 +29,9 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     predicted = np.zeros(0)
     model = model_of(robot, data)
     for _ in range(ROUNDS):
-        frame = start.fit_frame(model_of(robot, data.take(good)), robot.mdh)
+        frame = start.fit_base(model_of(robot, data.take(good)), robot.mdh)
         links = kinematics.chain(frame.state.mdh, model.q, model.prismatic)
-        predicted = kinematics.points(links, frame.state.targets)
+        predicted = kinematics.points(links, frame.state.target_positions)
         measured = in_base(frame.state, model.y)
         squares = (np.where(model.seen[:, None], measured - predicted, 0.0) ** 2).sum(axis=(0, 1))
         miss = np.sqrt(squares / np.maximum(model.seen.sum(axis=0), 1))

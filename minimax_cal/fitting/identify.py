@@ -157,7 +157,7 @@ def partners(gram: Array, scale: Array, active: Array, i: int, names: Names) -> 
     mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
     share = np.abs(mix) * scale[chosen] / scale[i]
     shown = [names.all[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
-    spots = [name for name in shown if name.rsplit("_", 1)[0] in names.targets]
+    spots = [name for name in shown if name.rsplit("_", 1)[0] in names.target_names]
     if len({name.rsplit("_", 1)[0] for name in spots}) > 1:  # one thing to the reader
         shown = [name for name in shown if name not in spots] + ["all targets moved together"]
     more = len(shown) - 4

@@ -43,8 +43,8 @@ def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distanc
     typical `u95` where there is such a column, else the scatter of each measured distance.
     """
     pairs, mean, spread = [], [], []
-    for a in range(len(data.targets)):
-        for b in range(a + 1, len(data.targets)):
+    for a in range(len(data.target_names)):
+        for b in range(a + 1, len(data.target_names)):
             distance = np.linalg.norm(data.y[:, a] - data.y[:, b], axis=-1)
             distance = distance[np.isfinite(distance)]
             if len(distance) > 2:
@@ -64,7 +64,7 @@ def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distanc
 
 
 @dataclass(frozen=True, eq=False)
-class Worst:
+class MinimaxProblem:
     """min over x of the largest f_i, as `solvers.minimax` wants it.
 
     per: "target" for f_i = F_i / m_i, "point" for the squared distance of every measured point.
@@ -97,18 +97,18 @@ class Worst:
     def deviation(self, x: State) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
         pairs, names = self.distances.pairs, self.model.names
-        between = x.targets[pairs[:, 0]] - x.targets[pairs[:, 1]]
+        between = x.target_positions[pairs[:, 0]] - x.target_positions[pairs[:, 1]]
         length = np.maximum(np.linalg.norm(between, axis=-1), 1e-12)
         c = (length - self.distances.mean) / self.distances.tolerance
-        slope = np.zeros((len(pairs), names.count))
+        jacobian = np.zeros((len(pairs), names.count))
         unit = between / length[:, None] / self.distances.tolerance[:, None]
         first = 5 * names.joints + 6
         for row, (a, b) in enumerate(pairs):
-            slope[row, first + 3 * a : first + 3 * a + 3] = unit[row]
-            slope[row, first + 3 * b : first + 3 * b + 3] = -unit[row]
+            jacobian[row, first + 3 * a : first + 3 * a + 3] = unit[row]
+            jacobian[row, first + 3 * b : first + 3 * b + 3] = -unit[row]
         if self.form == "squared":
-            slope, c = 2.0 * c[:, None] * slope, c**2
-        return c, slope[:, self.model.active] / self.scale
+            jacobian, c = 2.0 * c[:, None] * jacobian, c**2
+        return c, jacobian[:, self.model.active] / self.scale
 
     def evaluate(self, x: State) -> tuple[Array, Array]:
         """f and c."""
@@ -130,7 +130,7 @@ class Worst:
 
         return Linear(
             f=(at.f + prior_of(model, x)) / self.size,
-            slope=(at.slope - 2.0 * weight * off / total) / self.size / self.scale,
+            jacobian=(at.jacobian - 2.0 * weight * off / total) / self.size / self.scale,
             c=c,
             normal=normal,
             curvature=curvature,
@@ -148,7 +148,7 @@ class Sensitivity:
     """f (n,) [m^2], its derivative (n, free), and the weighted sum of its curvatures."""
 
     f: Array
-    slope: Array
+    jacobian: Array
     curvature: Callable[[Array], Array]
 
 
@@ -171,7 +171,7 @@ def target_sensitivity(model: Model, x: State) -> Sensitivity:
     counts = model.counts
     return Sensitivity(
         normal.cost / counts,
-        -2.0 * normal.slope / counts[:, None],
+        -2.0 * normal.gradient / counts[:, None],
         lambda weights: 2.0 * np.einsum("k,kij->ij", weights / counts, normal.gram),
     )
 
@@ -187,20 +187,20 @@ def point_sensitivity(model: Model, x: State) -> Sensitivity:
     blocks = model.blocks(x)
     rows = [model.weighted_rows(x, block, model.active) for block in blocks]
     f = np.concatenate([(error**2).sum(axis=-2) for error, _ in rows], axis=-1)
-    slopes = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
-    slope = np.concatenate(slopes, axis=1)
+    jacobians = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
+    jacobian = np.concatenate(jacobians, axis=1)
 
     def curvature(weights: Array) -> Array:
         spread = np.zeros(model.seen.shape)
         spread[model.seen] = np.sqrt(weights)
-        total = np.zeros((slope.shape[-1],) * 2)
+        total = np.zeros((jacobian.shape[-1],) * 2)
         for block, (_, turned) in zip(blocks, rows, strict=True):
             part = turned * spread[:, None, None, block.rows]
             flat = np.moveaxis(part, 1, 0).reshape(len(total), -1)
             total += flat @ flat.T
         return 2.0 * total
 
-    return Sensitivity(f[model.seen], slope[model.seen], curvature)
+    return Sensitivity(f[model.seen], jacobian[model.seen], curvature)
 
 
 PER = {
@@ -209,7 +209,9 @@ PER = {
 }
 
 
-def worst_of(model: Model, start: State, distances: Distances, form: str, per: str) -> Worst:
+def minimax_problem(
+    model: Model, start: State, distances: Distances, form: str, per: str
+) -> MinimaxProblem:
     """The minimax problem scaled at a start.  Raises OptionError for an unknown form."""
     if form not in DISTANCE_FORMS:
         raise OptionError(f"distance form {form!r}; choose {', '.join(DISTANCE_FORMS)}")
@@ -222,4 +224,4 @@ def worst_of(model: Model, start: State, distances: Distances, form: str, per: s
     mean = 0.5 * np.diag(first.curvature(np.full(len(first.f), 1.0 / len(first.f))))
     mean = mean + model.prior.weight[model.active] / model.counts.sum()
     scale = np.sqrt(np.maximum(2.0 * mean / size, 1e-30))
-    return Worst(per, model, distances, start, first, scale, size, form)
+    return MinimaxProblem(per, model, distances, start, first, scale, size, form)

@@ -33,13 +33,13 @@ ALL: Array = np.ones(0, dtype=bool)
 class Loss:
     """rho(z) of a point's distance in robust standard deviations, by the weight rho'(z) / z.
 
-    weight, slope: of u = z / tuning, (n,): the weight, and the derivative of u weight(u).
+    weight, derivative: of u = z / tuning, (n,): the weight, and the derivative of u weight(u).
     tuning: what makes the fit 95 % as efficient as least squares where all errors are Gaussian, in
     three dimensions.
     """
 
     weight: Callable[[Array], Array]
-    slope: Callable[[Array], Array]
+    derivative: Callable[[Array], Array]
     tuning: float
 
 
@@ -232,8 +232,8 @@ def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array,
     own = LOSSES[loss]
     u = size / (scale * own.tuning)
     weight = own.weight(u)
-    slope = np.where(model.seen, (own.slope(u) + 2.0 * weight) / 3.0, 0.0)
-    return slope.sum(axis=1) / counts, ((weight * size) ** 2).sum(axis=1) / (3.0 * counts)
+    derivative = np.where(model.seen, (own.derivative(u) + 2.0 * weight) / 3.0, 0.0)
+    return derivative.sum(axis=1) / counts, ((weight * size) ** 2).sum(axis=1) / (3.0 * counts)
 
 
 def flatness(robust: Robust, state: State) -> float:
@@ -241,8 +241,8 @@ def flatness(robust: Robust, state: State) -> float:
 
     The sandwich of a weighted fit takes the weights for given; the true slope of psi is less.
     """
-    slope, _ = moments(robust.kept, state, robust.loss, robust.loss_scale)
+    derivative, _ = moments(robust.kept, state, robust.loss, robust.loss_scale)
     counts = robust.kept.counts
     if robust.loss == SQUARE or not np.isfinite(robust.loss_scale):
         return 1.0
-    return float(robust.weights[robust.kept.seen].sum() / (slope * counts).sum())
+    return float(robust.weights[robust.kept.seen].sum() / (derivative * counts).sum())

@@ -24,7 +24,7 @@ OCTAHEDRAL = Rotation.create_group("O").as_matrix()  # the 24 turns of a cube
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class BaseFit:
     """Base and targets that fit a fixed geometry best.
 
     state: the geometry with its base and targets.  mean_square: of the point errors [m^2].
@@ -36,7 +36,7 @@ class Frame:
     mirrored: float
 
 
-def fit_frame(model: Model, mdh: Array) -> Frame:
+def fit_base(model: Model, mdh: Array) -> BaseFit:
     """The global best base and targets for a given geometry.
 
     With S = R_b' the residual S y - c - R_n t - o_n is linear in (S, c, t).  Eliminating c and t
@@ -81,7 +81,7 @@ def fit_frame(model: Model, mdh: Array) -> Frame:
     )
     shift, targets = lengths[0][:3], lengths[0][3:].reshape(k, 3)
     state = State(mdh, turn.T, centre + turn.T @ shift, targets)
-    return Frame(state, mean_square, mirrored)
+    return BaseFit(state, mean_square, mirrored)
 
 
 def project(matrix: Array) -> Array:
@@ -104,10 +104,12 @@ def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
     error = residual(turn)
     cost = (error**2).sum(-1)
     for _ in range(100):
-        slopes = (turn[:, None] @ axes).reshape(-1, 3, 9) @ matrix.T  # S exp(hat(w)), (B, 3, rows)
-        gram = slopes @ np.swapaxes(slopes, -1, -2)
+        jacobians = (turn[:, None] @ axes).reshape(
+            -1, 3, 9
+        ) @ matrix.T  # S exp(hat(w)), (B, 3, rows)
+        gram = jacobians @ np.swapaxes(jacobians, -1, -2)
         scale = np.trace(gram, axis1=-2, axis2=-1)[:, None, None] + 1e-300
-        pull = -(slopes @ error[..., None])
+        pull = -(jacobians @ error[..., None])
         step = np.linalg.solve(gram + damping[:, None, None] * scale * np.eye(3), pull)[..., 0]
         trial = turn @ kinematics.rotation(step)
         after_error = residual(trial)

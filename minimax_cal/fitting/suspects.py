@@ -40,12 +40,12 @@ EXPLANATION = (
 class Scores:
     """How far each point is from the fit, in what the noise and the fit's own error allow.
 
-    square: (k, m) squared distance, standardised [m^2].  freedom: (k, m) in how many directions the
-    point was judged, 0 where not measured or where the fit follows the point.
+    square: (k, m) squared distance, standardised [m^2].  directions: (k, m) in how many
+    directions the point was judged, 0 where not measured or where the fit follows the point.
     """
 
     square: Array
-    freedom: Array
+    directions: Array
 
 
 def scores(model: Model, state: State, weights: Array) -> Scores:
@@ -67,7 +67,7 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     ridge = RIDGE * np.diag(np.diag(gram(np.ones_like(weights))))
     cover = solve_normal(gram(weights) + prior + ridge, np.eye(len(prior)))
     spread = cover @ (gram(weights**2) + prior) @ cover
-    square, freedom = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
+    square, directions = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
     for block in model.blocks(state):
         error, rows = model.weighted_rows(state, block, active)
         own = weights[:, block.rows, None, None]
@@ -76,8 +76,8 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
         along = np.einsum("kcab,kac->kcb", axes, error)
         told = share > FOLLOWED
         square[:, block.rows] = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
-        freedom[:, block.rows] = told.sum(axis=-1)
-    return Scores(square, np.where(model.seen, freedom, 0))
+        directions[:, block.rows] = told.sum(axis=-1)
+    return Scores(square, np.where(model.seen, directions, 0))
 
 
 def hat_blocks(rows: Array, matrix: Array) -> Array:
@@ -92,88 +92,91 @@ class Spread:
     """Ordinary points scatter by Student's t: scale per coordinate [m], degrees of freedom."""
 
     scale: float
-    freedom: float
+    dof: float
 
-    def chance(self, found: Scores) -> Array:
+    def p_value(self, found: Scores) -> Array:
         """(k, m) that an ordinary point is as far off or farther; 1 where it was not judged."""
-        judged = found.freedom > 0
-        freedom = np.maximum(found.freedom, 1)
-        ratio = found.square / freedom / self.scale**2
-        return np.where(judged, stats.f.sf(ratio, freedom, self.freedom), 1.0)
+        judged = found.directions > 0
+        directions = np.maximum(found.directions, 1)
+        ratio = found.square / directions / self.scale**2
+        return np.where(judged, stats.f.sf(ratio, directions, self.dof), 1.0)
 
 
-def spread_of(found: Scores, spare: float) -> Spread:
+def spread_of(found: Scores, dof: float) -> Spread:
     """Scale and tails of the ordinary points, whatever the suspects are.
 
     The start is the median of the distances, taken for Gaussian.  In turn the suspects are listed
     and Student's t is fitted to the other points by maximum likelihood [Lange, Little and Taylor
     1989], which knows that their distances end where the suspects begin.  Errors of a model have
-    heavy tails: they make the list shorter, while outliers beyond a gap do not.  spare: degrees of
+    heavy tails: they make the list shorter, while outliers beyond a gap do not.  dof: degrees of
     freedom of the fit, which the scale cannot have more of.
     """
-    judged = found.freedom > 0
-    freedom, mean_square = found.freedom[judged], (found.square / np.maximum(found.freedom, 1))
+    judged = found.directions > 0
+    directions, mean_square = (
+        found.directions[judged],
+        (found.square / np.maximum(found.directions, 1)),
+    )
     mean_square = mean_square[judged]
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
-    middle = np.median(mean_square / stats.f.ppf(0.5, freedom, spare))
-    here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), spare)
+    middle = np.median(mean_square / stats.f.ppf(0.5, directions, dof))
+    here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(ROUNDS):
-        far = unlikely(here.chance(found)[judged])
+        far = unlikely(here.p_value(found)[judged])
         if any(np.array_equal(far, other) for other in before):
             break
         before.append(far)
         edge = float(mean_square[far].min(initial=np.inf))
-        here = student(mean_square[~far], freedom[~far], edge, spare, here.scale)
+        here = student(mean_square[~far], directions[~far], edge, dof, here.scale)
     if len(before) == 1:  # no suspects at the median's scale: the rest decides on the tails
-        here = student(mean_square, freedom, np.inf, spare, here.scale)
+        here = student(mean_square, directions, np.inf, dof, here.scale)
     return here
 
 
-def student(mean_square: Array, freedom: Array, edge: float, spare: float, usual: float) -> Spread:
+def student(mean_square: Array, directions: Array, edge: float, dof: float, usual: float) -> Spread:
     """Student's t by maximum likelihood from points below an edge; light tails if in doubt.
 
     mean_square: (n,) standardised squared distance per direction [m^2], which over the variance is
-    distributed as F.  freedom: (n,) directions.
+    distributed as F.  directions: (n,) directions.
     """
     known = np.maximum(mean_square, LEAST_SCALE**2)
-    kinds, times = np.unique(freedom, return_counts=True)
+    kinds, times = np.unique(directions, return_counts=True)
 
     def loss(log_scale: float, tail: float) -> float:
         variance = np.exp(2.0 * log_scale)
         size = np.log(known / variance)
-        wide = 0.5 * (freedom + tail) * np.log1p(freedom * known / variance / tail)
+        wide = 0.5 * (directions + tail) * np.log1p(directions * known / variance / tail)
         shape = 0.5 * kinds * np.log(kinds / tail) - betaln(0.5 * kinds, 0.5 * tail)
         inside = np.log(fdtr(kinds, tail, edge / variance))
-        density = ((0.5 * freedom - 1.0) * size - wide).sum() + times @ (shape - inside)
+        density = ((0.5 * directions - 1.0) * size - wide).sum() + times @ (shape - inside)
         return float(len(known) * 2.0 * log_scale - density)
 
     middle = np.log(usual)
     best: list[tuple[float, Spread]] = []
-    for tail in (spare, *(tail for tail in TAILS if tail < spare)):
+    for tail in (dof, *(tail for tail in TAILS if tail < dof)):
         found = minimize_scalar(
             loss, bounds=(middle - 2.0, middle + 2.0), args=(tail,), method="bounded"
         )
         scale = max(float(np.exp(found.x)), LEAST_SCALE)
         best.append(
-            (float(found.fun) + (CLEARLY if tail < spare else 0.0), Spread(scale, float(tail)))
+            (float(found.fun) + (CLEARLY if tail < dof else 0.0), Spread(scale, float(tail)))
         )
     return min(best, key=lambda one: one[0])[1]
 
 
-def unlikely(chance: Array, level: float = LEVEL) -> Array:
+def unlikely(p_value: Array, level: float = LEVEL) -> Array:
     """True for points that stand out, of any shape [Benjamini and Hochberg 1995].
 
     Of those listed a share `level` is expected to be ordinary; without outliers the list is empty
     but for one data set in 1 / level.  That holds for points of one noise: where noise grows with
     range and no u95 tells, two to five times as many lists name an ordinary point.
     """
-    order = np.sort(chance, axis=None)
+    order = np.sort(p_value, axis=None)
     count = len(order)
     below = np.flatnonzero(order <= level * (np.arange(count) + 1.0) / max(count, 1))
     limit = order[below[-1]] if len(below) else -1.0
-    return np.asarray(chance <= limit)
+    return np.asarray(p_value <= limit)
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,7 @@ class Suspect:
     """A point that stands out from the fit.
 
     line: of the file.  pose: index of the row.  distance: from the prediction [m].  score: the
-    distance standardised by scale and leverage.  chance: that an ordinary point scores as much.
+    distance standardised by scale and leverage.  p_value: that an ordinary point scores as much.
     together: whether all targets of the pose are suspects: then its joint values may be wrong.
     """
 
@@ -190,7 +193,7 @@ class Suspect:
     pose: int
     distance: float
     score: float
-    chance: float
+    p_value: float
     together: bool
 
     def to_dict(self) -> dict[str, object]:
@@ -200,7 +203,7 @@ class Suspect:
             "target": self.target,
             "distance_mm": 1e3 * self.distance,
             "score": self.score,
-            "chance": self.chance,
+            "chance": self.p_value,
             "together": self.together,
         }
 
@@ -209,22 +212,22 @@ def suspects_of(
     model: Model, state: State, found: Scores, spread: Spread, line: Array
 ) -> tuple[Suspect, ...]:
     """The points that stand out, the least likely first.  line: (m,) of the file."""
-    chance = spread.chance(found)
-    judged = found.freedom > 0
+    p_value = spread.p_value(found)
+    judged = found.directions > 0
     far = np.zeros(judged.shape, dtype=bool)
-    far[judged] = unlikely(chance[judged])
+    far[judged] = unlikely(p_value[judged])
     distance = np.linalg.norm(model.error(state), axis=-1)
     score = np.sqrt(found.square) / spread.scale
     together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)
-    where = sorted(np.argwhere(far).tolist(), key=lambda at: (chance[*at], -score[*at]))
+    where = sorted(np.argwhere(far).tolist(), key=lambda at: (p_value[*at], -score[*at]))
     return tuple(
         Suspect(
             line=int(line[pose]),
-            target=model.names.targets[target],
+            target=model.names.target_names[target],
             pose=pose,
             distance=float(distance[target, pose]),
             score=float(score[target, pose]),
-            chance=float(chance[target, pose]),
+            p_value=float(p_value[target, pose]),
             together=bool(together[pose]),
         )
         for target, pose in where
@@ -237,7 +240,7 @@ def table_of(suspects: Sequence[Suspect]) -> Table:
         "points that stand out (may be real effects: run minimax-cal diagnose)",
         ("line", "target", "distance mm", "score", "chance", "of the pose"),
         tuple(
-            (s.line, s.target, 1e3 * s.distance, s.score, s.chance,
+            (s.line, s.target, 1e3 * s.distance, s.score, s.p_value,
              "all targets" if s.together else "")
             for s in suspects
         ),

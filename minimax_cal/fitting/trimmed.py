@@ -67,7 +67,7 @@ class Weighted:
         if not np.isfinite(self.found.cost).all():  # a fit that diverged tells of no point
             return Scores(np.zeros(self.weights.shape), np.zeros(self.weights.shape, dtype=int))
         found = scores(self.plain, self.state, self.weights)
-        return replace(found, freedom=np.where(self.judged[:, None], found.freedom, 0))
+        return replace(found, directions=np.where(self.judged[:, None], found.directions, 0))
 
     def spread(self, found: Scores) -> Spread:
         """How ordinary points scatter."""
@@ -94,7 +94,7 @@ def soften(at: Weighted) -> Weighted:
     for _ in range(SOFT):
         found = at.scores()
         distance = np.sqrt(found.square)
-        usual = float(np.median(distance[found.freedom > 0])) if found.freedom.any() else 0.0
+        usual = float(np.median(distance[found.directions > 0])) if found.directions.any() else 0.0
         at = at.again(1.0 / np.maximum(distance / max(usual, LEAST_SCALE), 1.0))
     return at
 
@@ -126,7 +126,9 @@ def concentrate(at: Weighted, share: float) -> Weighted:
     2006, "Computing LTS regression for large data sets"].
     """
     count = at.most(share)
-    return leave(at, lambda found: farthest(np.where(found.freedom > 0, found.square, -1.0), count))
+    return leave(
+        at, lambda found: farthest(np.where(found.directions > 0, found.square, -1.0), count)
+    )
 
 
 def set_aside(at: Weighted, share: float) -> Weighted:
@@ -135,8 +137,8 @@ def set_aside(at: Weighted, share: float) -> Weighted:
 
     def goes(found: Scores) -> Array:
         far = np.zeros(found.square.shape, dtype=bool)
-        judged = found.freedom > 0
-        far[judged] = unlikely(at.spread(found).chance(found)[judged])
+        judged = found.directions > 0
+        far[judged] = unlikely(at.spread(found).p_value(found)[judged])
         return farthest(np.where(far, found.square, -1.0), count) & far
 
     return leave(at, goes)

@@ -31,7 +31,7 @@ from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
 
 PLENTY = 1000  # poses that tell all; of more, so many are drawn
-SPARE = 3.0  # degrees of freedom that tell two noises apart
+LEAST_DOF = 3.0  # degrees of freedom that tell two noises apart
 ALONE = 1e-3  # of what all poses tell of a direction, all but one must tell this share
 # A fit of the worst point rests on a few points: other noise would choose others.  With this share
 # of the mean multiplier as the least of any point, `by_noise` covers as it should; no theory says
@@ -98,16 +98,17 @@ def point_share(mu: Array, seen: Array) -> Array:
 class Poses:
     """A linearised fit pose by pose, points in units of the instrument's noise.
 
-    error: (m, r) errors, r = 3k.  slope: (m, r, p) derivative by the free parameters.
-    arm: (m, r, n) motion of the points per unit of each joint.  pull: (m, r, p) A times `slope`.
+    error: (m, r) errors, r = 3k.  jacobian: (m, r, p) derivative by the free parameters.
+    arm: (m, r, n) motion of the points per unit of each joint.
+    weighted: (m, r, p) A times `jacobian`.
     off, prior: (p,) how far the parameters are from the prior's mean, and its weights.
     seen: (k, m) which points were measured.
     """
 
     error: Array
-    slope: Array
+    jacobian: Array
     arm: Array
-    pull: Array
+    weighted: Array
     off: Array
     prior: Array
     seen: Array
@@ -122,18 +123,18 @@ class Poses:
         if len(estimator.mix):  # weighs along the axes of the instrument
             error, turned = state.rotation @ error, state.rotation @ turned
         every = np.moveaxis(turned, (3, 0, 2, 1), (0, 1, 2, 3)).reshape(m, 3 * k, p)
-        slope = every[..., model.active]
+        jacobian = every[..., model.active]
         if len(estimator.mix):
-            pull = estimator.mix @ slope
+            weighted = estimator.mix @ jacobian
         else:
-            pull = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * slope
+            weighted = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * jacobian
         joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
         off = (model.prior.mean - model.values(state))[model.active]
         return Poses(
             error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
-            slope=slope,
+            jacobian=jacobian,
             arm=every[..., joints],
-            pull=pull,
+            weighted=weighted,
             off=off,
             prior=model.prior.weight[model.active],
             seen=model.seen,
@@ -142,7 +143,7 @@ class Poses:
     @property
     def bread(self) -> Array:
         """(p, p) H."""
-        flat = [a.reshape(-1, a.shape[-1]) for a in (self.slope, self.pull)]
+        flat = [a.reshape(-1, a.shape[-1]) for a in (self.jacobian, self.weighted)]
         return np.asarray(flat[0].T @ flat[1] + np.diag(self.prior))
 
     @property
@@ -155,18 +156,18 @@ class Poses:
     @property
     def gram(self) -> Array:
         """(m, p, p) J'A J of each pose."""
-        return np.asarray(np.swapaxes(self.slope, -1, -2) @ self.pull)
+        return np.asarray(np.swapaxes(self.jacobian, -1, -2) @ self.weighted)
 
     @property
     def score(self) -> Array:
         """(m, p) J'A e of each pose."""
-        return np.asarray(np.einsum("mrp,mr->mp", self.pull, self.error))
+        return np.asarray(np.einsum("mrp,mr->mp", self.weighted, self.error))
 
     def rows(self) -> Rows:
         """For the estimate of the noises; a prior is some more rows, as noisy as a typical one."""
-        m, r, p = self.slope.shape
-        parts = (np.moveaxis(a.reshape(m, r // 3, 3, -1), 0, 3) for a in (self.slope, self.arm))
-        slope, arm = (np.moveaxis(part, 2, 0) for part in parts)
+        m, r, p = self.jacobian.shape
+        parts = (np.moveaxis(a.reshape(m, r // 3, 3, -1), 0, 3) for a in (self.jacobian, self.arm))
+        jacobian, arm = (np.moveaxis(part, 2, 0) for part in parts)
         plain = np.moveaxis(self.error.reshape(m, r // 3, 3), 0, 2)
         none = np.zeros((r // 3, 0, 3, m))
         bare = rows_of(plain, none, arm, self.seen.astype(float))
@@ -177,8 +178,8 @@ class Poses:
         return replace(
             bare,
             error=np.concatenate([bare.error, root * self.off[known]]),
-            basis=orthonormal(np.concatenate([bare.of(slope), more])),
-            stretch=np.concatenate([bare.stretch, np.ones(len(known))]),
+            basis=orthonormal(np.concatenate([bare.of(jacobian), more])),
+            variance_ratio=np.concatenate([bare.variance_ratio, np.ones(len(known))]),
             count=bare.count + len(known),
         )
 
@@ -189,14 +190,14 @@ class Uncertainty:
 
     names: of all p parameters.  units: of each, SI.  covariance: (p, p), the base's in its own
     axes, NaN where a parameter is not identified.  noise: of a typical coordinate and of the
-    joints.  spare: degrees of freedom of the noise.  source: `poses` or `noise`.
+    joints.  dof: degrees of freedom of the noise.  source: `poses` or `noise`.
     """
 
     names: Names
     units: tuple[str, ...]
     covariance: Array
     noise: Noise
-    spare: float
+    dof: float
     source: str
 
     @property
@@ -232,7 +233,7 @@ class Uncertainty:
 
     def half_width(self, level: float = 0.95) -> Array:
         """(p,) half of the interval of each parameter: Student's quantile times sigma [SI]."""
-        return quantile(level, self.spare) * self.sigma
+        return quantile(level, self.dof) * self.sigma
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the identified parameters, lengths in millimetres."""
@@ -245,16 +246,16 @@ class Uncertainty:
             "units": ["mm" if self.units[i] == "m" else self.units[i] for i in known],
             "rows": rows.tolist(),
             "source": self.source,
-            "degrees_of_freedom": self.spare,
+            "degrees_of_freedom": self.dof,
             "noise_mm": 1e3 * float(np.sqrt(self.noise.variance)),
             "jitter_rad": self.noise.jitter,
             "jitter_ratio": self.noise.ratio,
         }
 
 
-def quantile(level: float, spare: float) -> float:
-    """Student's two-sided quantile.  spare: degrees of freedom, at least one counts."""
-    return float(stats.t.ppf(0.5 + 0.5 * level, max(spare, 1.0)))
+def quantile(level: float, dof: float) -> float:
+    """Student's two-sided quantile.  dof: degrees of freedom, at least one counts."""
+    return float(stats.t.ppf(0.5 + 0.5 * level, max(dof, 1.0)))
 
 
 def scales(units: tuple[str, ...]) -> Array:
@@ -267,21 +268,21 @@ def noise_of(poses: Poses) -> tuple[Noise, float]:
 
     None are free where the poses do not determine the parameters.
     """
-    rows, p = poses.rows(), poses.slope.shape[-1]
-    spare = float(rows.count - p) if rows.basis.shape[1] == p else 0.0
-    if spare >= SPARE:
-        return restricted(rows, np.zeros((len(rows.error), 0))), spare
+    rows, p = poses.rows(), poses.jacobian.shape[-1]
+    dof = float(rows.count - p) if rows.basis.shape[1] == p else 0.0
+    if dof >= LEAST_DOF:
+        return restricted(rows, np.zeros((len(rows.error), 0))), dof
     left = rows.error - rows.basis @ (rows.basis.T @ rows.error)
-    return Noise(0.0, float(left @ left) / max(spare, 1.0), 0.0), spare
+    return Noise(0.0, float(left @ left) / max(dof, 1.0), 0.0), dof
 
 
 def by_noise(poses: Poses, noise: Noise) -> Array:
     """H^-1 F H^-1 with F = sum J'A (s^2 + t^2 S S') A J: (p, p) of the free parameters [SI]."""
-    pull = poses.pull.reshape(-1, poses.pull.shape[-1])
-    swing = np.swapaxes(poses.pull, -1, -2) @ poses.arm
-    filling = noise.variance * pull.T @ pull
-    filling += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
-    return sandwich(poses, filling)
+    weighted = poses.weighted.reshape(-1, poses.weighted.shape[-1])
+    swing = np.swapaxes(poses.weighted, -1, -2) @ poses.arm
+    meat = noise.variance * weighted.T @ weighted
+    meat += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
+    return sandwich(poses, meat)
 
 
 def by_poses(poses: Poses, group: Array) -> Array:
@@ -292,7 +293,7 @@ def by_poses(poses: Poses, group: Array) -> Array:
     number are one pose.  NaN where the fit needs one of the poses.
     """
     _, member = np.unique(group, return_inverse=True)
-    count, p = int(member.max()) + 1, poses.slope.shape[-1]
+    count, p = int(member.max()) + 1, poses.jacobian.shape[-1]
     gram, score = np.zeros((count, p, p)), np.zeros((count, p))
     np.add.at(gram, member, poses.gram)
     np.add.at(score, member, poses.score)
@@ -305,11 +306,11 @@ def by_poses(poses: Poses, group: Array) -> Array:
     return np.asarray((count - 1) / count * change.T @ change + prior)
 
 
-def sandwich(poses: Poses, filling: Array) -> Array:
+def sandwich(poses: Poses, meat: Array) -> Array:
     """H^-1 F H^-1.  A prior is rows as noisy as a typical one: its weight times their variance."""
     if poses.prior.any():
-        filling = filling + poses.mean_square * np.diag(poses.prior)
-    half = solve_normal(poses.bread, filling)
+        meat = meat + poses.mean_square * np.diag(poses.prior)
+    half = solve_normal(poses.bread, meat)
     return np.asarray(solve_normal(poses.bread, half.T))
 
 
@@ -324,17 +325,17 @@ def uncertainty_of(
     """
     few, rows = estimator.thinned(group, PLENTY)
     poses = Poses.of(few, state)
-    noise, spare = noise_of(poses)
+    noise, dof = noise_of(poses)
     found, source = np.full(poses.bread.shape, np.nan), "poses"
-    if spare >= 1.0 and estimator.share.ndim == 1:
+    if dof >= 1.0 and estimator.share.ndim == 1:
         found = by_poses(poses, group[rows])
-    if spare >= 1.0 and np.isnan(found).any():
+    if dof >= 1.0 and np.isnan(found).any():
         found, source = by_noise(poses, noise), "noise"
     names, active = few.model.names, few.model.active
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[np.ix_(active, active)] = 0.5 * (found + found.T) * len(rows) / len(group)
     own = tuple("m" if length else "rad" for length in names.linear[: names.geometric])
-    return Uncertainty(names, (*own, *units), covariance, noise, spare, source)
+    return Uncertainty(names, (*own, *units), covariance, noise, dof, source)
 
 
 # ---- positions -------------------------------------------------------------------------------
@@ -377,24 +378,24 @@ def position_factor(
         raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
     model, state = model_at(cell, q)
     n = model.names.joints
-    slope = np.swapaxes(model.jacobian(state), 0, 1)
+    jacobian = np.swapaxes(model.jacobian(state), 0, 1)
     if frame == "measurement":
-        slope = state.rotation @ slope
+        jacobian = state.rotation @ jacobian
     root = known.root
     if frame == "base":
         root[5 * n : 5 * n + 6] = 0.0
-    factor = slope @ root
+    factor = jacobian @ root
     if not jitter:
         return np.asarray(factor)
     joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
-    return np.concatenate([factor, known.noise.jitter * slope[..., joints]], axis=-1)
+    return np.concatenate([factor, known.noise.jitter * jacobian[..., joints]], axis=-1)
 
 
 def model_at(cell: Cell, q: Array) -> tuple[Model, State]:
     """The model of a cell at poses (m, n) where nothing was measured, and its state."""
-    data = still(np.atleast_2d(np.asarray(q, dtype=float)), cell.targets, cell.robot)
-    names = Names(cell.robot.joints, cell.targets)
-    m, k, nothing = data.poses, len(cell.targets), np.zeros(names.count)
+    data = still(np.atleast_2d(np.asarray(q, dtype=float)), cell.target_names, cell.robot)
+    names = Names(cell.robot.joints, cell.target_names)
+    m, k, nothing = data.poses, len(cell.target_names), np.zeros(names.count)
     model = Model(
         q=data.q * cell.robot.sign,
         prismatic=cell.robot.prismatic,
@@ -404,8 +405,7 @@ def model_at(cell: Cell, q: Array) -> tuple[Model, State]:
         active=np.ones(names.count, dtype=bool),
         prior=Prior(nothing, nothing),
     )
-    values = np.concatenate([np.zeros(0), *cell.effects.values])
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots, values)
+    state = cell.state
     if not cell.effects.terms:
         return model, state
     return extended(model, cell.robot, data, state, cell.effects.terms)
@@ -420,8 +420,8 @@ def holding_radius(covariance: Array, level: float = 0.95) -> Array:
     mean = np.trace(covariance, axis1=-2, axis2=-1)
     square = np.einsum("...ij,...ij->...", covariance, covariance)
     spread = np.where(mean > 0.0, square / np.where(mean > 0.0, mean, 1.0), 0.0)
-    freedom = np.where(square > 0.0, mean**2 / np.where(square > 0.0, square, 1.0), 1.0)
-    return np.asarray(np.sqrt(spread * stats.chi2.ppf(level, freedom)))
+    dof = np.where(square > 0.0, mean**2 / np.where(square > 0.0, square, 1.0), 1.0)
+    return np.asarray(np.sqrt(spread * stats.chi2.ppf(level, dof)))
 
 
 # ---- saved fits ------------------------------------------------------------------------------
@@ -440,9 +440,9 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         raise CalibrationError(
             f"{source}: does not hold a covariance; write it again with minimax-cal calibrate -o"
         )
-    nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.targets, cell.robot))
+    nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)
-    names = Names(cell.robot.joints, cell.targets, effects)
+    names = Names(cell.robot.joints, cell.target_names, effects)
     units = (*("m" if x else "rad" for x in names.linear[: names.geometric]), *own)
     try:
         part = content["covariance"]
@@ -450,7 +450,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         rows = np.array(part["rows"], dtype=float).reshape(len(place), len(place))
         ratio, jitter = float(part["jitter_ratio"]), float(part["jitter_rad"])
         noise = Noise(ratio, (1e-3 * float(part["noise_mm"])) ** 2, jitter)
-        spare, kind = float(part["degrees_of_freedom"]), str(part["source"])
+        dof, kind = float(part["degrees_of_freedom"]), str(part["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: its covariance does not fit its robot and targets ({error})"
@@ -460,4 +460,4 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     scale = scales(units)[place]
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[np.ix_(place, place)] = rows / np.outer(scale, scale)
-    return Uncertainty(names, units, covariance, noise, spare, kind)
+    return Uncertainty(names, units, covariance, noise, dof, kind)

@@ -19,14 +19,14 @@ from minimax_cal.fitting.calibrate import (
     QP_TOLERANCE,
     Fit,
     Options,
-    Report,
+    Progress,
     fit_cell,
     silent,
     usable,
 )
 from minimax_cal.fitting.calibration import Calibration
 from minimax_cal.fitting.intervals import Interval
-from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.robust import flatness
 from minimax_cal.fitting.uncertainty import model_at
 from minimax_cal.ground.arrays import Array
@@ -83,9 +83,9 @@ class Bootstrap:
         To first order about the fit.  q: (m, n) joints as the controller gives them [rad, m].
         """
         model, state = model_at(self.fit.cell, q)
-        slope = state.rotation @ np.swapaxes(model.jacobian(state), 0, 1)
+        jacobian = state.rotation @ np.swapaxes(model.jacobian(state), 0, 1)
         return np.asarray(
-            self.fit.predict(q) + np.einsum("mkcp,bp->bmkc", slope[..., self.place], self.change)
+            self.fit.predict(q) + np.einsum("mkcp,bp->bmkc", jacobian[..., self.place], self.change)
         )
 
     def position_interval(self, q: Array, level: float = 0.95) -> Array:
@@ -142,11 +142,11 @@ def percentiles(values: Array, level: float) -> Array:
 
 
 def bootstrap(
-    fit: Calibration, replicates: int = 500, seed: int = 0, report: Report = silent
+    fit: Calibration, replicates: int = 500, seed: int = 0, progress: Progress = silent
 ) -> Bootstrap:
     """Calibrate again on poses drawn from the training poses.
 
-    report: called with a word on progress.  Raises OptionError; DataError where most draws do not
+    progress: called with a word on progress.  Raises OptionError; DataError where most draws do not
     determine the parameters.
     """
     if replicates < 2:
@@ -161,7 +161,9 @@ def bootstrap(
     options, train = options_of(fit), fit.data.take(~fit.held)
     found = fit_cell(fit.nominal.robot, train, options, silent)
     draws = draw(found.group, replicates, np.random.default_rng(seed))
-    change, good = (solved_again if found.worst else stepped)(found, train, options, draws, report)
+    change, good = (solved_again if found.worst else stepped)(
+        found, train, options, draws, progress
+    )
     # a robust loss would weigh each draw anew, and so give way more than with weights that are kept
     change = change * flatness(found.robust, found.state)
     lost = replicates - int(np.count_nonzero(good))
@@ -213,7 +215,7 @@ def options_of(fit: Calibration) -> Options:
 
 
 def stepped(
-    found: Fit, train: Measurements, options: Options, draws: Draws, report: Report
+    found: Fit, train: Measurements, options: Options, draws: Draws, progress: Progress
 ) -> tuple[Array, Array]:
     """Replicates of a sum of squares: two Gauss-Newton steps from the fit.
 
@@ -223,26 +225,28 @@ def stepped(
     model, share = found.estimator.model, found.estimator.share
     model = model.emphasise(share)
     model = with_poses(model, found.estimator.mix) if len(found.estimator.mix) else model
-    part, pull = normal_parts(model, found.state, draws)
+    part, gradient = normal_parts(model, found.state, draws)
     prior = model.prior.weight[model.active]
     off = (model.prior.mean - model.values(found.state))[model.active]
     good = determined(draws, part, prior)
     gram = np.tensordot(draws.times[good], part, 1) + np.diag(prior)
     change = np.zeros((len(good), len(prior)))
-    change[good] = solve_normal(gram, (draws.times[good] @ pull + prior * off)[..., None])[..., 0]
+    change[good] = solve_normal(gram, (draws.times[good] @ gradient + prior * off)[..., None])[
+        ..., 0
+    ]
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % PACE == 0:
-            report(f"replicate {number + 1} of {len(good)}")
+            progress(f"replicate {number + 1} of {len(good)}")
         problem = SumOfSquares(replace(model, weight=model.weight * draws.rows(number)))
         x = problem.step(found.state, change[number])
-        _, slope, gram = problem.normal(x)
-        x = problem.step(x, solve_normal(gram, slope[:, None])[:, 0])
+        _, gradient, gram = problem.normal(x)
+        x = problem.step(x, solve_normal(gram, gradient[:, None])[:, 0])
         change[number] = between(found.state, x)[model.active]
     return change, good
 
 
 def solved_again(
-    found: Fit, train: Measurements, options: Options, draws: Draws, report: Report
+    found: Fit, train: Measurements, options: Options, draws: Draws, progress: Progress
 ) -> tuple[Array, Array]:
     """Replicates of a minimax, each solved from the fit.  Returns as `stepped`."""
     qp = partial(solve_qp, name=usable(options.qp)[0], tolerance=QP_TOLERANCE)
@@ -252,11 +256,11 @@ def solved_again(
     change = np.zeros((len(good), int(active.sum())))
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % PACE == 0:
-            report(f"replicate {number + 1} of {len(good)}")
+            progress(f"replicate {number + 1} of {len(good)}")
         rows = np.repeat(np.arange(len(draws.member)), draws.rows(number))
         model = found.estimator.at(rows).model
         distances = measured_distances(train.take(rows), options.distance_tolerance)
-        problem = worst_of(model, found.state, distances, options.distance, "target")
+        problem = minimax_problem(model, found.state, distances, options.distance, "target")
         best = minimax.solve(problem, found.state, qp, Sqp(hessian=options.hessian))
         good[number] = best.status is Status.CONVERGED
         change[number] = between(found.state, best.x)[active]
@@ -264,17 +268,17 @@ def solved_again(
 
 
 def normal_parts(model: Model, state: State, draws: Draws) -> tuple[Array, Array]:
-    """What each pose adds to Gram matrix (M, p, p) and slope (M, p) of the free parameters."""
+    """What each pose adds to Gram matrix (M, p, p) and gradient (M, p) of the free parameters."""
     count, p = draws.times.shape[1], int(model.active.sum())
-    gram, pull = np.zeros((count, p, p)), np.zeros((count, p))
+    gram, gradient = np.zeros((count, p, p)), np.zeros((count, p))
     for block in model.blocks(state):
         error, turned = model.weighted_rows(state, block, model.active)
-        slope = np.moveaxis(turned, (3, 1), (0, 1)).reshape(error.shape[-1], p, -1)
+        jacobian = np.moveaxis(turned, (3, 1), (0, 1)).reshape(error.shape[-1], p, -1)
         own = draws.member[block.rows]
-        np.add.at(gram, own, slope @ np.swapaxes(slope, 1, 2))
-        flat = np.moveaxis(error, 2, 0).reshape(len(slope), -1, 1)
-        np.add.at(pull, own, (slope @ flat)[..., 0])
-    return gram, pull
+        np.add.at(gram, own, jacobian @ np.swapaxes(jacobian, 1, 2))
+        flat = np.moveaxis(error, 2, 0).reshape(len(jacobian), -1, 1)
+        np.add.at(gradient, own, (jacobian @ flat)[..., 0])
+    return gram, gradient
 
 
 def determined(draws: Draws, gram: Array, prior: Array) -> Array:
@@ -297,7 +301,7 @@ def between(start: State, end: State) -> Array:
             links_of(end.mdh - start.mdh),
             start.rotation.T @ (end.origin - start.origin),
             turn,
-            (end.targets - start.targets).reshape(-1),
+            (end.target_positions - start.target_positions).reshape(-1),
             end.effects - start.effects,
         ]
     )
@@ -307,12 +311,12 @@ def unseen(found: Fit, change: Array, draws: Draws, good: Array) -> Array:
     """(B,) RMS distance of each replicate on the poses that it has not seen, to first order [m]."""
     model = found.estimator.model
     error = np.swapaxes(np.nan_to_num(model.error(found.state)), 0, 1)
-    slope = np.swapaxes(model.jacobian(found.state), 0, 1)[..., model.active]
+    jacobian = np.swapaxes(model.jacobian(found.state), 0, 1)[..., model.active]
     out = np.full(len(change), np.nan)
     for i, number in enumerate(np.flatnonzero(good).tolist()):
         left = draws.rows(number) == 0
         seen = model.seen.T[left]
         if seen.any():
-            square = ((error[left] - slope[left] @ change[i]) ** 2).sum(axis=-1)
+            square = ((error[left] - jacobian[left] @ change[i]) ** 2).sum(axis=-1)
             out[i] = np.sqrt(square[seen].mean())
     return out

@@ -231,7 +231,7 @@ def joint_range(robot: Robot, q: Array) -> tuple[Array, Array]:
 def tcp_place(cell: Cell, q: Array) -> Array:
     """The targets' centroid in the base frame, effects left out: (m, 3) [m].  q: (m, n)."""
     pose = cell.robot.pose(q)
-    return np.asarray(pose[:, :3, :3] @ cell.spots.mean(axis=0) + pose[:, :3, 3])
+    return np.asarray(pose[:, :3, :3] @ cell.target_positions.mean(axis=0) + pose[:, :3, 3])
 
 
 def reached_by(train: Array, q: Array) -> Array:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.start import fit_frame
+from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.ground.files import read_text
@@ -73,10 +73,10 @@ def open_fit(fit: Path | str, data: Path | str = "", nominal: str = "") -> Saved
 
 def known_targets(data: Measurements, cell: Cell) -> tuple[Measurements, tuple[str, ...]]:
     """The data without targets that the fit does not know, and a notice that names them."""
-    known = np.array([name in cell.targets for name in data.targets])
+    known = np.array([name in cell.target_names for name in data.target_names])
     if known.all() or not known.any():
         return data, ()  # of none in common the cell itself complains
-    names = ", ".join(np.array(data.targets)[~known])
+    names = ", ".join(np.array(data.target_names)[~known])
     return data.keep(known), (f"{data.source}: {names} left out: the fit does not know them",)
 
 
@@ -129,10 +129,10 @@ def nominal_cell(
         robot = robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot")
     else:
         raise CalibrationError(f"{source}: does not tell its nominal robot; give it (--nominal)")
-    missing = [name for name in cell.targets if name not in train.targets]
+    missing = [name for name in cell.target_names if name not in train.target_names]
     if missing:
         raise DataError(f"{train.source}: {missing[0]} was not measured")
     check_joints(robot, train)
-    state = fit_frame(model_of(robot, train), robot.mdh).state
+    state = fit_base(model_of(robot, train), robot.mdh).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
-    return Cell.of(robot, state, train.targets), (said,)
+    return Cell.of(robot, state, train.target_names), (said,)

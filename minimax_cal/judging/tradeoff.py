@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.calibrate import QP_TOLERANCE, Report, calibrate, silent, usable
+from minimax_cal.fitting.calibrate import QP_TOLERANCE, Progress, calibrate, silent, usable
 from minimax_cal.fitting.calibration import Calibration, Provenance
-from minimax_cal.fitting.minimax_problem import Worst, worst_of
+from minimax_cal.fitting.minimax_problem import MinimaxProblem, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, write_whole
@@ -48,7 +48,7 @@ SAME = 1e-6  # relative: what is not farther than this below a chord lies on it
 class Blend:
     """The problem `worst` (of points) with a share w of the mean: (1 - w) f_i + w mean f."""
 
-    worst: Worst
+    worst: MinimaxProblem
     share: float
 
     @property
@@ -77,7 +77,7 @@ class Blend:
         def curvature(weights: Array) -> Array:
             return at.curvature(self.mixed(weights))  # the mixing is symmetric
 
-        return Linear(self.mixed(at.f), self.mixed(at.slope), at.c, at.normal, curvature)
+        return Linear(self.mixed(at.f), self.mixed(at.jacobian), at.c, at.normal, curvature)
 
     def step(self, x: State, d: Array) -> State:
         """The state moved by a scaled step."""
@@ -99,7 +99,7 @@ class Compromise:
     status: Status
 
     @staticmethod
-    def of(worst: Worst, share: float, state: State, status: Status) -> Compromise:
+    def of(worst: MinimaxProblem, share: float, state: State, status: Status) -> Compromise:
         """A state and what it is worth."""
         f, _ = worst.evaluate(state)
         return Compromise(share, state, float(f.mean()), float(f.max()), status)
@@ -115,7 +115,11 @@ class Compromise:
 
 
 def curve_of(
-    worst: Worst, ends: tuple[Compromise, Compromise], steps: int, qp: Solver, report: Report
+    worst: MinimaxProblem,
+    ends: tuple[Compromise, Compromise],
+    steps: int,
+    qp: Solver,
+    progress: Progress,
 ) -> list[Compromise]:
     """The ends, `sum` first, and up to so many compromises between them, by growing RMS."""
     curve, straight = list(ends), set[float]()
@@ -126,7 +130,7 @@ def curve_of(
         return float(np.linalg.norm((b.place - a.place) / span)) if bends else 0.0
 
     while len(curve) < steps + 2:
-        report(f"compromise {len(curve) - 1} of {steps}")
+        progress(f"compromise {len(curve) - 1} of {steps}")
         gaps = [width(a, b) for a, b in itertools.pairwise(curve)]
         at = int(np.argmax(gaps))
         if gaps[at] == 0.0:
@@ -247,27 +251,27 @@ def tradeoff(
     qp: str = "daqp",
     holdout: float = 0.2,
     seed: int = 0,
-    report: Report = silent,
+    progress: Progress = silent,
 ) -> Tradeoff:
     """The choices between least squares and the worst point for a robot and its measurements.
 
-    steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.  report: called with
-    a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended is in the
-    result's `status`.
+    steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.  progress: called
+    with a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended
+    is in the result's `status`.
     """
     if not 0 <= steps <= MOST_STEPS:
         raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")
     began = time.perf_counter()
     split = {"holdout": holdout, "seed": seed}
-    first = calibrate(robot, data, "sum", qp, report, **split)
-    last = calibrate(robot, data, "point", qp, report, **split)
+    first = calibrate(robot, data, "sum", qp, progress, **split)
+    last = calibrate(robot, data, "point", qp, progress, **split)
     worst = problem_of(first)
     ends = (
         Compromise.of(worst, 1.0, state_of(first), first.status),
         Compromise.of(worst, 0.0, state_of(last), last.status),
     )
     solver = partial(solve_qp, name=usable(qp)[0], tolerance=QP_TOLERANCE)
-    curve = curve_of(worst, ends, steps, solver, report)
+    curve = curve_of(worst, ends, steps, solver, progress)
     names = ("sum", *["compromise"] * (len(curve) - 2), "point")
     return Tradeoff(
         robot=first.robot.name,
@@ -278,21 +282,21 @@ def tradeoff(
     )
 
 
-def problem_of(fit: Calibration) -> Worst:
+def problem_of(fit: Calibration) -> MinimaxProblem:
     """The worst-point problem on the training poses of a fit, with its identified parameters."""
     model = model_of(fit.nominal.robot, fit.data.take(~fit.held))
     model = model.only(fit.identification.active)
-    return worst_of(model, state_of(fit), fit.distances, "two-sided", "point")
+    return minimax_problem(model, state_of(fit), fit.distances, "two-sided", "point")
 
 
 def state_of(fit: Calibration) -> State:
     """The parameters of a fit."""
     cell = fit.cell
-    return State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    return cell.state
 
 
 def choice_of(fit: Calibration, name: str, compromise: Compromise) -> Choice:
     """A compromise as a cell, judged on the training and held-out poses of a fit."""
-    cell = Cell.of(fit.nominal.robot, compromise.state, fit.cell.targets)
+    cell = Cell.of(fit.nominal.robot, compromise.state, fit.cell.target_names)
     train, held = (accuracy(cell.error(fit.data.take(rows))) for rows in (~fit.held, fit.held))
     return Choice(name, compromise.share, cell, train, held, compromise.status)

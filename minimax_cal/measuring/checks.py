@@ -152,7 +152,7 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
         return []
     worst = sorted(found, key=lambda at: -distance[tuple(at)])[:5]
     named = ", ".join(
-        f"line {data.line[pose]} {data.targets[target]} {1e3 * distance[target, pose]:.3g} mm"
+        f"line {data.line[pose]} {data.target_names[target]} {1e3 * distance[target, pose]:.3g} mm"
         for target, pose in worst
     )
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
@@ -163,9 +163,11 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
 
 def check_spread(data: Measurements) -> None:
     """Raise DataError if one target's points spread a hundred times more than another's."""
-    spread = np.array([np.nanstd(data.y[:, i], axis=0).max() for i in range(len(data.targets))])
+    spread = np.array(
+        [np.nanstd(data.y[:, i], axis=0).max() for i in range(len(data.target_names))]
+    )
     if spread.max() > 100.0 * spread.min() and np.all(data.seen.sum(axis=0) > 5):
-        big, small = (data.targets[i] for i in (int(spread.argmax()), int(spread.argmin())))
+        big, small = (data.target_names[i] for i in (int(spread.argmax()), int(spread.argmin())))
         raise DataError(
             f"{data.source}: the points of {big} spread over {spread.max():.3g} m, those of "
             f"{small} over {spread.min():.3g} m; one of them has the wrong unit"

@@ -34,7 +34,7 @@ class Measurements:
 
     q: (m, n) joint values as the controller gives them [rad, or m where `sliding`].
     y: (m, k, 3) targets in the measurement frame, NaN where not measured [m].
-    targets: k names, as smr1.
+    target_names: k of them, as smr1.
     sliding: (n,) True where the joint column has a unit of length.
     line: (m,) line of the file, for messages.
     columns: the optional columns by name; numbers in SI, labels as text.
@@ -45,7 +45,7 @@ class Measurements:
 
     q: Array
     y: Array
-    targets: tuple[str, ...]
+    target_names: tuple[str, ...]
     sliding: Array
     line: Array
     columns: Mapping[str, Array]
@@ -77,13 +77,13 @@ class Measurements:
 
     def keep(self, targets: Array) -> Measurements:
         """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
-        names = tuple(name for name, kept in zip(self.targets, targets, strict=True) if kept)
-        some = replace(self, y=self.y[:, targets], targets=names)
+        names = tuple(name for name, kept in zip(self.target_names, targets, strict=True) if kept)
+        some = replace(self, y=self.y[:, targets], target_names=names)
         return some.take(np.asarray(some.seen.any(axis=1)))
 
     def only(self, target: int) -> Measurements:
         """One target alone, at the poses where it was measured."""
-        alone = replace(self, y=self.y[:, [target]], targets=(self.targets[target],))
+        alone = replace(self, y=self.y[:, [target]], target_names=(self.target_names[target],))
         return alone.take(self.seen[:, target])
 
     def with_y(self, y: Array) -> Measurements:
@@ -123,22 +123,22 @@ def check_finite(data: Measurements) -> Measurements:
     if broken.any():
         row, target = np.argwhere(broken)[0]
         raise DataError(
-            f"{data.source}:{data.line[row]}: {data.targets[target]} has some of x, y, z only; "
-            "give all three, or leave all three empty where it was not measured"
+            f"{data.source}:{data.line[row]}: {data.target_names[target]} has some of x, y, z "
+            "only; give all three, or leave all three empty where it was not measured"
         )
     if np.nanmax(np.abs(data.y), initial=0.0) > FARTHEST:
         row, target, _ = np.argwhere(np.abs(data.y) > FARTHEST)[0]
         raise DataError(
-            f"{data.source}:{data.line[row]}: {data.targets[target]} is more than "
+            f"{data.source}:{data.line[row]}: {data.target_names[target]} is more than "
             f"{FARTHEST / 1e3:g} km away; check the number and its unit"
         )
     unmeasured = ~data.seen.any(axis=0)
     if unmeasured.all():
         raise DataError(f"{data.source}: no target was measured at any pose")
     if unmeasured.any():
-        name = data.targets[int(np.argmax(unmeasured))]
+        name = data.target_names[int(np.argmax(unmeasured))]
         raise DataError(f"{data.source}: {name} is measured at no pose; delete its columns")
-    for target, name in enumerate(data.targets):
+    for target, name in enumerate(data.target_names):
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
@@ -193,7 +193,7 @@ def read_measurements(path: Path | str) -> Measurements:
     data = Measurements(
         q=q,
         y=y,
-        targets=tuple(f"smr{i}" for i in found),
+        target_names=tuple(f"smr{i}" for i in found),
         sliding=sliding,
         line=file.line,
         columns=columns,
@@ -210,9 +210,9 @@ def read_measurements(path: Path | str) -> Measurements:
 
 def write_measurements(path: Path | str, data: Measurements) -> None:
     """Write CSV as the contract describes it: radians (mm for slides) and millimetres."""
-    joints, k = data.q.shape[1], len(data.targets)
+    joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
-    header += [f"{name}_{axis}_mm" for name in data.targets for axis in "xyz"]
+    header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
     named = {name: file_column(name) for name in data.columns}
     header += [name for name, _ in named.values()]
     stream = io.StringIO()

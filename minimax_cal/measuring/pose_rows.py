@@ -32,7 +32,7 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
         "visits_told": numbered(data),
         "q": plain(data.q),
         "q_units": ["m" if sliding else "rad" for sliding in data.sliding],
-        "targets": list(data.targets),
+        "targets": list(data.target_names),
         "measured_mm": plain(1e3 * data.y),
         "errors_mm": {
             name: plain(1e3 * np.moveaxis(error, 0, 1)) for name, error in errors.items()

@@ -27,14 +27,15 @@ from minimax_cal.robots.robot import Robot, robot_from_dict
 class Cell:
     """A robot, its base in the measurement frame, and the targets on its flange.
 
-    base: (4, 4) pose of the base [m].  targets: k names.  spots: (k, 3) in the last frame [m].
+    base: (4, 4) pose of the base [m].  target_names: k of them.  target_positions: (k, 3) in
+    the last frame [m].
     effects: what moves the targets beyond geometry.
     """
 
     robot: Robot
     base: Array
-    targets: tuple[str, ...]
-    spots: Array
+    target_names: tuple[str, ...]
+    target_positions: Array
     effects: Fitted = field(default=NOTHING)
 
     @staticmethod
@@ -42,7 +43,14 @@ class Cell:
         """The cell that a state of the parameters describes."""
         base = np.eye(4)
         base[:3, :3], base[:3, 3] = state.rotation, state.origin
-        return Cell(robot.with_mdh(state.mdh), base, targets, state.targets, effects)
+        return Cell(robot.with_mdh(state.mdh), base, targets, state.target_positions, effects)
+
+    @property
+    def state(self) -> State:
+        """The parameters' values, those of the effects included."""
+        values = np.concatenate([np.zeros(0), *self.effects.values])
+        base = self.base
+        return State(self.robot.mdh, base[:3, :3], base[:3, 3], self.target_positions, values)
 
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m].
@@ -52,35 +60,37 @@ class Cell:
         """
         q = np.atleast_2d(np.asarray(q, dtype=float))
         if self.effects.terms:
-            return self.follow(still(q, self.targets, self.robot))
+            return self.follow(still(q, self.target_names, self.robot))
         pose = self.base @ self.robot.pose(q)
-        turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.spots)
+        turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.target_positions)
         return np.asarray(turned + pose[:, None, :3, 3])
 
     def scene(self, data: Measurements) -> Scene:
         """What the laws of effects look at, for all targets of the cell."""
         base = (self.base[:3, :3], self.base[:3, 3])
-        hidden = np.full((data.poses, len(self.targets), 3), np.nan)
-        data = replace(data, targets=self.targets, y=hidden)
-        return Scene.of(self.robot, data, base, self.spots, data.q * self.robot.sign)
+        hidden = np.full((data.poses, len(self.target_names), 3), np.nan)
+        data = replace(data, target_names=self.target_names, y=hidden)
+        return Scene.of(self.robot, data, base, self.target_positions, data.q * self.robot.sign)
 
     def follow(self, data: Measurements) -> Array:
         """As `predict`, with the columns of the data (order, temperature, payload ...)."""
         if not (self.effects.terms and data.poses):
-            return Cell(self.robot, self.base, self.targets, self.spots).predict(data.q)
+            return Cell(self.robot, self.base, self.target_names, self.target_positions).predict(
+                data.q
+            )
         points = np.moveaxis(self.effects.points(self.scene(data)), -1, 0)
         return np.asarray(points @ self.base[:3, :3].T + self.base[:3, 3])
 
     def error(self, data: Measurements) -> Array:
         """Measured minus predicted: (k, m, 3), for the targets of the data [m]."""
         check_joints(self.robot, data)
-        strange = [name for name in data.targets if name not in self.targets]
+        strange = [name for name in data.target_names if name not in self.target_names]
         if strange:
             raise DataError(
                 f"{data.source}: target {strange[0]} is not one of the fit's "
-                f"({', '.join(self.targets)})"
+                f"({', '.join(self.target_names)})"
             )
-        chosen = [self.targets.index(name) for name in data.targets]
+        chosen = [self.target_names.index(name) for name in data.target_names]
         return np.asarray(np.moveaxis(data.y - self.follow(data)[:, chosen], 1, 0))
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,7 +103,7 @@ class Cell:
             },
             "targets_mm": {
                 name: [float(v) * 1e3 for v in spot]
-                for name, spot in zip(self.targets, self.spots, strict=True)
+                for name, spot in zip(self.target_names, self.target_positions, strict=True)
             },
             "effects": self.effects.to_list(),
         }
@@ -138,7 +148,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
         raise CalibrationError(f"{source}: base or targets are not plausible numbers")
     cell = Cell(robot_from_dict(robot, source), base, tuple(map(str, targets)), spots, effects)
     try:
-        scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.targets, cell.robot))
+        scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
         for term, value in zip(effects.terms, effects.values, strict=True):
             names = term.columns(scene).names
             if len(names) != len(value):

@@ -20,7 +20,7 @@ from minimax_cal.solvers import least_squares
 def scene_of(robot: Robot, data: Measurements, model: Model, state: State) -> Scene:
     """What effects look at, with the geometry of a state."""
     base = (state.rotation, state.origin)
-    return Scene.of(robot.with_mdh(state.mdh), data, base, state.targets, model.q)
+    return Scene.of(robot.with_mdh(state.mdh), data, base, state.target_positions, model.q)
 
 
 def fitted(terms: Sequence[Term], scene: Scene, values: Array) -> Fitted:

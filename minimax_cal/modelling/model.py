@@ -34,12 +34,12 @@ class Normal:
     """Sums of squares and their normal equations, for each target.
 
     cost: (..., k) F_i = sum_j w_ij |e_ij|^2 [m^2].
-    slope: (..., k, p) J_i' W e_i, so that the gradient of F_i is -2 slope_i.
+    gradient: (..., k, p) J_i' W e_i, so that the gradient of F_i is -2 gradient_i.
     gram: (..., k, p, p) J_i' W J_i.
     """
 
     cost: Array
-    slope: Array
+    gradient: Array
     gram: Array
 
 
@@ -125,7 +125,7 @@ class Model:
     def error(self, state: State) -> Array:
         """Measured minus predicted, in base axes: (..., k, m, 3), NaN where not measured [m]."""
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
-        point = self.displaced(state, kinematics.points(links, state.targets), slice(None))
+        point = self.displaced(state, kinematics.points(links, state.target_positions), slice(None))
         error = np.swapaxes(in_base(state, self.y) - point, -1, -2)
         error[..., ~self.seen, :] = np.nan
         return np.asarray(error)
@@ -133,7 +133,7 @@ class Model:
     def jacobian(self, state: State) -> Array:
         """Derivative of every point, in base axes, by every parameter: (..., k, m, 3, p)."""
         links = kinematics.chain(state.mdh, self.q, self.prismatic)
-        point = kinematics.points(links, state.targets)
+        point = kinematics.points(links, state.target_positions)
         every = np.ones(self.names.count, dtype=bool)
         block = Block(slice(len(self.q)), links)
         swung = self.displaced(state, point, slice(None))
@@ -152,7 +152,7 @@ class Model:
 
     def error_of(self, state: State, block: Block) -> tuple[Array, Array]:
         """Weighted errors and predicted points of one block: (..., k, 3, c) each [m]."""
-        point = kinematics.points(block.links, state.targets)
+        point = kinematics.points(block.links, state.target_positions)
         error = in_base(state, self.y[..., block.rows]) - self.displaced(state, point, block.rows)
         if not self.even:
             error *= np.sqrt(self.weight[:, None, block.rows])
@@ -202,15 +202,15 @@ class Model:
     def normal_on(self, state: State, active: Array, blocks: list[Block]) -> Normal:
         """`normal` with the chains at hand."""
         select = Columns.of(self.names, active)
-        cost, slope, gram = np.zeros((3, 1))
+        cost, gradient, gram = np.zeros((3, 1))
         for block in blocks:
             error, turned = self.rows_of(state, block, select)
             *batch, k, p, _, c = turned.shape
             flat = turned.reshape(*batch, k, p, 3 * c)
             cost = cost + np.einsum("...kcm,...kcm->...k", error, error)
-            slope = slope + (flat @ error.reshape(*batch, k, 3 * c, 1))[..., 0]
+            gradient = gradient + (flat @ error.reshape(*batch, k, 3 * c, 1))[..., 0]
             gram = gram + flat @ np.swapaxes(flat, -1, -2)
-        return Normal(np.asarray(cost), np.asarray(slope), np.asarray(gram))
+        return Normal(np.asarray(cost), np.asarray(gradient), np.asarray(gram))
 
     def weighted_rows(self, state: State, block: Block, active: Array) -> tuple[Array, Array]:
         """Weighted errors (..., k, 3, c) and transposed Jacobian (..., k, p, 3, c) of one block."""
@@ -236,7 +236,7 @@ class Model:
         The part of the variable-projection Jacobian that Kaufman leaves out [paper S, eq. 24].
         """
         names, active = self.names, self.active
-        n, k = names.joints, len(names.targets)
+        n, k = names.joints, len(names.target_names)
         linear = names.linear
         total = np.zeros(1)
         for block in blocks:
@@ -266,10 +266,10 @@ class Model:
     def values(self, state: State) -> Array:
         """(..., p) the parameters' values; base rotation entries are 0 (they are steps only)."""
         *batch, n, _ = state.mdh.shape
-        k = state.targets.shape[-2]
+        k = state.target_positions.shape[-2]
         links = np.swapaxes(state.mdh, -1, -2).reshape(*batch, 5 * n)
         base = np.concatenate([state.origin, np.zeros((*batch, 3))], axis=-1)
-        spots = state.targets.reshape(*batch, 3 * k)
+        spots = state.target_positions.reshape(*batch, 3 * k)
         more = np.broadcast_to(state.effects, (*batch, len(self.fields)))
         return np.concatenate([links, base, spots, more], axis=-1)
 
@@ -295,8 +295,8 @@ class SumOfSquares:
         off = prior.mean - self.model.values(x)
         weight = prior.weight[active]
         cost = normal.cost.sum(-1) + (prior.weight * off**2).sum(-1)
-        slope = normal.slope.sum(-2) + weight * off[..., active]
-        return cost, slope, normal.gram.sum(-3) + np.diag(weight)
+        gradient = normal.gradient.sum(-2) + weight * off[..., active]
+        return cost, gradient, normal.gram.sum(-3) + np.diag(weight)
 
     def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
         """The states with their best free lengths [paper S, eq. 18], `normal` there, and M.
@@ -306,14 +306,14 @@ class SumOfSquares:
         model = self.model
         lengths = model.active & model.names.linear
         blocks = model.blocks(x)
-        _, slope, gram = self.normal_on(x, lengths, blocks)
-        dx = np.zeros((*slope.shape[:-1], model.names.count))
-        dx[..., lengths] = solve_normal(gram, slope[..., None])[..., 0]
+        _, gradient, gram = self.normal_on(x, lengths, blocks)
+        dx = np.zeros((*gradient.shape[:-1], model.names.count))
+        dx[..., lengths] = solve_normal(gram, gradient[..., None])[..., 0]
         x = x.step(dx)
         blocks = [block.stretched(x, model) for block in blocks]
         found = self.normal_on(x, model.active, blocks)
         free = self.linear
-        nothing = np.zeros((*slope.shape[:-1], free.sum(), (~free).sum()))
+        nothing = np.zeros((*gradient.shape[:-1], free.sum(), (~free).sum()))
         return x, *found, model.coupling_on(x, blocks) if full else nothing
 
     def cost(self, x: State) -> Array:
@@ -431,7 +431,7 @@ def model_of(robot: Robot, data: Measurements) -> Model:
         usual = np.nanmedian(u95)
         least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
         weight = weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
-    names = Names(robot.joints, data.targets)
+    names = Names(robot.joints, data.target_names)
     mean = np.zeros(names.count)
     mean[names.links] = links_of(robot.mdh)
     return Model(
@@ -455,7 +455,7 @@ def pose_weights(data: Measurements, lever: float) -> Array:
     for the targets' own, with which W is nearly the plain sum.  Rows where a target is missing
     are zero.
     """
-    k = len(data.targets)
+    k = len(data.target_names)
     whole = np.asarray(data.seen.all(axis=1))
     arm = np.where(whole[:, None, None], data.y - data.y.mean(axis=1, keepdims=True), 0.0)
     inertia = (arm**2).sum((1, 2))[:, None, None] * np.eye(3) - np.swapaxes(arm, 1, 2) @ arm

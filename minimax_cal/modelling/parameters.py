@@ -27,19 +27,19 @@ class State:
     """A geometry, the base in the measurement frame, and the targets; ``...`` is a batch.
 
     mdh: (..., n, 5) [m, rad].  rotation: (..., 3, 3), origin: (..., 3) [m], pose of the base.
-    targets: (..., k, 3) in the last frame [m].
+    target_positions: (..., k, 3) in the last frame [m].
     effects: (..., e) parameters of effects beyond geometry, in their own units; (0,) without any.
     """
 
     mdh: Array
     rotation: Array
     origin: Array
-    targets: Array
+    target_positions: Array
     effects: Array = field(default_factory=lambda: np.zeros(0))
 
     def step(self, dx: Array) -> State:
         """The state moved by dx (..., p), all parameters in the order of `Names`."""
-        n, k = self.mdh.shape[-2], self.targets.shape[-2]
+        n, k = self.mdh.shape[-2], self.target_positions.shape[-2]
         batch = dx.shape[:-1]
         links = np.swapaxes(dx[..., : 5 * n].reshape(*batch, 5, n), -1, -2)
         move, turn, shift, more = np.split(dx[..., 5 * n :], (3, 6, 6 + 3 * k), axis=-1)
@@ -47,7 +47,7 @@ class State:
             mdh=self.mdh + links,
             rotation=self.rotation @ kinematics.rotation(turn),
             origin=self.origin + (self.rotation @ move[..., None])[..., 0],
-            targets=self.targets + shift.reshape(*batch, k, 3),
+            target_positions=self.target_positions + shift.reshape(*batch, k, 3),
             effects=self.effects + more,
         )
 
@@ -55,7 +55,11 @@ class State:
         """Some members of a batch."""
         some = self.effects[rows] if self.effects.ndim > 1 else self.effects
         return State(
-            self.mdh[rows], self.rotation[rows], self.origin[rows], self.targets[rows], some
+            self.mdh[rows],
+            self.rotation[rows],
+            self.origin[rows],
+            self.target_positions[rows],
+            some,
         )
 
     def put(self, rows: Array, other: State) -> State:
@@ -65,11 +69,11 @@ class State:
             mdh=self.mdh.copy(),
             rotation=self.rotation.copy(),
             origin=self.origin.copy(),
-            targets=self.targets.copy(),
+            target_positions=self.target_positions.copy(),
             effects=self.effects.copy(),
         )
         out.mdh[rows], out.rotation[rows] = other.mdh, other.rotation
-        out.origin[rows], out.targets[rows] = other.origin, other.targets
+        out.origin[rows], out.target_positions[rows] = other.origin, other.target_positions
         if self.effects.ndim > 1:
             out.effects[rows] = other.effects
         return out
@@ -80,7 +84,7 @@ class State:
             self.mdh[None],
             self.rotation[None],
             self.origin[None],
-            self.targets[None],
+            self.target_positions[None],
             self.effects[None],
         )
 
@@ -94,14 +98,14 @@ class Names:
     """The parameters of an arm with n joints seen through some targets, and of its effects."""
 
     joints: int
-    targets: tuple[str, ...]
+    target_names: tuple[str, ...]
     effects: tuple[str, ...] = ()
 
     @property
     def all(self) -> tuple[str, ...]:
         """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..., effects."""
         links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
-        spots = [f"{target}_{axis}" for target in self.targets for axis in "xyz"]
+        spots = [f"{target}_{axis}" for target in self.target_names for axis in "xyz"]
         return (*links, *BASE_NAMES, *spots, *self.effects)
 
     @property
@@ -112,7 +116,7 @@ class Names:
     @property
     def geometric(self) -> int:
         """Number of parameters that are not of effects; those come first."""
-        return 5 * self.joints + 6 + 3 * len(self.targets)
+        return 5 * self.joints + 6 + 3 * len(self.target_names)
 
     @property
     def linear(self) -> Array:

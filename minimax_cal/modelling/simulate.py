@@ -86,7 +86,7 @@ def simulate(
     data = Measurements(
         q=q,
         y=y,
-        targets=cell.targets,
+        target_names=cell.target_names,
         sliding=robot.prismatic,
         line=np.arange(poses) + 2,
         columns={"order": np.arange(poses)},

@@ -145,7 +145,10 @@ def judged(
     A pose counts if one target is seen, or all of them where the room says so.
     """
     view, enough = View(room, sight, q), np.all if room.whole else np.any
-    good, seen = np.ones(len(q), dtype=bool), np.ones((len(room.spots), len(q)), dtype=bool)
+    good, seen = (
+        np.ones(len(q), dtype=bool),
+        np.ones((len(room.target_positions), len(q)), dtype=bool),
+    )
     against = {}
     for name, holds in arm.items():
         meets = holds(view)

@@ -29,7 +29,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 
 STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the joints' ranges
 AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
-Report = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 def plan(
@@ -38,7 +38,7 @@ def plan(
     *,
     fit: Calibration | Cell | str | Path = "",
     data: Measurements | str | Path = "",
-    report: Report = silent,
+    progress: Progress = silent,
     **options: object,
 ) -> Plan:
     """Which poses of a robot to measure next.
@@ -53,10 +53,10 @@ def plan(
     if wish.criterion not in CRITERIA:
         raise OptionError(f"no criterion {wish.criterion!r}; choose {', '.join(CRITERIA)}")
     check_wishes(wish, poses, robot)
-    report("start")
+    progress("start")
     ground = ground_of(robot, fit, data, wish)
     room, sight, said = surroundings(ground.cell, wish)
-    report("candidate poses")
+    progress("candidate poses")
     found = candidates(room, sight, wish.candidates, wish.seed)
     if len(found.q) < poses:
         raise OptionError(
@@ -64,26 +64,26 @@ def plan(
             f"asked for; {rarest(found.rejected)}"
         )
     task = task_of(robot, ground, room, sight, found, wish)
-    found, first = refined(task, found, poses, report)
+    found, first = refined(task, found, poses, progress)
     aim = task.aim(found)
-    best = best_design(*aim, first, report)
-    report("comparison")
+    best = best_design(*aim, first, progress)
+    progress("comparison")
     notices = (*ground.notices, *said, *remarks(task, found, best))
     return assembled(task, found, aim, best, notices, began)
 
 
-def refined(task: Task, found: Poses, poses: int, report: Report) -> tuple[Poses, Array]:
+def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[Poses, Array]:
     """More candidates around those that tell most, and a first choice.
 
     Where poses that can be seen are rare, the best of a sequence lie inside of what is allowed;
     better ones lie at its edge.
     """
-    report("first poses")
+    progress("first poses")
     menu, criterion = task.aim(found)
     chosen = first_design(menu, criterion, poses, task.wish.seed)
     rng = np.random.default_rng(task.wish.seed)
     for step in STEPS:
-        report(f"poses within {100.0 * step:g} % around them")
+        progress(f"poses within {100.0 * step:g} % around them")
         each = -(-AROUND // poses)
         more, seen = near(task.room, task.sight, found.q[chosen], each, step, rng)
         menu, criterion = task.aim(found.join(more, seen))

@@ -69,35 +69,35 @@ class Prospect:
         k = seen.shape[1]
         jacobian, scene = motions(self.cell, data)
         told = np.repeat(seen, 3, axis=1)
-        slope = np.moveaxis(scene.slope, (3, 1, 2, 0), (0, 1, 2, 3)).reshape(len(seen), 3 * k, -1)
-        slope = slope * told[..., None]
+        swing = np.moveaxis(scene.jacobian, (3, 1, 2, 0), (0, 1, 2, 3))
+        swing = swing.reshape(len(seen), 3 * k, -1) * told[..., None]
         away = np.linalg.norm(scene.points - scene.instrument[:, None], axis=1).T
         spread = self.instrument.noise + self.instrument.per_metre * away
-        cov = self.instrument.jitter**2 * slope @ np.swapaxes(slope, 1, 2)
+        cov = self.instrument.jitter**2 * swing @ np.swapaxes(swing, 1, 2)
         cov[:, np.arange(3 * k), np.arange(3 * k)] += np.repeat(spread**2, 3, axis=1)
         scaled = jacobian.reshape(len(seen), 3 * k, -1)[..., self.active] / self.scale
         return np.asarray(np.linalg.solve(np.linalg.cholesky(cov), scaled * told[..., None]))
 
     def ahead(self, q: Array, seen: Array) -> Array:
         """`rows` of poses that may be measured.  q: (m, n)."""
-        return self.rows(still(q, self.cell.targets, self.cell.robot), seen)
+        return self.rows(still(q, self.cell.target_names, self.cell.robot), seen)
 
     def known(self, data: Measurements) -> Array:
         """(f, f) information of poses that were measured."""
-        chosen = [self.cell.targets.index(name) for name in data.targets]
-        seen = np.zeros((data.poses, len(self.cell.targets)), dtype=bool)
+        chosen = [self.cell.target_names.index(name) for name in data.target_names]
+        seen = np.zeros((data.poses, len(self.cell.target_names)), dtype=bool)
         seen[:, chosen] = data.seen
         flat = self.rows(data, seen).reshape(-1, len(self.names))
         return np.asarray(flat.T @ flat)
 
     def jacobian(self, q: Array, seen: Array) -> Array:
         """(N, f) of every coordinate that is seen at poses (m, n), without noise: no unit."""
-        moved, _ = motions(self.cell, still(q, self.cell.targets, self.cell.robot))
+        moved, _ = motions(self.cell, still(q, self.cell.target_names, self.cell.robot))
         return np.asarray(moved[seen].reshape(-1, moved.shape[-1])[:, self.active] / self.scale)
 
     def predictions(self, q: Array) -> Array:
         """B (m, 3k, f): tr(B C B') is a pose's variance of position, the mean of its targets."""
-        moved, _ = motions(self.cell, still(q, self.cell.targets, self.cell.robot))
+        moved, _ = motions(self.cell, still(q, self.cell.target_names, self.cell.robot))
         k = moved.shape[1]
         flat = moved.reshape(len(q), 3 * k, -1)[..., self.active]
         return np.asarray(flat / self.scale / np.sqrt(k))
@@ -112,13 +112,12 @@ def motions(cell: Cell, data: Measurements) -> tuple[Array, Scene]:
 
 def model_at(cell: Cell, data: Measurements) -> tuple[Model, State]:
     """The model of a cell at some poses, effects included, and its state."""
-    robot, k = cell.robot, len(cell.targets)
+    robot, k = cell.robot, len(cell.target_names)
     hidden = Measurements(
-        data.q, np.full((data.poses, k, 3), np.nan), cell.targets, robot.prismatic, data.line,
+        data.q, np.full((data.poses, k, 3), np.nan), cell.target_names, robot.prismatic, data.line,
         data.columns,
     )  # fmt: skip
-    values = np.concatenate([np.zeros(0), *cell.effects.values])
-    state = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots, values)
+    state = cell.state
     model = model_of(robot, hidden)
     if not cell.effects.terms:
         return model, state
@@ -132,11 +131,11 @@ def prospect(cell: Cell, instrument: Instrument, q: Array, seen: Array) -> Prosp
     """
     q, seen = q[:SAMPLE], seen[:SAMPLE]
     robot = cell.robot
-    model, state = model_at(cell, still(q, cell.targets, robot))
+    model, state = model_at(cell, still(q, cell.target_names, robot))
     model = replace(model, weight=seen.T.astype(float))
     names = model.names
     more = names.count - names.geometric
-    plain = model_of(robot, still(q, cell.targets, robot))
+    plain = model_of(robot, still(q, cell.target_names, robot))
     order = identify.drop_order(robot, plain.names)
     found = identify.identify(
         model,
@@ -157,7 +156,7 @@ def with_effects(cell: Cell, texts: Sequence[str], q: Array) -> Cell:
     Raises OptionError.
     """
     known = [term.label for term in cell.effects.terms]
-    scene = cell.scene(still(q[:SAMPLE], cell.targets, cell.robot))
+    scene = cell.scene(still(q[:SAMPLE], cell.target_names, cell.robot))
     terms = [term for term in terms_of(scene, texts) if term.label not in known]
     nothing = [np.zeros(len(term.columns(scene).names)) for term in terms]
     both = Fitted((*cell.effects.terms, *terms), (*cell.effects.values, *nothing))
@@ -168,7 +167,7 @@ def cell_ahead(cell: Cell, place: Array) -> Cell:
     """A cell whose measurement frame has the base's axes and its origin at a place (3,) [m]."""
     base = np.eye(4)
     base[:3, 3] = -place
-    return Cell(cell.robot, base, cell.targets, cell.spots, cell.effects)
+    return Cell(cell.robot, base, cell.target_names, cell.target_positions, cell.effects)
 
 
 def ring(count: int, radius: float = 0.1) -> Array:

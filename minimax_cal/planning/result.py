@@ -210,7 +210,7 @@ class Plan:
             "criterion": self.criterion,
             "poses": self.poses,
             "at_hand": self.at_hand,
-            "targets": list(self.cell.targets),
+            "targets": list(self.cell.target_names),
             "q": self.q.tolist(),
             "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
             "seen": self.seen.tolist(),

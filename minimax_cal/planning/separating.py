@@ -86,10 +86,10 @@ def question(
     data = with_history(data)
     fit = calibrate(robot, data, "sum", holdout=0.0, effects=(*beside, pair[0]))
     base = fit.cell.base
-    state = State(fit.robot.mdh, base[:3, :3], base[:3, 3], fit.cell.spots)
+    state = State(fit.robot.mdh, base[:3, :3], base[:3, 3], fit.cell.target_positions)
     model = model_of(robot, data)
     scene = scene_of(robot, data, model, state)
-    rows = linearised(model, state, scene.slope)
+    rows = linearised(model, state, scene.jacobian)
     fitted = fit.cell.effects
     noise = restricted(rows, rows.of(fields_of(fitted.terms, scene)))
     (other,) = terms_of(scene, pair[1:], partial(best_variant, scene, rows))

@@ -79,7 +79,7 @@ def ground_of(
             )
         for one in own:
             check_joints(robot, one)
-            strange = [name for name in one.targets if name not in cells[0].targets]
+            strange = [name for name in one.target_names if name not in cells[0].target_names]
             if strange:
                 raise OptionError(f"{one.source}: target {strange[0]} is not one of the fit's")
         if not own:
@@ -137,11 +137,13 @@ def shown_noise(
 
 def noise_of(cell: Cell, data: Measurements) -> Noise:
     """Noise of instrument and joints in the errors of a cell."""
-    chosen = [cell.targets.index(name) for name in data.targets]
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots[chosen])
+    chosen = [cell.target_names.index(name) for name in data.target_names]
+    state = State(
+        cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions[chosen]
+    )
     model = model_of(cell.robot, data)
     scene = scene_of(cell.robot, data, model, state)
-    rows = linearised(model, state, scene.slope)
+    rows = linearised(model, state, scene.jacobian)
     terms = cell.effects.terms
     fields = fields_of(terms, scene) if terms else np.zeros((0, *scene.points.shape))
     return restricted(rows, rows.of(fields))
@@ -153,8 +155,8 @@ def surroundings(cell: Cell, wish: Wishes) -> tuple[Room, Sight, tuple[str, ...]
     lower, upper, notices = limits_of(robot, wish.joints)
     radius = THICK * robot.reach() if np.isnan(wish.body) else wish.body
     room = Room(
-        robot, cell.spots, normals_of(cell.spots, wish.normals), lower, upper, radius,
-        floor=wish.floor, whole=wish.whole,
+        robot, cell.target_positions, normals_of(cell.target_positions, wish.normals), lower,
+        upper, radius, floor=wish.floor, whole=wish.whole,
     )  # fmt: skip
     if len(wish.volume):
         low, high = np.array(wish.volume, dtype=float)

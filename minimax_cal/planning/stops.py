@@ -34,7 +34,7 @@ def stops(
     header += [f"q{j + 1}_{'mm' if slides[j] else unit}" for j in range(n)]
     header += [f"approach{j + 1}" for j in range(n)]
     header += ["via"] if stopping else []
-    header += [f"expected_{target}_{axis}_mm" for target in cell.targets for axis in "xyz"]
+    header += [f"expected_{target}_{axis}_mm" for target in cell.target_names for axis in "xyz"]
     width = len(str(len(expected)))
     rows: list[list[TableCell]] = []
     for stop, pose in enumerate(visits.pose):

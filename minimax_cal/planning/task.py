@@ -75,8 +75,8 @@ class Task:
 
     def named(self, asked: Question) -> list[int]:
         """Which targets of the cell the measurements behind a question have."""
-        names = asked.site.scene.data.targets
-        return [self.ground.cell.targets.index(name) for name in names]
+        names = asked.site.scene.data.target_names
+        return [self.ground.cell.target_names.index(name) for name in names]
 
 
 def task_of(

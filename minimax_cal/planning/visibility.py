@@ -47,7 +47,7 @@ class Sight:
 class Room:
     """An arm with targets, and where it may go.
 
-    spots, normals: (k, 3) of the targets in the last frame [m], unit vectors.
+    target_positions, normals: (k, 3) of the targets in the last frame [m], unit vectors.
     lower, upper: (n,) of the joints [rad, m].  radius: of the body [m].
     floor: height of the floor above the base's origin [m].
     low, high: (3,) box in base axes in which the flange must stay, infinite where open [m].
@@ -55,7 +55,7 @@ class Room:
     """
 
     robot: Robot
-    spots: Array
+    target_positions: Array
     normals: Array
     lower: Array
     upper: Array
@@ -103,7 +103,7 @@ class View:
     @cached_property
     def points(self) -> Array:
         """(k, 3, m) the targets [m]."""
-        return kinematics.points(self.links, self.room.spots)
+        return kinematics.points(self.links, self.room.target_positions)
 
     @cached_property
     def sights(self) -> Array:

@@ -92,7 +92,9 @@ def bare_scene() -> Scene:
     robot = load_robot("irb2600")
     cell = Cell(robot, np.eye(4), ("smr1",), np.zeros((1, 3)))
     q, y = np.zeros((1, robot.joints)), np.full((1, 1, 3), np.nan)
-    return cell.scene(Measurements(q, y, cell.targets, robot.prismatic, np.ones(1, dtype=int), {}))
+    return cell.scene(
+        Measurements(q, y, cell.target_names, robot.prismatic, np.ones(1, dtype=int), {})
+    )
 
 
 def effects_list(scene: Scene | None = None) -> list[dict[str, Any]]:

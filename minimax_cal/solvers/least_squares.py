@@ -135,7 +135,7 @@ def solve(
         short, gain = damped_step(at, damp)
         square = np.einsum("bi,bij,bj->b", short, at.matrix, short)
         motion = np.sqrt(np.maximum(square, 0.0) / points)
-        move = lift(problem.linear, short, at.slope, at.gram, method)
+        move = lift(problem.linear, short, at.gradient, at.gram, method)
         trial = examine(problem, problem.step(at.x, move), method)
         sane = np.isfinite(trial.cost) & np.isfinite(motion)
         done = sane & (motion <= limits.step)
@@ -175,15 +175,16 @@ def solve(
 class Examined(Generic[X]):
     """Iterates with what a step needs.
 
-    cost: (B,).  slope: (B, p), gram: (B, p, p) over all parameters.  target, matrix: right side and
-    matrix of the reduced problem in the angles alone (Schur complement), or again over all.
-    scale: size of the matrix's columns, but not less than a part in 1e5 of what they were before
-    the lengths took theirs: what is left of a redundant angle is rounding, not to be scaled up.
+    cost: (B,).  gradient: (B, p), gram: (B, p, p) over all parameters.  target, matrix: right
+    side and matrix of the reduced problem in the angles alone (Schur complement), or again over
+    all.  scale: size of the matrix's columns, but not less than a part in 1e5 of what they were
+    before the lengths took theirs: what is left of a redundant angle is rounding, not to be scaled
+    up.
     """
 
     x: X
     cost: Array
-    slope: Array
+    gradient: Array
     gram: Array
     target: Array
     matrix: Array
@@ -191,7 +192,7 @@ class Examined(Generic[X]):
 
     def take(self, rows: Array) -> Examined[X]:
         """Some members of the batch."""
-        arrays = (self.cost, self.slope, self.gram, self.target, self.matrix, self.scale)
+        arrays = (self.cost, self.gradient, self.gram, self.target, self.matrix, self.scale)
         return Examined(self.x.take(rows), *(array[rows] for array in arrays))
 
     def put(self, rows: Array, other: Examined[X]) -> Examined[X]:
@@ -200,13 +201,17 @@ class Examined(Generic[X]):
         out = Examined(
             self.x.put(rows, chosen.x),
             self.cost.copy(),
-            self.slope.copy(),
+            self.gradient.copy(),
             self.gram.copy(),
             self.target.copy(),
             self.matrix.copy(),
             self.scale.copy(),
         )
-        out.cost[rows], out.slope[rows], out.gram[rows] = chosen.cost, chosen.slope, chosen.gram
+        out.cost[rows], out.gradient[rows], out.gram[rows] = (
+            chosen.cost,
+            chosen.gradient,
+            chosen.gram,
+        )
         out.target[rows], out.matrix[rows] = chosen.target, chosen.matrix
         out.scale[rows] = chosen.scale
         return out
@@ -215,9 +220,9 @@ class Examined(Generic[X]):
 def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
     """Cost and (reduced) normal equations; separable methods move x to its best lengths first."""
     if not method.separable:
-        cost, slope, gram = problem.normal(x)
-        return Examined(x, cost, slope, gram, slope, gram, column_size(gram))
-    x, cost, slope, gram, coupled = problem.reduced(x, full=method.full)
+        cost, gradient, gram = problem.normal(x)
+        return Examined(x, cost, gradient, gram, gradient, gram, column_size(gram))
+    x, cost, gradient, gram, coupled = problem.reduced(x, full=method.full)
     r, w = problem.linear, ~problem.linear
     lengths, mixed = gram[:, r][:, :, r], gram[:, r][:, :, w]
     # Golub and Pereyra: P J_w on top of (G+)' M; both halves need the inverse of the lengths' part
@@ -229,7 +234,7 @@ def examine(problem: Separable[X], x: X, method: Method) -> Examined[X]:
     size = np.maximum(column_size(matrix), 1e-5 * column_size(gram)[:, w])
     if method.damped:  # angles share a unit: the paper's mu I, in units of the largest column
         size = np.repeat(size.max(axis=1, keepdims=True), size.shape[1], axis=1)
-    return Examined(x, cost, slope, gram, slope[:, w], matrix, size)
+    return Examined(x, cost, gradient, gram, gradient[:, w], matrix, size)
 
 
 def column_size(gram: Array) -> Array:
@@ -237,14 +242,14 @@ def column_size(gram: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.einsum("bii->bi", gram), 1e-300)))
 
 
-def lift(linear: Array, short: Array, slope: Array, gram: Array, method: Method) -> Array:
+def lift(linear: Array, short: Array, gradient: Array, gram: Array, method: Method) -> Array:
     """A step in all parameters from one in the angles; the lengths follow to first order."""
     if not method.separable:
         return short
-    out = np.zeros(slope.shape)
+    out = np.zeros(gradient.shape)
     out[:, ~linear] = short
     mixed = gram[:, linear][:, :, ~linear]
-    pull = slope[:, linear, None] - mixed @ short[..., None]
+    pull = gradient[:, linear, None] - mixed @ short[..., None]
     out[:, linear] = solve_normal(gram[:, linear][:, :, linear], pull)[..., 0]
     return out
 

@@ -41,13 +41,13 @@ EPIGRAPH = 1e-8
 class Linear:
     """Values and first derivatives at a point.
 
-    f: (k,).  slope: (k, p) of f.  c: (l,).  normal: (l, p) of c.
+    f: (k,).  jacobian: (k, p) of f.  c: (l,).  normal: (l, p) of c.
     curvature: from weights (k,) to the weighted sum of the f_i's second derivatives (p, p), or to
     an empty matrix where only BFGS can find them.
     """
 
     f: Array
-    slope: Array
+    jacobian: Array
     c: Array
     normal: Array
     curvature: Callable[[Array], Array]
@@ -156,7 +156,7 @@ def solve(
     """Minimise max f from x.  qp: a QP solver whose answers are already verified."""
     lower, upper = problem.lower, problem.upper
     here = problem.linearise(x)
-    k, p = here.slope.shape
+    k, p = here.jacobian.shape
     mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
     exact = settings.hessian == "gauss-newton"
     quasi = Bfgs(np.eye(0), fresh=True) if exact else Bfgs.start(here, p)
@@ -167,7 +167,7 @@ def solve(
     kkt = optimality(here, mu, lam, lower, upper)
     best, lowest, idle = np.inf, np.inf, 0
     for iteration in range(1, settings.iterations + 1):
-        if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.slope))):
+        if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.jacobian))):
             status = Status.FAILED
             break
         hessian = here.curvature(np.maximum(mu, settings.floor / k)) if exact else quasi.matrix
@@ -187,7 +187,7 @@ def solve(
         if plan.relaxed:
             penalty = max(penalty, plan.penalty)
             if hopeless(here, plan, lower, upper, settings.tolerance):
-                if penalty > RELENTLESS * max(1.0, float(np.abs(here.slope).max())):
+                if penalty > RELENTLESS * max(1.0, float(np.abs(here.jacobian).max())):
                     status = Status.INFEASIBLE
                     break
                 penalty *= 10.0
@@ -253,15 +253,15 @@ def subproblem(
     answer = qp(plain)
     if answer.solved or not len(here.c):
         return read(answer, here, relaxed=False, penalty=0.0)
-    weight = max(penalty, 1e2 * float(np.abs(here.slope).max(initial=1.0)))
+    weight = max(penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
     return read(qp(elastic(plain, len(here.f), weight)), here, relaxed=True, penalty=weight)
 
 
 def epigraph(here: Linear, hessian: Array, lower: Array, upper: Array) -> Problem:
     """min 1/2 d'Hd + v with rows f - max f + f'd <= v and lower - c <= c'd <= upper - c."""
-    k, p = here.slope.shape
+    k, p = here.jacobian.shape
     rows = np.zeros((k + len(here.c), p + 1))
-    rows[:k, :p], rows[:k, p], rows[k:, :p] = here.slope, -1.0, here.normal
+    rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
     quadratic = np.zeros((p + 1, p + 1))
     quadratic[:p, :p] = hessian
     quadratic[p, p] = EPIGRAPH
@@ -289,7 +289,7 @@ def elastic(problem: Problem, k: int, weight: float) -> Problem:
 
 def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
     """Step and multipliers of a QP answer; mu is brought back to sum one exactly."""
-    k, p = here.slope.shape
+    k, p = here.jacobian.shape
     usable = answer.solved
     mu = np.maximum(answer.y[:k], 0.0) if usable else np.full(k, 1.0 / k)
     total = mu.sum()
@@ -308,7 +308,7 @@ def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
 
 def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
     """The KKT residuals at a point."""
-    stationarity = here.slope.T @ mu + here.normal.T @ lam
+    stationarity = here.jacobian.T @ mu + here.normal.T @ lam
     with np.errstate(invalid="ignore"):
         room = np.where(lam > 0, upper - here.c, here.c - lower)
         slack = np.where(lam == 0, 0.0, np.abs(lam) * np.abs(room))
@@ -346,7 +346,7 @@ def search(
         return value if np.isfinite(value) else float("inf")
 
     start = merit(here.f, here.c)
-    ahead = merit(here.f + here.slope @ plan.d, here.c + here.normal @ plan.d)
+    ahead = merit(here.f + here.jacobian @ plan.d, here.c + here.normal @ plan.d)
     decrease = start - ahead
     slack = ROUNDING * abs(start)
     trial = problem.step(x, plan.d)
@@ -356,7 +356,7 @@ def search(
         return 1.0, plan.d, trial, there
     if np.isfinite(value):
         # what the linear model missed at the full step goes into the constants
-        bent = resolve(there.f - here.slope @ plan.d, there.c - here.normal @ plan.d)
+        bent = resolve(there.f - here.jacobian @ plan.d, there.c - here.normal @ plan.d)
         if bent.usable and np.linalg.norm(bent.d) <= 2.0 * np.linalg.norm(plan.d):
             trial = problem.step(x, bent.d)
             there = problem.linearise(trial)
@@ -392,7 +392,7 @@ class Bfgs:
 
     def update(self, s: Array, before: Linear, after: Linear, mu: Array, lam: Array) -> Bfgs:
         """With the change of the Lagrangian's gradient over the step s, same multipliers."""
-        q = (after.slope - before.slope).T @ mu + (after.normal - before.normal).T @ lam
+        q = (after.jacobian - before.jacobian).T @ mu + (after.normal - before.normal).T @ lam
         length = float(s @ s)
         if length == 0.0 or not np.all(np.isfinite(q)):
             return self

@@ -66,12 +66,12 @@ def minimize_max(
         x = np.clip(x, bounds.lb, bounds.ub)
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
-    slope = derivative(function, jac, args, count)
+    jacobian = derivative(function, jac, args, count)
     first = function(x)
     if first.ndim != 1 or not np.all(np.isfinite(first)):
         raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
-    size = max(1.0, float(np.abs(slope(x)).max(initial=0.0)))
-    problem = MaxOfFunctions(function, slope, rows, size)
+    size = max(1.0, float(np.abs(jacobian(x)).max(initial=0.0)))
+    problem = MaxOfFunctions(function, jacobian, rows, size)
     solver = partial(solve_qp, name=qp, tolerance=QP_TOLERANCE) if isinstance(qp, str) else qp
 
     def tell(step: Step) -> None:
@@ -219,9 +219,11 @@ class Rows:
         """c(x): (l,)."""
         return np.concatenate([self.linear @ x, *(function(x) for function, _ in self.parts)])
 
-    def slopes(self, x: Array) -> Array:
+    def jacobians(self, x: Array) -> Array:
         """c'(x): (l, n)."""
-        return np.concatenate([self.linear, *(np.atleast_2d(slope(x)) for _, slope in self.parts)])
+        return np.concatenate(
+            [self.linear, *(np.atleast_2d(jacobian(x)) for _, jacobian in self.parts)]
+        )
 
 
 def vector(function: Callable[[Array], Any], x: Array) -> Array:
@@ -239,7 +241,7 @@ class MaxOfFunctions:
     """A problem over R^n as `solvers.minimax` wants it; functions are divided by size."""
 
     function: Function
-    slope: Function
+    jacobian: Function
     rows: Rows
     size: float
 
@@ -260,7 +262,7 @@ class MaxOfFunctions:
     def linearise(self, x: Array) -> Linear:
         """f, c and their derivatives; the curvature is left to BFGS."""
         f, c = self.evaluate(x)
-        return Linear(f, self.slope(x) / self.size, c, self.rows.slopes(x), unknown)
+        return Linear(f, self.jacobian(x) / self.size, c, self.rows.jacobians(x), unknown)
 
     def step(self, x: Array, d: Array) -> Array:
         """The point moved."""

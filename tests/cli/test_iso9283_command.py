@@ -262,7 +262,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
     fit: Path, folder: Path, robot: mc.Robot, poses: Path
 ) -> None:
     found = mc.calibrate(robot, poses)
-    names = Names(6, found.cell.targets)
+    names = Names(6, found.cell.target_names)
     units = tuple("m" if length else "rad" for length in names.linear)
     even = 0.5 * (found.covariance + found.covariance.T)
     known = Uncertainty(names, units, even, Noise(0.0, 1e-10, 0.0), 100.0, "noise")

@@ -116,7 +116,7 @@ def test_calibrate_reads_the_stops_once_they_are_measured(planned: Path, folder:
     data = mc.read_measurements(path)
     assert data.poses == 12  # not the stops on the way
     assert {"approach6", "order", "pose"} <= set(data.columns)
-    error = mc.Cell(mc.load_robot("irb2600"), base_of(data), data.targets, SPOTS).error(data)
+    error = mc.Cell(mc.load_robot("irb2600"), base_of(data), data.target_names, SPOTS).error(data)
     assert np.nanmax(np.abs(error)) < 1e-6  # the file's digits
 
 

@@ -130,11 +130,11 @@ def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Ge
     data = path_of(q, robot, 0.0)
     reach = Reach(arm_of(cell_of(robot)), data, robot.pose(q), 0.3, 1e-5, 0.1)
     still = np.zeros_like(q)
-    _, slope = examine(reach, q, reach.goal, still)
+    _, jacobian = examine(reach, q, reach.goal, still)
     for j, step in enumerate(1e-6 * np.eye(robot.joints)):
         ahead, _ = examine(reach, q + step, reach.goal, still)
         behind, _ = examine(reach, q - step, reach.goal, still)
-        assert_allclose((behind - ahead) / 2e-6, slope[:, :, j], rtol=0, atol=1e-8)
+        assert_allclose((behind - ahead) / 2e-6, jacobian[:, :, j], rtol=0, atol=1e-8)
 
 
 def test_limits_hold_and_are_reported(robot: mc.Robot, rng: np.random.Generator) -> None:
@@ -145,7 +145,7 @@ def test_limits_hold_and_are_reported(robot: mc.Robot, rng: np.random.Generator)
     assert found.q[0, 2] == robot.upper[2]
     assert np.all((found.q >= robot.lower) & (found.q <= robot.upper))
     # least squares: no allowed motion of the other joints lowers the cost
-    lever = float(np.sqrt(np.mean(np.square(cell_of(real).spots).sum(axis=1))))
+    lever = float(np.sqrt(np.mean(np.square(cell_of(real).target_positions).sum(axis=1))))
 
     def cost(at: Array) -> float:
         distance, angle = apart(robot.pose(q[:1]), real.pose(at[None]))
@@ -207,8 +207,8 @@ def test_a_redundant_arm_changes_least(rng: np.random.Generator) -> None:
     found = compensate(cell_of(real), q, seven, frame="own")
     assert set(found.outcome) == {Outcome.REACHED}
     reach = Reach(arm_of(cell_of(real)), path_of(q, real, 0.0), seven.pose(q), 0.1, 1e-5, 0.1)
-    residual, slope = examine(reach, q, reach.goal, np.zeros_like(q))
-    least = (np.linalg.pinv(slope) @ residual[..., None])[..., 0]
+    residual, jacobian = examine(reach, q, reach.goal, np.zeros_like(q))
+    least = (np.linalg.pinv(jacobian) @ residual[..., None])[..., 0]
     assert_allclose(found.q - q, least, rtol=0, atol=0.02 * np.abs(least).max())
 
 

@@ -40,7 +40,7 @@ def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:
     assert plain.verdict == "named"
     (one,) = plain.findings
     assert (one.term.effect, one.term.place) == ("backlash", "J2")
-    assert one.chance < 1e-6
+    assert one.p_value < 1e-6
     assert plain.closed > 0.7
     assert plain.closed_ci[0] <= plain.closed <= plain.closed_ci[1]
     assert one.after < one.before

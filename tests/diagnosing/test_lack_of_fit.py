@@ -19,12 +19,12 @@ def test_probabilities_are_right_on_noise() -> None:
     made = study(6e-6, 1.0, 0)
     rng, rows = np.random.default_rng(1), made.rows
     noise = Noise(0.5, 1e-10, 0.0)
-    spread = np.sqrt(1e-10 * (1.0 + 0.5 * rows.stretch))
+    spread = np.sqrt(1e-10 * (1.0 + 0.5 * rows.variance_ratio))
     hits = []
     for _ in range(60):
         drawn = type(rows)(
             spread * rng.normal(size=len(rows.error)),
-            rows.basis, rows.stretch, rows.size, rows.count, rows.turn, rows.weight,
+            rows.basis, rows.variance_ratio, rows.size, rows.count, rows.turn, rows.weight,
         )  # fmt: skip
         found = structure(made.scene, drawn, noise, np.zeros((len(rows.error), 0)))
         hits.append([trace.p < 0.1 for trace in found if "wave" not in trace.name])
@@ -55,7 +55,7 @@ def test_laws_outside_the_library_leave_a_trace(law: str) -> None:
 
 def test_what_was_fitted_is_not_found_again() -> None:
     made = study(6e-6, 1.0, 2)
-    wave = np.cos(made.scene.q[1]) * made.scene.slope[1]
+    wave = np.cos(made.scene.q[1]) * made.scene.jacobian[1]
     column = made.rows.of(wave[None])
     rest = rest_of(made.rows, Noise(0.1, 1e-10, 0.0), column)
     root = rest.root

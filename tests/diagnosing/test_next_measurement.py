@@ -95,7 +95,7 @@ def by_hand(
     def rowed(fields: Array) -> Array:  # (d, k, 3, m) -> (m, 3k, d)
         return np.moveaxis(fields.reshape(-1, 3 * k, m), (0, 1, 2), (2, 1, 0))
 
-    arm = rowed(scene.slope)
+    arm = rowed(scene.jacobian)
     cov = place.noise.variance * np.eye(3 * k) + place.noise.jitter**2 * arm @ arm.swapaxes(1, 2)
     white = np.linalg.inv(np.linalg.cholesky(cov))
     terms = [rowed(t.columns(scene).displacement(scene)) for t in (*known, other)]
@@ -133,7 +133,7 @@ def test_power_of_revisits_is_that_of_a_dense_fit(
 def test_power_now_is_what_rivals_say(
     robot: mc.Robot, sim: Simulation, wide: Site, one: Term, value: list[float], other: Term
 ) -> None:
-    rows = linearised(wide.model, wide.state, wide.scene.slope)
+    rows = linearised(wide.model, wide.state, wide.scene.jacobian)
     empty = selection.Library(wide.scene, rows, np.zeros((len(rows.error), 0)), ())
     lib, both = empty.with_terms([(one, 1.0), (other, 1.0)])
     table = selection.bench(lib, ())

@@ -13,16 +13,15 @@ from scipy.stats import binom
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.where import Where, joint_equivalent, maps, noise_of, where
-from minimax_cal.diagnosing.where.chance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.features import factors, levelled, smooth_rows
 from minimax_cal.diagnosing.where.mean_squares import lack_of_fit
 from minimax_cal.diagnosing.where.residual import orthonormal, residual_of
 from minimax_cal.diagnosing.where.rows import joint_rows
+from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.spread import scatter, shape_energy, shape_scatter
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import groups
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots import kinematics
 
@@ -39,7 +38,7 @@ class Scene:
     cell: mc.Cell
     data: mc.Measurements
     jacobian: Array
-    slope: Array
+    joint_jacobian: Array
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -47,7 +46,7 @@ class Scene:
 
     def turned(self, dq: Array) -> Array:
         """Errors (k, m, 3) of joints that are off by dq (m, n)."""
-        return np.asarray(np.einsum("jkcm,mj->kmc", self.slope, dq))
+        return np.asarray(np.einsum("jkcm,mj->kmc", self.joint_jacobian, dq))
 
     def noise(self, rng: np.random.Generator, sigma: float = SIGMA) -> Array:
         return sigma * rng.normal(size=self.shape)
@@ -68,21 +67,21 @@ class Scene:
     def where(self, error: Array, noise: float = SIGMA, fit: bool = True) -> Where:
         data, base = self.measured(error), self.cell.base
         if not fit:
-            return where(data, error, self.slope, base, noise)
+            return where(data, error, self.joint_jacobian, base, noise)
         rest = self.fitted(error)
-        return where(data, rest, self.slope, base, noise, fitted=self.jacobian)
+        return where(data, rest, self.joint_jacobian, base, noise, fitted=self.jacobian)
 
 
 def derivative(cell: mc.Cell, data: mc.Measurements) -> Array:
     """Of all points by all parameters: (k, m, 3, p)."""
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     return model_of(cell.robot, data).jacobian(state)
 
 
-def slopes(robot: mc.Robot, cell: mc.Cell, q: Array) -> Array:
+def joint_jacobians(robot: mc.Robot, cell: mc.Cell, q: Array) -> Array:
     """Motion of every target with every joint: (n, k, 3, m)."""
     links = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic)
-    lever = kinematics.points(links, cell.spots)[None] - links.before[:, None]
+    lever = kinematics.points(links, cell.target_positions)[None] - links.before[:, None]
     turn = kinematics.cross(links.z[:, None], lever)
     slide = np.broadcast_to(links.z[:, None], turn.shape)
     flat = robot.prismatic[:, None, None, None]
@@ -98,12 +97,10 @@ def scene(
     rows = np.concatenate([np.arange(poses), np.arange(again)])
     order = np.random.default_rng(4).permutation(len(rows)).astype(float)
     data = replace(made.data.take(rows), columns={"order": order})
-    state = State(
-        made.cell.robot.mdh, made.cell.base[:3, :3], made.cell.base[:3, 3], made.cell.spots
-    )
+    state = made.cell.state
     jacobian = model_of(made.cell.robot, data).jacobian(state)
-    slope = slopes(made.cell.robot, made.cell, data.q)
-    return Scene(made.cell.robot, made.cell, data, jacobian, slope)
+    joint_jacobian = joint_jacobians(made.cell.robot, made.cell, data.q)
+    return Scene(made.cell.robot, made.cell, data, jacobian, joint_jacobian)
 
 
 def by_chance(p: list[float], level: float = 0.05) -> bool:
@@ -146,7 +143,7 @@ def kernel() -> tuple[Array, Array]:
     """Features of the scene without what the fit spans: (m, 9, r), levelled and as they are."""
     made = scene()
     bare = residual_of(np.zeros(made.shape), made.jacobian, groups(made.data))
-    motion = joint_rows(made.slope, np.ones((made.data.poses, 9), dtype=bool))
+    motion = joint_rows(made.joint_jacobian, np.ones((made.data.poses, 9), dtype=bool))
     rows = bare.without_fit(smooth_rows(made.data, motion))
     return levelled(rows), rows
 
@@ -182,7 +179,7 @@ def test_jitter_of_the_joints_is_not_structure() -> None:
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
         error = made.noise(rng) + made.turned(20e-6 * rng.normal(size=(made.data.poses, 6)))
-        rest = residual_of(error, made.jacobian, groups(made.data), made.slope, SIGMA)
+        rest = residual_of(error, made.jacobian, groups(made.data), made.joint_jacobian, SIGMA)
         p.append(structure_by_pose(rest, rows))
     assert by_chance(p)
 
@@ -228,8 +225,8 @@ def test_compliance_of_a_joint_appears_at_that_joint() -> None:
     cell = fit.cell
     error = fit.errors["train"] @ cell.base[:3, :3]
     jacobian = derivative(cell, data)
-    slope = slopes(cell.robot, cell, data.q)
-    found = where(data, error, slope, cell.base, SIGMA, fitted=jacobian)
+    joint_jacobian = joint_jacobians(cell.robot, cell, data.q)
+    found = where(data, error, joint_jacobian, cell.base, SIGMA, fitted=jacobian)
     share = [gap.share for gap in found.by_joint]
     assert np.argmax(share) == 1
     assert share[1] > 0.5
@@ -329,7 +326,7 @@ def test_mean_along_the_line_of_sight() -> None:
     y = made.cell.predict(made.data.q)
     sight = np.moveaxis(y / np.linalg.norm(y, axis=-1, keepdims=True), 0, 1)
     error = 80e-6 * sight @ made.cell.base[:3, :3]
-    found = where(made.data.with_y(y), error, made.slope, made.cell.base, SIGMA)
+    found = where(made.data.with_y(y), error, made.joint_jacobian, made.cell.base, SIGMA)
     for gap in found.by_target:
         assert_allclose(gap.sight, 80e-6, rtol=1e-9)
         assert_allclose(gap.rms, 80e-6, rtol=1e-9)
@@ -368,7 +365,7 @@ def test_worst_region_is_where_the_error_is(rng: np.random.Generator) -> None:
 def test_joint_equivalent_is_the_turn(rng: np.random.Generator) -> None:
     made = scene()
     dq = 1e-3 * rng.normal(size=(made.data.poses, 6))
-    found = joint_equivalent(made.turned(dq), made.slope, 1e-7)
+    found = joint_equivalent(made.turned(dq), made.joint_jacobian, 1e-7)
     off = np.abs(found - dq)  # large only where the wrist or the arm is stretched
     assert np.median(off) < 1e-5
     assert np.quantile(off[:, :3], 0.9) < 1e-4
@@ -467,8 +464,8 @@ def test_an_uncertain_noise_makes_p_larger(rng: np.random.Generator) -> None:
     made = scene()
     error = made.noise(rng, 1.2 * SIGMA)
     data, rest = made.measured(error), made.fitted(error)
-    sure = where(data, rest, made.slope, made.cell.base, SIGMA)
-    guess = where(data, rest, made.slope, made.cell.base, SIGMA, freedom=10)
+    sure = where(data, rest, made.joint_jacobian, made.cell.base, SIGMA)
+    guess = where(data, rest, made.joint_jacobian, made.cell.base, SIGMA, freedom=10)
     assert sure.triage.shape.p < 1e-3
     assert guess.triage.shape.p > 0.05
 
@@ -527,11 +524,11 @@ def test_a_real_arm() -> None:
     data = mc.read_measurements(path)
     fit = mc.calibrate(mc.load_robot(name), data, objective="sum", holdout=0.0)
     cell = fit.cell
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     jacobian = model_of(cell.robot, data).jacobian(state)
     error = fit.errors["train"] @ cell.base[:3, :3]
-    slope = slopes(cell.robot, cell, data.q)
-    found = where(data, error, slope, cell.base, math.nan, fitted=jacobian)
+    joint_jacobian = joint_jacobians(cell.robot, cell, data.q)
+    found = where(data, error, joint_jacobian, cell.base, math.nan, fitted=jacobian)
     share = {gap.joint: gap.share for gap in found.by_joint}
     assert max(share, key=lambda joint: share[joint]) in ("J2", "J3")
     assert found.structure < 1e-12

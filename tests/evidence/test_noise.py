@@ -28,12 +28,12 @@ def test_rotated_rows_keep_every_square(quiet: Study, rng: np.random.Generator) 
 
 def test_the_variance_of_a_row_is_that_of_its_direction(quiet: Study) -> None:
     """Each rotated row has variance s^2 + t^2 |S'u|^2, and rows of a pose are uncorrelated."""
-    rows, slope = quiet.rows, quiet.scene.slope
-    arms = rows.of(slope)  # (N, n)
+    rows, jacobian = quiet.rows, quiet.scene.jacobian
+    arms = rows.of(jacobian)  # (N, n)
     pose = 7
     r = rows.weight.shape[1]
-    own = arms.reshape(-1, r, slope.shape[0])[pose]
-    expected = np.diag(rows.stretch.reshape(-1, r)[pose] * rows.size)
+    own = arms.reshape(-1, r, jacobian.shape[0])[pose]
+    expected = np.diag(rows.variance_ratio.reshape(-1, r)[pose] * rows.size)
     assert_allclose(own @ own.T, expected, rtol=0, atol=1e-9 * expected.max())
 
 
@@ -60,13 +60,17 @@ def test_noise_and_jitter_are_found(jitter: float, noise: float) -> None:
 
 def test_weights_are_the_inverse_variances(quiet: Study) -> None:
     noise = Noise(2.0, 1e-10, 0.0)
-    stretch = quiet.rows.stretch
-    assert_allclose(noise.weights(quiet.rows) * 1e-10 * (1.0 + 2.0 * stretch), 1.0, rtol=1e-12)
+    variance_ratio = quiet.rows.variance_ratio
+    assert_allclose(
+        noise.weights(quiet.rows) * 1e-10 * (1.0 + 2.0 * variance_ratio), 1.0, rtol=1e-12
+    )
 
 
 def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
     rows = quiet.rows
-    few = Rows(rows.error[:9], np.eye(9), rows.stretch[:9], rows.size, 9, rows.turn, rows.weight)
+    few = Rows(
+        rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, 9, rows.turn, rows.weight
+    )
     assert restricted(few, np.zeros((9, 0))).variance > 0.0
 
 

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.diagnose import Study, chosen, resemblance, studied
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import rivals
+from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.periodogram import lines
 from minimax_cal.fitting.calibrate import Options, fit_cell, silent
 from minimax_cal.measuring.history import with_history
@@ -68,7 +68,7 @@ def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
     for seed in (1, 2, 3):
         _, choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
         named = choice.fits[0]
-        found = rivals(choice.benches[0], named)
+        found = alternatives(choice.benches[0], named)
         names = {named.candidate.key, *(other.candidate.key for other, _, _ in found)}
         assert ("base_flex", "frame") in names
         for _, rho2, power in found:

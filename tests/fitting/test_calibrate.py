@@ -225,7 +225,7 @@ def test_one_target_says_that_minimax_is_the_sum(robot: mc.Robot) -> None:
 def test_collinear_targets_are_a_notice(robot: mc.Robot) -> None:
     made = simulate(robot, 60, 3, seed=2)
     spots = np.outer([0.0, 0.1, 0.25], [1.0, 0.0, 0.2])
-    cell = replace(made.cell, spots=spots)
+    cell = replace(made.cell, target_positions=spots)
     fit = mc.calibrate(robot, made.data.with_y(cell.predict(made.data.q)))
     assert any("nearly on a line" in note for note in fit.notices)
     assert fit.accuracy["holdout"].max_mm < 1e-6

@@ -9,7 +9,12 @@ from problems_fit import identified, solve
 import minimax_cal as mc
 from experiments.worst_point import Case, by_cones, by_cvxpy, by_sqp, linear_optimum
 from minimax_cal.fitting.certificate import PointCones, certify
-from minimax_cal.fitting.minimax_problem import Distances, Worst, measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import (
+    Distances,
+    MinimaxProblem,
+    measured_distances,
+    minimax_problem,
+)
 from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, simulate
@@ -30,8 +35,8 @@ class Setup:
     form: str = "two-sided"
 
     @property
-    def worst(self) -> Worst:
-        return worst_of(self.model, self.start, self.distances, self.form, "point")
+    def worst(self) -> MinimaxProblem:
+        return minimax_problem(self.model, self.start, self.distances, self.form, "point")
 
     @property
     def case(self) -> Case:
@@ -98,9 +103,9 @@ def test_derivatives(name: str, robot: mc.Robot, noisy: Simulation) -> None:
         e = rng.normal(size=len(problem.white))
         plus, minus = (problem.linearise(problem.step(at, sign * step * e)) for sign in (1, -1))
         # errors are told in base axes, which a step may turn: only their lengths are compared
-        slope = (plus.norms - minus.norms) / (2 * step)
+        jacobian = (plus.norms - minus.norms) / (2 * step)
         along = np.einsum("nw,nwp,p->n", rows.r, rows.J, e) / rows.norms
-        assert_allclose(along, slope, rtol=1e-6, atol=1e-6)
+        assert_allclose(along, jacobian, rtol=1e-6, atol=1e-6)
         assert_allclose(rows.C @ e, (plus.c - minus.c) / (2 * step), rtol=1e-6, atol=1e-6)
 
 
@@ -168,7 +173,7 @@ def test_the_points_that_decide_are_named(robot: mc.Robot, noisy: Simulation) ->
     assert_allclose(proof.distance, proof.value, rtol=1e-6)  # every active point is a largest one
     for target, line, size in zip(proof.target, proof.line, proof.distance, strict=True):
         pose = int(np.flatnonzero(data.line == line)[0])
-        assert_allclose(size, distance[data.targets.index(target), pose], rtol=1e-12)
+        assert_allclose(size, distance[data.target_names.index(target), pose], rtol=1e-12)
     assert np.all(np.diff(proof.multiplier) <= 0)
     assert np.count_nonzero(distance > proof.value * (1 - 1e-6)) == len(proof.line)
     text = proof.table().text()
@@ -185,7 +190,7 @@ def test_weights_count_in_the_value_and_not_in_the_distances(
     best = here.sqp()
     proof = certify(here.worst, best, here.data.line)
     weight = here.model.weight[
-        [here.data.targets.index(name) for name in proof.target],
+        [here.data.target_names.index(name) for name in proof.target],
         [int(np.flatnonzero(here.data.line == line)[0]) for line in proof.line],
     ]
     assert np.ptp(proof.distance) > 1e-5

@@ -13,7 +13,7 @@ TWELVE = "d1 theta1 d2 beta1 beta3 beta4 beta5 a6 d6 theta6 alpha6 beta6"
 
 def find(robot: mc.Robot, data: mc.Measurements, order: np.ndarray | None = None):  # type: ignore[no-untyped-def]
     model = model_of(robot, data)
-    frame = start.fit_frame(model, robot.mdh)
+    frame = start.fit_base(model, robot.mdh)
     order = identify.drop_order(robot, model.names) if order is None else order
     return model, frame.state, identify.identify(
         model,

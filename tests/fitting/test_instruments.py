@@ -93,13 +93,13 @@ def test_slopes_are_the_derivative_of_the_rows(
     count = instrument.names.count
     every = np.ones(count, dtype=bool)
     every[5 * robot.joints : 5 * robot.joints + 6] = False  # the base is the frame
-    _, slopes = instrument.rows(x, every)
+    _, jacobians = instrument.rows(x, every)
     for column, i in enumerate(np.flatnonzero(every)):
         step = np.zeros(count)
         step[i] = 1e-6
         after, before = (instrument.rows(x.step(sign * step), every)[0] for sign in (1, -1))
         # rows are measured minus predicted; central differences of 1e-6 are good to 1e-9
-        assert_allclose(slopes[column], -(after - before) / 2e-6, rtol=1e-7, atol=2e-8)
+        assert_allclose(jacobians[column], -(after - before) / 2e-6, rtol=1e-7, atol=2e-8)
 
 
 @pytest.mark.parametrize("make", [wires, sockets])
@@ -111,11 +111,11 @@ def test_rows_of_a_batch_are_those_of_its_members(
     some[30:36] = False
     batch = x.repeat(3)
     batch = batch.step(1e-2 * rng.normal(size=(3, instrument.names.count)) * some)
-    errors, slopes = instrument.rows(batch, some)
+    errors, jacobians = instrument.rows(batch, some)
     for i in range(3):
-        error, slope = instrument.rows(batch.take(np.array(i)), some)
+        error, jacobian = instrument.rows(batch.take(np.array(i)), some)
         assert_allclose(errors[i], error, rtol=0, atol=1e-13)
-        assert_allclose(slopes[i], slope, rtol=0, atol=1e-13)
+        assert_allclose(jacobians[i], jacobian, rtol=0, atol=1e-13)
 
 
 def test_the_barycentre_is_the_best_place_of_a_socket(

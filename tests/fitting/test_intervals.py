@@ -141,5 +141,5 @@ def test_chance_of_a_larger_error_is_free_of_the_law(rng: np.random.Generator) -
     runs, n = 20000, 14
     for sample in (rng.standard_cauchy((runs, n + 1)), rng.uniform(size=(runs, n + 1))):
         share = float(np.mean(sample[:, n] > sample[:, :n].max(axis=1)))
-        chance = chance_of_larger(n)
-        assert abs(share - chance) < 4.0 * np.sqrt(chance / runs)
+        p_value = chance_of_larger(n)
+        assert abs(share - p_value) < 4.0 * np.sqrt(p_value / runs)

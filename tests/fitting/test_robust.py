@@ -22,7 +22,7 @@ from scipy import integrate, optimize, stats
 import minimax_cal as mc
 from minimax_cal import solvers
 from minimax_cal.fitting import robust
-from minimax_cal.fitting.minimax_problem import measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.robust import LOSSES, distances, moments, robust_fit
 from minimax_cal.fitting.suspects import unlikely
 from minimax_cal.fitting.trimmed import Weighted
@@ -50,7 +50,7 @@ def test_weight_and_slope_are_derivatives_of_the_loss(name: str) -> None:
     weight = (RHO[name](u + step) - RHO[name](u - step)) / (2.0 * step) / u
     assert_allclose(LOSSES[name].weight(u), weight, atol=1e-8)
     psi = LOSSES[name].weight(u + step) * (u + step) - LOSSES[name].weight(u - step) * (u - step)
-    assert_allclose(LOSSES[name].slope(u), psi / (2.0 * step), atol=1e-8)
+    assert_allclose(LOSSES[name].derivative(u), psi / (2.0 * step), atol=1e-8)
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -65,14 +65,14 @@ def test_losses_are_95_percent_efficient_in_three_dimensions(name: str) -> None:
             for part in parts
         )
 
-    def slope(r: float) -> Array:
+    def derivative(r: float) -> Array:
         u = np.array(r / loss.tuning)
-        return (loss.slope(u) + 2.0 * loss.weight(u)) / 3.0
+        return (loss.derivative(u) + 2.0 * loss.weight(u)) / 3.0
 
     def square(r: float) -> Array:
         return (r * loss.weight(np.array(r / loss.tuning))) ** 2 / 3.0
 
-    assert mean(slope) ** 2 / mean(square) == pytest.approx(0.95, abs=1e-4)
+    assert mean(derivative) ** 2 / mean(square) == pytest.approx(0.95, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -80,8 +80,8 @@ def test_moments_are_those_of_the_chi_distribution(robot: mc.Robot, name: str) -
     """At the truth itself the distances are sigma chi_3; 15000 of them leave 2 % of chance."""
     case = shifted(robot, 0.0, 0.0, poses=5000, seed=3)
     state = case.without()
-    slope, square = moments(case.model, state, name, NOISE)
-    assert_allclose(slope**2 * NOISE**2 / square, 0.95, rtol=0.02)
+    derivative, square = moments(case.model, state, name, NOISE)
+    assert_allclose(derivative**2 * NOISE**2 / square, 0.95, rtol=0.02)
     one, plain = moments(case.model, state, "square", np.nan)
     assert_allclose(one, 1.0)
     assert_allclose(plain, case.model.cost(state) / (3.0 * case.model.counts), rtol=1e-12)
@@ -103,7 +103,7 @@ def small(robot: mc.Robot) -> Case:
     weight = np.zeros(names.count)
     weight[names.index("a2")] = (NOISE / 1e-5) ** 2
     model = case.model.only(active).with_prior(Prior(case.model.prior.mean, weight))
-    truth = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    truth = cell.state
     model, found = FITTER(model, truth)
     return replace(case, model=model, found=found)
 
@@ -344,7 +344,7 @@ def test_what_is_set_aside_is_a_fixed_point(robot: mc.Robot) -> None:
     found = case.robust(trim=0.2)
     last = Weighted(FITTER, found.plain, found.fit, found.weights, np.ones(3, dtype=bool))
     judged = last.scores()
-    far = unlikely(last.spread(judged).chance(judged))
+    far = unlikely(last.spread(judged).p_value(judged))
     assert (far == (found.weights == 0.0)).all()
     again = case.robust(trim=0.2)
     assert_allclose(again.weights, found.weights, rtol=0)
@@ -355,7 +355,7 @@ def test_points_that_stand_out_but_stay_in_are_told() -> None:
     """A real arm with an effect that geometry lacks: heavy tails, or outliers?  It depends."""
     paths = shared("fanuc_r2000")
     robot, data = mc.load_robot(paths[0]), mc.read_measurements(paths[1])
-    nothing = np.zeros((data.poses, len(data.targets)), dtype=bool)
+    nothing = np.zeros((data.poses, len(data.target_names)), dtype=bool)
     case = case_of(robot, simulate(robot, 1, 1), data, nothing)
     for share in (0.02, 0.05, 0.1, 0.2):
         found = case.robust(trim=share)
@@ -377,7 +377,7 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot: mc.Robot
         (deleted.model.only(found.model.active), state_of(deleted.found)),
     ):
         assert_allclose(model.counts, (found.weights > 0.0).sum(axis=1))
-        problem = worst_of(model, state, measured_distances(case.data.with_y(y)), "off", per)
+        problem = minimax_problem(model, state, measured_distances(case.data.with_y(y)), "off", per)
         best = solvers.minimax.solve(problem, state, lambda qp: solve_qp(qp, "daqp"), Sqp())
         assert best.status == "converged"
         worst.append(best.f.max() * problem.size)
@@ -437,7 +437,9 @@ def test_rounds_that_do_not_settle_are_told(
 def test_a_plain_fit_that_diverged_stays_what_it_is(robot: mc.Robot) -> None:
     case = shifted(robot, 0.1, 1e-3, poses=20)
     state = state_of(case.found)
-    lost = replace(state, origin=state.origin * np.nan, targets=state.targets * np.nan)
+    lost = replace(
+        state, origin=state.origin * np.nan, target_positions=state.target_positions * np.nan
+    )
     failed = replace(case.found, x=lost.batch(), cost=np.array([np.nan]), status=(Status.FAILED,))
     found = replace(case, found=failed).robust("tukey", 0.1)
     assert found.fit.status == ("failed",)

@@ -57,7 +57,7 @@ def test_covariance_is_that_of_the_whole_hat_matrix(robot: mc.Robot) -> None:
     error = (model.error(state) * np.sqrt(quality)[..., None]).reshape(-1, 3)
     blocks = np.stack([whole[i : i + 3, i : i + 3] for i in range(0, len(rows), 3)])
     expected = np.einsum("na,nab,nb->n", error, np.linalg.inv(blocks), error)
-    full = found.freedom.reshape(-1) == 3
+    full = found.directions.reshape(-1) == 3
     assert full.mean() > 0.9
     assert_allclose(found.square.reshape(-1)[full], expected[full], rtol=1e-7)
 
@@ -84,11 +84,11 @@ def test_directions_that_the_fit_follows_are_not_judged(robot: mc.Robot) -> None
     model = replace(case.model, weight=weight)
     state = state_of(fit(model, state_of(case.found))[1])
     found = scores(model, state, model.seen.astype(float))
-    assert found.freedom[2, 0] == 0
-    assert (found.freedom[:2] == 3).all()
-    chance = Spread(NOISE, 100.0).chance(found)
-    assert chance[2, 0] == 1.0
-    assert (chance[2, 1:] == 1.0).all()  # never measured
+    assert found.directions[2, 0] == 0
+    assert (found.directions[:2] == 3).all()
+    p_value = Spread(NOISE, 100.0).p_value(found)
+    assert p_value[2, 0] == 1.0
+    assert (p_value[2, 1:] == 1.0).all()  # never measured
 
 
 # ---- chances ---------------------------------------------------------------------------------
@@ -100,14 +100,14 @@ def clean(robot: mc.Robot) -> list[tuple[Scores, float]]:
     out = []
     for seed in range(40):
         case = shifted(robot, 0.0, 0.0, poses=25, seed=seed)
-        spare = 3.0 * case.model.counts.sum() - case.model.active.sum()
-        out.append((plain_scores(case), float(spare)))
+        dof = 3.0 * case.model.counts.sum() - case.model.active.sum()
+        out.append((plain_scores(case), float(dof)))
     return out
 
 
 def test_scores_of_clean_points_are_chi_square(clean: list[tuple[Scores, float]]) -> None:
     """Kolmogorov and Smirnov over 3000 points of fits with 33 parameters from 225 coordinates."""
-    full = np.concatenate([found.square[found.freedom == 3] for found, _ in clean])
+    full = np.concatenate([found.square[found.directions == 3] for found, _ in clean])
     assert len(full) > 2900
     assert stats.kstest(full / NOISE**2, stats.chi2(3).cdf).pvalue > 1e-3
 
@@ -115,16 +115,16 @@ def test_scores_of_clean_points_are_chi_square(clean: list[tuple[Scores, float]]
 def test_clean_points_are_rarely_listed(clean: list[tuple[Scores, float]]) -> None:
     """At most `LEVEL` of the data sets have suspects; 4 of 40 would be a chance of 1 in 2000."""
     lists, low, count = 0, 0, 0
-    for found, spare in clean:
-        chance = spread_of(found, spare).chance(found)
-        lists += bool(unlikely(chance).any())
-        low, count = low + int((chance < 0.05).sum()), count + chance.size
+    for found, dof in clean:
+        p_value = spread_of(found, dof).p_value(found)
+        lists += bool(unlikely(p_value).any())
+        low, count = low + int((p_value < 0.05).sum()), count + p_value.size
     assert stats.binom.sf(lists - 1, len(clean), LEVEL) > 1e-3
     assert abs(low / count - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / count)
 
 
 def test_scale_is_that_of_the_noise(clean: list[tuple[Scores, float]]) -> None:
-    scale = [spread_of(found, spare).scale for found, spare in clean]
+    scale = [spread_of(found, dof).scale for found, dof in clean]
     assert_allclose(np.mean(scale), NOISE, rtol=0.02)
 
 
@@ -143,8 +143,8 @@ def test_scale_and_tails_are_found_beside_outliers(rng: np.random.Generator, tai
         found = Scores(mixed, np.full(mixed.shape, 3))
         spread = spread_of(found, 5000.0)
         assert_allclose(spread.scale, NOISE, rtol=0.1)
-        assert (spread.freedom < 10.0) == (tail < 10.0)
-        listed = unlikely(spread.chance(found))
+        assert (spread.dof < 10.0) == (tail < 10.0)
+        listed = unlikely(spread.p_value(found))
         # not so where the tails are heavy: a hundred sigma are then an ordinary point's right
         if tail > 4.0:
             assert listed[wrong].all()
@@ -155,8 +155,8 @@ def test_heavy_tails_make_the_list_short(rng: np.random.Generator) -> None:
     """What a Gaussian would call unlikely is what a model that lacks an effect leaves."""
     found = Scores(drawn(rng, 1000, 3.0), np.full((1, 1000), 3))
     gaussian = Spread(spread_of(found, 3000.0).scale, 3000.0)
-    assert unlikely(gaussian.chance(found)).sum() > 30
-    assert unlikely(spread_of(found, 3000.0).chance(found)).sum() <= 3
+    assert unlikely(gaussian.p_value(found)).sum() > 30
+    assert unlikely(spread_of(found, 3000.0).p_value(found)).sum() <= 3
 
 
 def test_points_without_error_are_no_suspects(robot: mc.Robot) -> None:
@@ -164,7 +164,7 @@ def test_points_without_error_are_no_suspects(robot: mc.Robot) -> None:
     exact = Truth(compliance=0.0, noise=0.0, noise_per_metre=0.0)
     assert not shifted(robot, 0.0, 0.0, truth=exact).robust("tukey").suspects
     nothing = Scores(np.zeros((1, 4)), np.zeros((1, 4), dtype=int))
-    assert (spread_of(nothing, 1.0).chance(nothing) == 1.0).all()
+    assert (spread_of(nothing, 1.0).p_value(nothing) == 1.0).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -214,11 +214,11 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
         assert {s.target for s in by_pose[int(pose)]} == {"smr1", "smr2", "smr3"}
         assert all(s.together for s in by_pose[int(pose)])
     for one in found.suspects:
-        target = case.data.targets.index(one.target)
+        target = case.data.target_names.index(one.target)
         assert one.line == case.data.line[one.pose]
         assert one.distance == pytest.approx(distance[target, one.pose])
         assert one.score == pytest.approx(one.distance / found.scale, rel=0.3)
-    order = [one.chance for one in found.suspects]
+    order = [one.p_value for one in found.suspects]
     assert order == sorted(order)
     assert "diagnose" in found.notices[0]
     assert "real effect" in found.notices[0]
@@ -241,7 +241,7 @@ def test_the_list_is_the_least_likely_first(robot: mc.Robot) -> None:
     found = plain_scores(case)
     state = state_of(case.found)
     listed = suspects_of(case.model, state, found, Spread(NOISE, 1e4), case.data.line)
-    assert [one.chance for one in listed] == sorted(one.chance for one in listed)
+    assert [one.p_value for one in listed] == sorted(one.p_value for one in listed)
 
 
 def test_lines_are_those_of_the_file(robot: mc.Robot) -> None:
@@ -262,7 +262,7 @@ def test_the_study_moves_the_share_it_says(robot: mc.Robot) -> None:
     assert len(wrong) == np.count_nonzero(off) == 6
     assert_allclose(off[off > 0.0], 0.7e-3, rtol=1e-9)
     assert wrong == {
-        (data.line[row], data.targets[column]) for row, column in np.argwhere(off > 0.0)
+        (data.line[row], data.target_names[column]) for row, column in np.argwhere(off > 0.0)
     }
 
 

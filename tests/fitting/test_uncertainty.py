@@ -72,10 +72,10 @@ def predictor(robot: mc.Robot, found: Fit, targets: tuple[str, ...], q: Array): 
 
 def dense(robot: mc.Robot, data: Measurements, found: Fit) -> tuple[Array, Array, Array]:
     """Slopes J (m, 3k, p) and arms S (m, 3k, n) by differences, errors (m, 3k), as measured."""
-    m, k = data.poses, len(data.targets)
-    points = predictor(robot, found, data.targets, data.q)
+    m, k = data.poses, len(data.target_names)
+    points = predictor(robot, found, data.target_names, data.q)
     J = differences(points, found.names.count)[..., found.identification.active]
-    cell = Cell.of(robot, found.state, data.targets)
+    cell = Cell.of(robot, found.state, data.target_names)
     S = differences(lambda turn: cell.predict(data.q + turn), robot.joints)
     error = data.y - cell.predict(data.q)
     return J.reshape(m, 3 * k, -1), S.reshape(m, 3 * k, -1), error.reshape(m, 3 * k)
@@ -85,8 +85,8 @@ def sandwich(J: Array, A: Array, V: Array, prior: Array) -> Array:
     """H^-1 F H^-1, pose by pose from dense matrices.  A, V: (m, 3k, 3k)."""
     turned = np.swapaxes(J, 1, 2)
     bread = np.linalg.inv((turned @ A @ J).sum(axis=0) + np.diag(prior))
-    filling = (turned @ A @ V @ A @ J).sum(axis=0)
-    return np.asarray(bread @ filling @ bread)
+    meat = (turned @ A @ V @ A @ J).sum(axis=0)
+    return np.asarray(bread @ meat @ bread)
 
 
 def alike(found: Array, expected: Array, tolerance: float) -> None:
@@ -188,10 +188,10 @@ def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(
             fit.names.all
             and (
                 np.concatenate(
-                    [links_of(one.state.mdh), np.zeros(6), one.state.targets.reshape(-1)]
+                    [links_of(one.state.mdh), np.zeros(6), one.state.target_positions.reshape(-1)]
                 )
                 - np.concatenate(
-                    [links_of(fit.state.mdh), np.zeros(6), fit.state.targets.reshape(-1)]
+                    [links_of(fit.state.mdh), np.zeros(6), fit.state.target_positions.reshape(-1)]
                 )
             )[fit.identification.active]
         )
@@ -295,7 +295,7 @@ def test_jitter_raises_sigma_as_it_raises_the_scatter(
 def step_between(start: State, end: State) -> Array:
     turn = Rotation.from_matrix(start.rotation.T @ end.rotation).as_rotvec()
     move = start.rotation.T @ (end.origin - start.origin)
-    spots = (end.targets - start.targets).reshape(-1)
+    spots = (end.target_positions - start.target_positions).reshape(-1)
     return np.concatenate([links_of(end.mdh - start.mdh), move, turn, spots])
 
 
@@ -382,7 +382,7 @@ def test_position_covariance_is_that_of_the_prediction(
     robot: mc.Robot, noisy: Simulation, fit: Fit, anywhere: Array
 ) -> None:
     """Central differences of the predicted points by all parameters, in both frames."""
-    known, targets = fit.uncertainty, noisy.data.targets
+    known, targets = fit.uncertainty, noisy.data.target_names
     cell = Cell.of(robot, fit.state, targets)
     active = known.active
     C = known.covariance[np.ix_(active, active)]
@@ -419,9 +419,9 @@ def test_the_centroid_is_the_mean_of_the_factors(
     robot: mc.Robot, noisy: Simulation, fit: Fit, anywhere: Array
 ) -> None:
     known = fit.uncertainty
-    cell = Cell.of(robot, fit.state, noisy.data.targets)
+    cell = Cell.of(robot, fit.state, noisy.data.target_names)
     factor = position_factor(cell, known, anywhere, "measurement").mean(axis=1)
-    points = predictor(robot, fit, noisy.data.targets, anywhere)
+    points = predictor(robot, fit, noisy.data.target_names, anywhere)
     J = differences(lambda step: points(step).mean(axis=1), fit.names.count)[..., known.active]
     C = known.covariance[np.ix_(known.active, known.active)]
     expected = J @ C @ np.swapaxes(J, -1, -2)
@@ -572,7 +572,7 @@ def test_the_equivalent_truth_is_the_arm() -> None:
     true = coverage.reference(arm, case)
     robot = mc.load_robot(case.robot)
     q = random_poses(robot, 50, np.random.default_rng(3))
-    same = Cell.of(robot, true.state, arm.targets)
+    same = Cell.of(robot, true.state, arm.target_names)
     assert_allclose(same.predict(q), arm.predict(q), rtol=0, atol=1e-9)
     known = true.identification.active
     nominal = coverage.along(true.nominal.rotation, replace(true.state, mdh=robot.mdh))
@@ -585,7 +585,7 @@ def test_the_equivalent_truth_is_the_arm() -> None:
 def test_values_of_the_study_are_those_of_the_result(robot: mc.Robot, noisy: Simulation) -> None:
     fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
     cell = fit.cell
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     value = coverage.along(fit.nominal.base[:3, :3], state)
     names = fit.uncertainty.names.all
     for p in fit.parameters:

@@ -98,7 +98,7 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: 
     found = bootstrap(fit, 8, seed=1)
     draws = draw(groups(data), 8, np.random.default_rng(1))
     cell = fit.cell
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     sigma = fit.uncertainty.sigma[found.place]
     ours, theirs = found.change / sigma, np.zeros(found.change.shape)
     for number in range(8):
@@ -182,10 +182,10 @@ def test_positions_are_those_of_the_replicates(
 def whole(robot: mc.Robot, found: Bootstrap, number: int) -> Cell:
     """The cell of one replicate."""
     cell = found.fit.cell
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     step = np.zeros(len(found.fit.uncertainty.names.all))
     step[found.place] = found.change[number]
-    return Cell.of(robot, state.step(step), cell.targets)
+    return Cell.of(robot, state.step(step), cell.target_names)
 
 
 def test_poses_left_out_judge_a_replicate(
@@ -259,7 +259,7 @@ def test_table_and_json(found: Bootstrap) -> None:
 
 def test_progress_is_told(fit: mc.Calibration) -> None:
     said: list[str] = []
-    bootstrap(fit, 30, report=said.append)
+    bootstrap(fit, 30, progress=said.append)
     assert said == ["replicate 1 of 30", "replicate 26 of 30"]
 
 
@@ -282,6 +282,6 @@ def test_wrong_choices_are_refused(
 
 def test_between_undoes_a_step(rng: np.random.Generator, fit: mc.Calibration) -> None:
     cell = fit.cell
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     step: Array = 1e-3 * rng.normal(size=len(fit.uncertainty.names.all))
     assert_allclose(between(state, state.step(step)), step, rtol=0, atol=1e-14)

@@ -445,7 +445,7 @@ def test_a_tcp_that_is_none_is_refused(cell: mc.Cell, tcp: object, words: str) -
 def test_wrong_targets_and_joints_are_refused(cell: mc.Cell) -> None:
     data = seen_at(cell, level_poses(cell.robot, 4))
     with pytest.raises(DataError, match="target smr7"):
-        of(cell, replace(data, targets=("smr1", "smr2", "smr7")))
+        of(cell, replace(data, target_names=("smr1", "smr2", "smr7")))
     with pytest.raises(DataError, match="5 joint columns"):
         of(cell, replace(data, q=data.q[:, :5], sliding=data.sliding[:5]))
     with pytest.raises(DataError, match="three of them"):

@@ -65,7 +65,7 @@ def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
 ) -> None:
     """Parameters drawn from the covariance, and the exact kinematics of each such arm."""
     fit = mc.calibrate(robot, noisy.data, "sum")
-    names, draws = Names(6, fit.cell.targets), 20_000
+    names, draws = Names(6, fit.cell.target_names), 20_000
     units = tuple("m" if length else "rad" for length in names.linear)
     known = Uncertainty(names, units, fit.covariance, Noise(0.0, 1e-10, 0.0), 100.0, "noise")
     with pytest.raises(OptionError, match="no frame 'table'"):
@@ -76,12 +76,12 @@ def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
     assert radius.shape == (4,)
     assert np.abs(radius / base - 1.0).max() > 0.05  # the base's pose is part of the first alone
     state = State(
-        fit.robot.mdh, fit.cell.base[:3, :3], fit.cell.base[:3, 3], fit.cell.spots
+        fit.robot.mdh, fit.cell.base[:3, :3], fit.cell.base[:3, 3], fit.cell.target_positions
     ).repeat(draws)
     moved = state.step(np.random.default_rng(3).normal(size=(draws, known.root.shape[1]))
                        @ known.root.T)  # fmt: skip
     flange = forward(moved.mdh, np.broadcast_to(q * robot.sign, (draws, *q.shape)), robot.prismatic)
-    centre = moved.targets.mean(axis=1)[:, None, :, None]
+    centre = moved.target_positions.mean(axis=1)[:, None, :, None]
     there = flange[..., :3, 3] + (flange[..., :3, :3] @ centre)[..., 0]
     seen = there @ np.swapaxes(moved.rotation, 1, 2) + moved.origin[:, None]
     off = np.linalg.norm(seen - fit.predict(q).mean(axis=1), axis=-1)

@@ -13,7 +13,7 @@ import minimax_cal as mc
 from minimax_cal.cli import main
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.certificate import PointCones
-from minimax_cal.fitting.minimax_problem import Worst
+from minimax_cal.fitting.minimax_problem import MinimaxProblem
 from minimax_cal.judging.tradeoff import (
     Blend,
     Tradeoff,
@@ -41,7 +41,7 @@ def test_the_ends_are_sum_and_point(found: Tradeoff, robot: mc.Robot, noisy: Sim
         assert choice.objective == objective
         assert choice.train == fit.accuracy["train"]
         assert choice.holdout == fit.accuracy["holdout"]
-        assert_allclose(choice.cell.spots, fit.cell.spots, rtol=0, atol=1e-15)
+        assert_allclose(choice.cell.target_positions, fit.cell.target_positions, rtol=0, atol=1e-15)
 
 
 def test_the_rms_grows_and_the_largest_error_falls(found: Tradeoff) -> None:
@@ -70,7 +70,7 @@ def small(robot: mc.Robot, share_of_missing: float = 0.0, **columns: np.ndarray)
     )
 
 
-def cvxpy_blend(worst: Worst, x: State, share: float) -> float:
+def cvxpy_blend(worst: MinimaxProblem, x: State, share: float) -> float:
     """The same compromise by a sequence of cone programs with cvxpy."""
     cones = PointCones.of(worst)
     value = np.inf
@@ -110,7 +110,7 @@ def test_derivatives_of_a_blend(robot: mc.Robot, noisy: Simulation) -> None:
     assert_allclose(here.f, f, rtol=1e-12)
     assert_allclose(here.c, c, rtol=1e-12)
     plus, minus = (blend.evaluate(blend.step(at, sign * step * e))[0] for sign in (1, -1))
-    assert_allclose(here.slope @ e, (plus - minus) / (2 * step), rtol=1e-6, atol=1e-6)
+    assert_allclose(here.jacobian @ e, (plus - minus) / (2 * step), rtol=1e-6, atol=1e-6)
     weights = rng.uniform(size=len(f))
     n = len(f)
     mix = (1 - 0.4) * np.eye(n) + 0.4 / n

@@ -84,7 +84,7 @@ def test_a_target_seen_too_rarely_is_left_out(robot: mc.Robot, noisy: Simulation
         y = noisy.data.y.copy()
         y[count:, 2] = np.nan
         fit = mc.calibrate(robot, noisy.data.with_y(y))
-        assert fit.cell.targets == ("smr1", "smr2")
+        assert fit.cell.target_names == ("smr1", "smr2")
         assert any("left out: smr3" in note for note in fit.notices)
         assert fit.json()
 

@@ -130,7 +130,7 @@ def test_a_fit_names_the_targets_of_an_even_triangle(robot: mc.Robot) -> None:
     sim = simulate(robot, 100, 3, seed=8, truth=RIGID)
     angle = 2.0 * np.pi * np.arange(3) / 3
     spots = np.stack([np.cos(angle), np.sin(angle) * 1.4, 3.0 + 0.0 * angle], axis=1) * 0.1
-    cell = replace(sim.cell, spots=spots)  # two sides alike
+    cell = replace(sim.cell, target_positions=spots)  # two sides alike
     rng = np.random.default_rng(0)
     good = sim.data.with_y(cell.predict(sim.data.q) + 17.5e-6 * rng.normal(size=sim.data.y.shape))
     y = good.y.copy()

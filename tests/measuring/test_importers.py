@@ -295,7 +295,7 @@ def test_robodk(truth: mc.Measurements, write: Write, tmp_path: Path) -> None:
     assert "taken as measured points" in found.data.notices[0]
     calibrates(found, tmp_path)
     three = import_files([write("val.csv", table(robodk_rows(truth, 3), ROBODK))])
-    assert three.data.targets == ("smr1", "smr2", "smr3")
+    assert three.data.target_names == ("smr1", "smr2", "smr3")
     assert_allclose(three.data.y[:POSES, 0], truth.y[:, 0], atol=2e-9)
     calibrates(three, tmp_path)
 

@@ -22,7 +22,7 @@ def test_units_stand_in_the_header(tmp_path: Path) -> None:
     assert_allclose(data.q, [[np.pi / 2, 0.1]], rtol=1e-15)
     assert_allclose(data.y, [[[1.0, 0.002, 0.003]]], rtol=1e-15)
     assert_array_equal(data.sliding, [False, True])
-    assert data.targets == ("smr2",)
+    assert data.target_names == ("smr2",)
     assert_allclose(data.columns["u95"], [5e-5])
 
 

@@ -115,11 +115,13 @@ def test_columns_are_the_derivative_of_the_points(which: str) -> None:
     scene = SCENES[which]
     for term in all_terms(scene):
         field = term.columns(scene).displacement(scene)
-        for i, slope in enumerate(field):
-            step = 1e-5 / np.abs(slope).max() * np.eye(len(field))[i]  # moves by 10 um at most
+        for i, jacobian in enumerate(field):
+            step = 1e-5 / np.abs(jacobian).max() * np.eye(len(field))[i]  # moves by 10 um at most
             up, down = (Fitted((term,), (sign * step,)).points(scene) for sign in (1.0, -1.0))
             change = (up - down) / (2.0 * step[i])
-            assert_allclose(change, slope, rtol=0, atol=1e-5 * np.abs(slope).max(), err_msg=term)
+            assert_allclose(
+                change, jacobian, rtol=0, atol=1e-5 * np.abs(jacobian).max(), err_msg=term
+            )
 
 
 @pytest.mark.parametrize("which", SCENES)
@@ -172,7 +174,7 @@ def potential(scene: Scene, q: Array) -> Array:
         pose = pose @ link
         centre = pose[:, :3, :3] @ scene.masses[1][i] + pose[:, :3, 3]
         energy = energy + scene.masses[0][i] * G * (centre @ robot.up)
-    tip = pose[:, :3, :3] @ scene.spots.mean(axis=0) + pose[:, :3, 3]
+    tip = pose[:, :3, :3] @ scene.target_positions.mean(axis=0) + pose[:, :3, 3]
     return np.asarray(energy + payload * G * (tip @ robot.up))
 
 
@@ -182,8 +184,8 @@ def test_torque_is_minus_the_slope_of_the_potential_energy(which: str) -> None:
     step = 1e-30j
     for j in range(6):
         moved = scene.q.T + step * np.eye(6)[j]
-        slope = potential(scene, moved).imag / 1e-30
-        assert_allclose(scene.gravity[j], -slope, rtol=0, atol=EXACT * 1e4)
+        jacobian = potential(scene, moved).imag / 1e-30
+        assert_allclose(scene.gravity[j], -jacobian, rtol=0, atol=EXACT * 1e4)
 
 
 def test_torque_is_the_one_of_pinocchio() -> None:
@@ -289,10 +291,10 @@ def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
     sag = -columns("link_bending", "L1", scene).displacement(scene)[0, 0, :, 0]
     expected = force * length**3 / 3.0 + force * beyond * length**2 / 2.0
     assert_allclose(sag, [0.0, 0.0, expected], rtol=EXACT, atol=1e-12)
-    slope = force * length**2 / 2.0 + force * beyond * length
+    jacobian = force * length**2 / 2.0 + force * beyond * length
     farther = replace(scene, points=scene.points + np.array([[0.25], [0.0], [0.0]]))
     found = -columns("link_bending", "L1", farther).displacement(farther)[0, 0, 2, 0]
-    assert_allclose(found, expected + 0.25 * slope, rtol=EXACT)
+    assert_allclose(found, expected + 0.25 * jacobian, rtol=EXACT)
 
 
 def test_links_that_carry_nothing_do_not_bend() -> None:
@@ -347,8 +349,8 @@ def test_spring_pulls_as_the_length_of_a_real_spring_has_it() -> None:
     found = columns("gravity_compensator", "J2", level, zero=zero, eye=eye, rest=rest)
     b = lean - zero + 1e-30j
     length = np.sqrt(1.0 + eye**2 - 2.0 * eye * np.cos(b))
-    slope = (0.5 * (length - rest) ** 2).imag / 1e-30
-    assert_allclose(found.turn[0, 1], slope / eye, rtol=0, atol=EXACT)
+    jacobian = (0.5 * (length - rest) ** 2).imag / 1e-30
+    assert_allclose(found.turn[0, 1], jacobian / eye, rtol=0, atol=EXACT)
 
 
 # ---------------------------------------------------------------- gears

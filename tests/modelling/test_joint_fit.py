@@ -412,7 +412,7 @@ def joined(texts: dict[str, list[float]]) -> tuple[mc.Measurements, tuple[Term, 
     data = with_history(visited(30))
     cell = with_effects(true_cell(), data, texts)
     data = measured(cell, data)
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots,
+    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions,
                   np.concatenate(cell.effects.values))  # fmt: skip
     model, state = extended(model_of(ROBOT, data), ROBOT, data, state, cell.effects.terms)
     return data, cell.effects.terms, state, model
@@ -429,7 +429,7 @@ def test_the_model_at_its_values_is_the_cell() -> None:
     """Columns, and what finite turns add to them, give the exact points again."""
     data, chosen, state, model = joined(LARGE)
     effects = fitted(chosen, scene_of(ROBOT, data, model, state), state.effects)
-    cell = mc.Cell.of(ROBOT, state, data.targets, effects)
+    cell = mc.Cell.of(ROBOT, state, data.target_names, effects)
     expected = cell.error(data) @ state.rotation  # into base axes
     assert_allclose(model.error(state), expected, rtol=0, atol=1e-12)
 
@@ -455,7 +455,7 @@ def test_slope_is_the_gradient_of_the_cost() -> None:
     model = replace(model, y=model.y + np.random.default_rng(0).normal(size=model.y.shape))
     every = np.ones(model.names.count, dtype=bool)
     normal = model.normal(state, every)
-    gradient = -2.0 * normal.slope.sum(axis=0)
+    gradient = -2.0 * normal.gradient.sum(axis=0)
     scale = np.sqrt(np.diagonal(normal.gram.sum(axis=0)))
     for i in range(model.names.count):
         step = 1e-6 / scale[i] * np.eye(model.names.count)[i]
@@ -488,12 +488,12 @@ def test_full_golub_pereyra_matrix_holds_the_effects() -> None:
 
     scale = np.sqrt((model.jacobian(state)[..., linear] ** 2).sum(axis=(0, 1, 2)))
     step = 1e-6
-    slopes = np.stack(
+    jacobians = np.stack(
         [(residual(step * e) - residual(-step * e)) / (2 * step) for e in np.eye(angles.sum())],
         axis=1,
     )
     found = examine(SumOfSquares(model), state.batch(), METHODS["snllm"])
-    squared = slopes.T @ slopes
+    squared = jacobians.T @ jacobians
     assert np.abs(found.matrix[0] - squared).max() < 1e-6 * np.abs(squared).max()
 
 

@@ -39,8 +39,8 @@ def test_normal_equations_are_those_of_the_explicit_jacobian(
     weight = this.weight
     assert_allclose(found.cost, np.einsum("km,kmc,kmc->k", weight, error, error), rtol=1e-13)
     assert_allclose(this.cost(x), found.cost, rtol=1e-13)
-    slope = np.einsum("km,kmcp,kmc->kp", weight, jacobian, error)
-    assert_allclose(found.slope, slope, rtol=0, atol=1e-12 * np.abs(slope).max())
+    gradient = np.einsum("km,kmcp,kmc->kp", weight, jacobian, error)
+    assert_allclose(found.gradient, gradient, rtol=0, atol=1e-12 * np.abs(gradient).max())
     gram = np.einsum("km,kmcp,kmcq->kpq", weight, jacobian, jacobian)
     assert_allclose(found.gram, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
 
@@ -71,7 +71,7 @@ def test_projected_lengths_are_the_linear_least_squares_ones(
     best = x.step(step)
     assert_allclose(y.mdh[0], best.mdh, rtol=0, atol=1e-12)
     assert_allclose(y.origin[0], best.origin, rtol=0, atol=1e-12)
-    assert_allclose(y.targets[0], best.targets, rtol=0, atol=1e-12)
+    assert_allclose(y.target_positions[0], best.target_positions, rtol=0, atol=1e-12)
 
 
 def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
@@ -132,10 +132,10 @@ def test_prior_rows_count_like_measurements(robot: mc.Robot, rng: np.random.Gene
     off = this.values(x) - this.prior.mean
     expected = SumOfSquares(this).cost(x) + (weight * off**2).sum()
     assert_allclose(SumOfSquares(with_prior).cost(x), expected, rtol=1e-14)
-    cost, slope, gram = SumOfSquares(with_prior).normal(x)
+    cost, gradient, gram = SumOfSquares(with_prior).normal(x)
     _, plain, bare = SumOfSquares(this).normal(x)
     assert_allclose(cost, expected, rtol=1e-13)
-    assert_allclose(slope - plain, -weight * off, rtol=0, atol=1e-10)
+    assert_allclose(gradient - plain, -weight * off, rtol=0, atol=1e-10)
     assert_allclose(gram - bare, np.diag(weight), rtol=0, atol=1e-10)
 
 
@@ -181,8 +181,8 @@ def test_mixed_normal_equations_are_explicit_ones(
     error = np.moveaxis(plain.error(x) @ x.rotation.T, 0, 1).reshape(30, 9)
     gram = np.einsum("map,mab,mbq->pq", flat, weight, flat)
     assert_allclose(found.gram.sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())
-    slope = np.einsum("map,mab,mb->p", flat, weight, error)
-    assert_allclose(found.slope.sum(0), slope, rtol=0, atol=1e-11 * np.abs(slope).max())
+    gradient = np.einsum("map,mab,mb->p", flat, weight, error)
+    assert_allclose(found.gradient.sum(0), gradient, rtol=0, atol=1e-11 * np.abs(gradient).max())
     assert_allclose(found.cost.sum(), np.einsum("ma,mab,mb", error, weight, error), rtol=1e-12)
     batch = mixed.normal(x.repeat(3), every)
     assert_allclose(batch.gram[1].sum(0), gram, rtol=0, atol=1e-11 * np.abs(gram).max())

@@ -378,15 +378,17 @@ def test_information_is_that_of_dense_covariances(robot: mc.Robot) -> None:
     seen[:, 0] |= ~seen.any(axis=1)
     ahead = ahead_of(robot, 2, q, seen, Instrument(12e-6, 3e-6, 20e-6))
     cell = ahead.cell
-    data = still(q, cell.targets, robot)
-    state = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    data = still(q, cell.target_names, robot)
+    state = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions)
     jacobian = model_of(robot, data).jacobian(state)
-    scene = Scene.of(robot, data, (state.rotation, state.origin), cell.spots, q * robot.sign)
+    scene = Scene.of(
+        robot, data, (state.rotation, state.origin), cell.target_positions, q * robot.sign
+    )
     rows = ahead.ahead(q, seen)
     for pose in (0, 7, 23):
         chosen = np.flatnonzero(seen[pose])
         j = jacobian[chosen, pose].reshape(3 * len(chosen), -1)[:, ahead.active] / ahead.scale
-        s = scene.slope[..., pose][:, chosen].reshape(6, -1).T
+        s = scene.jacobian[..., pose][:, chosen].reshape(6, -1).T
         away = np.linalg.norm(cell.predict(q[pose])[0, chosen], axis=-1)  # tracker at its origin
         v = np.diag(np.repeat((12e-6 + 3e-6 * away) ** 2, 3)) + (20e-6) ** 2 * s @ s.T
         expected = j.T @ np.linalg.inv(v) @ j

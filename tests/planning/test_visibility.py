@@ -129,7 +129,7 @@ def test_acceptance_is_an_angle_about_the_normal(robot: mc.Robot) -> None:
     spots = np.array([[0.1, 0.0, 0.03], [0.0, -0.1, 0.02]])
     normals = normals_of(spots, "radial")
     sight = Sight(np.array([2.5, -1.0, 0.7]), robot.up, np.radians(40.0))
-    seen = View(room_of(robot, spots=spots, normals=normals), sight, q)
+    seen = View(room_of(robot, target_positions=spots, normals=normals), sight, q)
     found = TRACKER["acceptance"](seen)
     pose = robot.pose(q)
     for k in range(2):
@@ -204,7 +204,7 @@ def test_candidates_meet_every_condition(robot: mc.Robot, eye: Sight) -> None:
 def test_one_target_is_enough_unless_all_are_asked_for(robot: mc.Robot, eye: Sight) -> None:
     lower, upper, _ = limits_of(robot, {})
     spots = 0.1 * np.array([[1.0, 0.0, 0.3], [-1.0, 0.0, 0.3]])
-    room = room_of(robot, spots=spots, normals=normals_of(spots, "radial"), lower=lower,
+    room = room_of(robot, target_positions=spots, normals=normals_of(spots, "radial"), lower=lower,
                    upper=upper)  # fmt: skip
     wide = dataclasses.replace(eye, acceptance=np.radians(80.0))
     found = candidates(room, wide, 200, 0)

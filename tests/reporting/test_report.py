@@ -417,7 +417,9 @@ def test_arrows_lead_from_prediction_to_measurement(sources: Sources) -> None:
     space = space_of(poses, cell)
     predicted = space.points - space.after
     flange = cell.robot.pose(poses.data.q[space.chosen])
-    spots = np.einsum("mij,kj->mki", flange[:, :3, :3], cell.spots) + flange[:, None, :3, 3]
+    spots = (
+        np.einsum("mij,kj->mki", flange[:, :3, :3], cell.target_positions) + flange[:, None, :3, 3]
+    )
     assert_allclose(predicted, 1e3 * spots, atol=1e-6)
     tracker = np.linalg.solve(cell.base, [0, 0, 0, 1])[:3]  # origin of the measurement frame
     assert space.away == pytest.approx(1e3 * np.linalg.norm(tracker))

@@ -31,7 +31,7 @@ def test_jacobian_is_the_complex_step_derivative(name: str, rng: np.random.Gener
         dx[i] = 1e-30j  # exact to rounding: no difference is taken
         moved = state.step(dx)
         links = kinematics.chain(moved.mdh, model.q, model.prismatic)
-        point = np.swapaxes(kinematics.points(links, moved.targets), -1, -2)
+        point = np.swapaxes(kinematics.points(links, moved.target_positions), -1, -2)
         seen = point @ moved.rotation.T + moved.origin
         slope = (seen.imag / 1e-30) @ state.rotation  # from measurement into base axes
         assert_allclose(analytic[..., i], slope, rtol=0, atol=1e-14, err_msg=model.names.all[i])

@@ -45,9 +45,9 @@ def test_minimum_is_scipys(robot: mc.Robot, noisy: Simulation) -> None:
 def test_gradient_is_zero_at_the_minimum(robot: mc.Robot, noisy: Simulation) -> None:
     model, begin = identified(robot, noisy.data)
     found = solve(model, begin)
-    cost, slope, gram = SumOfSquares(model).normal(found.x.take(np.array(0)))
+    cost, gradient, gram = SumOfSquares(model).normal(found.x.take(np.array(0)))
     # cosine of the angle between residual and each column of the Jacobian
-    assert np.abs(slope / np.sqrt(np.diag(gram) * cost)).max() < 1e-9
+    assert np.abs(gradient / np.sqrt(np.diag(gram) * cost)).max() < 1e-9
 
 
 def test_true_robot_is_found_without_noise(robot: mc.Robot, clean: Simulation) -> None:
@@ -86,10 +86,10 @@ def test_closed_form_start_is_the_best_frame(robot: mc.Robot, rng: np.random.Gen
     for seed in range(5):
         made = simulate(robot, 30, 2, seed)
         model = model_of(robot, made.data)
-        frame = start.fit_frame(model, robot.mdh)
+        frame = start.fit_base(model, robot.mdh)
         chosen = ~model.names.links
         cell = made.cell
-        near = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+        near = State(robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions)
         local = solve(model.only(chosen), near)
         points = model.counts.sum()
         assert_allclose(frame.mean_square * points, local.cost[0], rtol=1e-9)

@@ -9,7 +9,12 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.fitting.minimax_problem import Distances, Worst, measured_distances, worst_of
+from minimax_cal.fitting.minimax_problem import (
+    Distances,
+    MinimaxProblem,
+    measured_distances,
+    minimax_problem,
+)
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation
@@ -20,8 +25,8 @@ from qp_backends import available
 from qp_backends import solve as solve_qp
 
 
-def worst_target(model: Model, x: State, distances: Distances, form: str) -> Worst:
-    return worst_of(model, x, distances, form, "target")
+def worst_target(model: Model, x: State, distances: Distances, form: str) -> MinimaxProblem:
+    return minimax_problem(model, x, distances, form, "target")
 
 
 BACKENDS = ("daqp", "quadprog", "clarabel", "osqp", "proxqp")
@@ -52,10 +57,10 @@ class Plain:
     def linearise(self, x: np.ndarray) -> Linear:
         f, c = self.evaluate(x)
         steps = x + 1e-30j * np.eye(len(x))
-        slope = np.array([[g(s).imag / 1e-30 for s in steps] for g in self.functions])
+        jacobian = np.array([[g(s).imag / 1e-30 for s in steps] for g in self.functions])
         normal = np.array([[g(s).imag / 1e-30 for s in steps] for g in self.constraints])
         n = len(x)
-        return Linear(f, slope, c, normal.reshape(-1, n), lambda mu: np.zeros((0, 0)))
+        return Linear(f, jacobian, c, normal.reshape(-1, n), lambda mu: np.zeros((0, 0)))
 
     def step(self, x: np.ndarray, d: np.ndarray) -> np.ndarray:
         return x + d
@@ -134,7 +139,7 @@ def test_derivatives_of_the_calibration_problem(robot: mc.Robot, noisy: Simulati
             plus = problem.evaluate(problem.step(at, step * e))
             minus = problem.evaluate(problem.step(at, -step * e))
             f, c = ((p - m) / (2 * step) for p, m in zip(plus, minus, strict=True))
-            assert_allclose(here.slope @ e, f, rtol=1e-6, atol=1e-6)
+            assert_allclose(here.jacobian @ e, f, rtol=1e-6, atol=1e-6)
             assert_allclose(here.normal @ e, c, rtol=1e-6, atol=1e-6)
 
 
@@ -154,7 +159,7 @@ def test_backends_end_at_the_same_value(backend: str, robot: mc.Robot, noisy: Si
     assert_allclose(value_of(robot, noisy.data, backend), reference, rtol=1e-6)
 
 
-def slsqp_value(problem: Worst, x: State) -> float:
+def slsqp_value(problem: MinimaxProblem, x: State) -> float:
     size = int(problem.model.active.sum())
 
     def inequality(u: np.ndarray) -> np.ndarray:
@@ -214,7 +219,7 @@ def test_kkt_conditions_hold(robot: mc.Robot, noisy: Simulation) -> None:
     problem = worst_target(model, x, measured_distances(noisy.data), "two-sided")
     found = run(problem, x)
     here = problem.linearise(found.x)
-    assert np.abs(here.slope.T @ found.mu + here.normal.T @ found.lam).max() < 1e-8
+    assert np.abs(here.jacobian.T @ found.mu + here.normal.T @ found.lam).max() < 1e-8
     assert found.mu.min() >= 0.0
     assert found.mu @ (here.f.max() - here.f) < 1e-8
     assert here.f.max() <= problem.linearise(x).f.max()

@@ -20,9 +20,9 @@ def test_complex_step_is_the_gradient(name: str) -> None:
     exact = complex_step(classic.fun, x)
     step = 1e-6 * np.maximum(1.0, np.abs(x))
     for i, e in enumerate(np.diag(step)):
-        slope = (np.asarray(classic.fun(x + e)) - np.asarray(classic.fun(x - e))) / (2 * step[i])
+        jacobian = (np.asarray(classic.fun(x + e)) - np.asarray(classic.fun(x - e))) / (2 * step[i])
         scale = max(1.0, np.abs(exact).max(), np.abs(np.asarray(classic.fun(x))).max())
-        assert_allclose(exact[:, i], slope, rtol=0, atol=1e-7 * scale)
+        assert_allclose(exact[:, i], jacobian, rtol=0, atol=1e-7 * scale)
 
 
 def solve(classic: Classic, **more: object):  # type: ignore[no-untyped-def]
@@ -44,14 +44,14 @@ def test_classics_reach_their_published_optimum(name: str) -> None:
     assert abs(found.fun - classic.best) <= 1e-6 * max(1.0, abs(classic.best))
     assert found.fun == np.max(classic.fun(found.x))
     # a certificate from outside the solver: KKT with the multipliers it reports
-    slopes = complex_step(classic.fun, found.x)
-    gradient = found.multipliers @ slopes
+    jacobians = complex_step(classic.fun, found.x)
+    gradient = found.multipliers @ jacobians
     rows = np.zeros((0, len(found.x)))
     if classic.bounds is not None:
         rows = np.eye(len(found.x))
     rows = np.concatenate([rows, *(c.A for c in classic.constraints)])
     gradient = gradient + found.constraint_multipliers @ rows
-    assert np.abs(gradient).max() <= 1e-6 * max(1.0, np.abs(slopes).max())
+    assert np.abs(gradient).max() <= 1e-6 * max(1.0, np.abs(jacobians).max())
     assert_allclose(found.multipliers.sum(), 1.0, rtol=1e-12)
     assert found.multipliers.min() >= 0.0
 

@@ -79,7 +79,7 @@ def read_job(source: Path | str) -> Job:
 def compliance_of(cell: Cell) -> Array:
     """(n,) turn per torque of each joint's whole load, NaN where none was fitted [rad/(N m)]."""
     out = np.full(cell.robot.joints, np.nan)
-    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.targets, cell.robot))
+    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
         if term.effect == "joint_compliance":
             for name, value in zip(term.columns(scene).names, values, strict=True):

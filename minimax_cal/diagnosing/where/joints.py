@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from minimax_cal.diagnosing.where.chance import explained
 from minimax_cal.diagnosing.where.features import WAVES, waves
 from minimax_cal.diagnosing.where.gaps import JointGap
 from minimax_cal.diagnosing.where.residual import Residual
 from minimax_cal.diagnosing.where.rows import blocks, joint_rows, root
+from minimax_cal.diagnosing.where.significance import explained
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 
 
-def joint_equivalent(error: Array, slope: Array, noise: float) -> Array:
+def joint_equivalent(error: Array, jacobian: Array, noise: float) -> Array:
     """Turns of the joints that would make the errors of each pose: (m, n) [rad, m].
 
     Ridge least squares, min |e - S dq|^2 + lambda |dq|^2 with lambda = noise^2 / turn^2, where turn
@@ -23,16 +23,18 @@ def joint_equivalent(error: Array, slope: Array, noise: float) -> Array:
     wrist in line, or a single target, would ask for endless turns.  Arguments as `where`.
     """
     rows, seen = blocks(error)
-    motion = joint_rows(slope, seen)
+    motion = joint_rows(jacobian, seen)
     gram = np.swapaxes(motion, 1, 2) @ motion
     size = np.trace(gram, axis1=1, axis2=2).mean()
     square = (rows**2).sum(1).mean()
     if not (size > 0.0 and square > 0.0):
-        return np.zeros((len(rows), len(slope)))
+        return np.zeros((len(rows), len(jacobian)))
     floor = max(noise**2 if math.isfinite(noise) else 0.0, 1e-4 * square / seen.sum(1).mean())
     ridge = floor * size / square
-    pull = (np.swapaxes(motion, 1, 2) @ rows[..., None])[..., 0]
-    return np.asarray(np.linalg.solve(gram + ridge * np.eye(len(slope)), pull[..., None])[..., 0])
+    gradient = (np.swapaxes(motion, 1, 2) @ rows[..., None])[..., 0]
+    return np.asarray(
+        np.linalg.solve(gram + ridge * np.eye(len(jacobian)), gradient[..., None])[..., 0]
+    )
 
 
 def by_joint(

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from scipy.stats import chi2, f
 
-from minimax_cal.diagnosing.where.chance import flips
 from minimax_cal.diagnosing.where.gaps import CANNOT_TELL, Part, Triage
 from minimax_cal.diagnosing.where.residual import Residual
+from minimax_cal.diagnosing.where.significance import flips
 from minimax_cal.diagnosing.where.spread import revisit_scatter, shape_scatter
 from minimax_cal.measuring.measurements import Measurements
 
@@ -23,9 +23,7 @@ def lack_of_fit(rest: Residual) -> float:
     return flips(float(gram.sum()), gram)
 
 
-def triage(
-    data: Measurements, rest: Residual, noise: float, known: float, freedom: float
-) -> Triage:
+def triage(data: Measurements, rest: Residual, noise: float, known: float, dof: float) -> Triage:
     """Mean squares per point of the errors `rest`: noise + shape + repeat + pose.
 
     With s^2 = noise^2, per coordinate, p fitted directions and N points:
@@ -35,7 +33,7 @@ def triage(
     repeat: `revisit_scatter` per visit less that of s^2 + u^2, less what the fit has taken.
     pose: what is left.  Negative parts are 0; shares add up to 1 over the parts that can be told,
     and what cannot (no revisits, one target) falls to pose.
-    p of shape: chi^2 against s^2, F if that has finite `freedom`.  p of repeat: the same, but F
+    p of shape: chi^2 against s^2, F if that has finite `dof`.  p of repeat: the same, but F
     against the scatter of the shape where that is clearly larger.  p of pose: `lack_of_fit`.
     noise: as given, NaN if it was estimated from the data as `known`: then the scatter that gave it
     is noise by definition, and cannot be told.
@@ -45,7 +43,7 @@ def triage(
     if not (math.isfinite(known) and total > 0.0):
         return Triage(CANNOT_TELL, CANNOT_TELL, CANNOT_TELL, CANNOT_TELL)
     given, left = math.isfinite(noise), 3.0 - rest.fitted / points
-    least, behind = max(known**2, 1e-24), freedom
+    least, behind = max(known**2, 1e-24), dof
     told = {"noise": (known**2 * left, math.nan)}
     shape, shape_free = shape_scatter(data)
     if given and shape_free >= 1.0:

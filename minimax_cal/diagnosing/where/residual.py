@@ -42,11 +42,11 @@ class Residual:
 
 
 def residual_of(
-    error: Array, fitted: Array, group: Array, slope: Array = NO_FIT, noise: float = math.nan
+    error: Array, fitted: Array, group: Array, jacobian: Array = NO_FIT, noise: float = math.nan
 ) -> Residual:
     """Errors (k, m, 3) of a fit with derivatives (k, m, 3, p), NaN where not measured.
 
-    slope, noise: as `where`; they tell how a jitter of the joints would spread, for `evened`.
+    jacobian, noise: as `where`; they tell how a jitter of the joints would spread, for `evened`.
     """
     rows, seen = blocks(error)
     m, wide = rows.shape
@@ -57,8 +57,8 @@ def residual_of(
     bare = Residual(rows, rows, basis, seen, group)
     rows = bare.without_fit(rows[..., None])[..., 0]
     spread = np.broadcast_to(np.eye(wide), (m, wide, wide))
-    if slope.size and math.isfinite(noise):
-        motion = joint_rows(slope, seen)
+    if jacobian.size and math.isfinite(noise):
+        motion = joint_rows(jacobian, seen)
         energy, free = float((rows**2).sum()), float(seen.sum() - basis.shape[2])
         level = max(noise**2, 1e-4 * energy / max(free, 1.0))
         jitter = max(0.0, energy / max(level, 1e-300) - free) / max(

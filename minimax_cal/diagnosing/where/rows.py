@@ -22,10 +22,10 @@ def blocks(error: Array) -> tuple[Array, Array]:
     return np.where(seen, rows, 0.0), seen
 
 
-def joint_rows(slope: Array, seen: Array) -> Array:
+def joint_rows(jacobian: Array, seen: Array) -> Array:
     """Slopes (n, k, 3, m) as blocks (m, 3k, n), 0 where not measured."""
-    n, k, _, m = slope.shape
-    return np.where(seen[..., None], slope.transpose(3, 1, 2, 0).reshape(m, 3 * k, n), 0.0)
+    n, k, _, m = jacobian.shape
+    return np.where(seen[..., None], jacobian.transpose(3, 1, 2, 0).reshape(m, 3 * k, n), 0.0)
 
 
 def base_rows(point: Array, up: Array, seen: Array) -> Array:

@@ -22,8 +22,8 @@ def noise_of(data: Measurements) -> float:
         spread = [np.median(np.abs(c[w > 0])) for c, w in zip(off.T, weight.T, strict=True)]
         return float(np.median(spread)) * 1.4826 / math.sqrt(2.0)
     off, weight = scatter(data.y.reshape(data.poses, -1), groups(data))
-    freedom = float(weight.sum())
-    return math.sqrt(float((off**2).sum()) / freedom) if freedom >= 8.0 else math.nan
+    dof = float(weight.sum())
+    return math.sqrt(float((off**2).sum()) / dof) if dof >= 8.0 else math.nan
 
 
 def pairs(k: int) -> Array:
@@ -33,7 +33,7 @@ def pairs(k: int) -> Array:
 
 def distances(data: Measurements) -> Array:
     """Between all pairs of targets: (m, pairs), NaN where not both were measured [m]."""
-    pair = pairs(len(data.targets))
+    pair = pairs(len(data.target_names))
     return np.asarray(np.linalg.norm(data.y[:, pair[:, 0]] - data.y[:, pair[:, 1]], axis=-1))
 
 
@@ -57,11 +57,11 @@ def shape_energy(data: Measurements, off: Array) -> tuple[Array, Array]:
     rigid motion enters.  DD' follows from the mean distances by the law of cosines.
     Returns energy (m,) [m^2] and rank (m,), 3k - 6 for k > 2 targets in general places.
     """
-    pair, seen = pairs(len(data.targets)), data.seen
+    pair, seen = pairs(len(data.target_names)), data.seen
     apart = distances(data)
     known = np.isfinite(apart)
     mean = np.where(known, apart, 0.0).sum(0) / np.maximum(known.sum(0), 1)
-    square = np.zeros((len(data.targets),) * 2)
+    square = np.zeros((len(data.target_names),) * 2)
     square[pair[:, 0], pair[:, 1]] = square[pair[:, 1], pair[:, 0]] = mean**2
     (a, b), (c, d) = pair.T[:, :, None], pair.T[:, None, :]
     dot = 0.5 * (square[a, d] + square[b, c] - square[a, c] - square[b, d])

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from minimax_cal.diagnosing.where.chance import explained
 from minimax_cal.diagnosing.where.features import products, scaled, waves
 from minimax_cal.diagnosing.where.gaps import Trend
 from minimax_cal.diagnosing.where.residual import Residual
+from minimax_cal.diagnosing.where.significance import explained
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 

@@ -22,18 +22,18 @@ def reach(
     """
     best = q * robot.sign
     damping = np.full(len(q), 1e-6)
-    gap, slope = examine(robot, ball, goal, best)
+    gap, jacobian = examine(robot, ball, goal, best)
     for _ in range(iterations):
-        square = slope @ np.swapaxes(slope, 1, 2)
+        square = jacobian @ np.swapaxes(jacobian, 1, 2)
         size = np.trace(square, axis1=1, axis2=2)[:, None, None] + 1e-12
         damped = square + damping[:, None, None] * size * np.eye(3)
-        step = np.swapaxes(slope, 1, 2) @ np.linalg.solve(damped, gap[..., None])
+        step = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(damped, gap[..., None])
         step = step[..., 0] * np.minimum(1.0, LONGEST / np.maximum(np.abs(step).max(axis=1), 1e-12))
         trial = best + step
         after, after_slope = examine(robot, ball, goal, trial)
         better = np.linalg.norm(after, axis=1) < np.linalg.norm(gap, axis=1)
         best, gap = np.where(better[:, None], trial, best), np.where(better[:, None], after, gap)
-        slope = np.where(better[:, None, None], after_slope, slope)
+        jacobian = np.where(better[:, None, None], after_slope, jacobian)
         damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), 1e-12, 1e6)
         if not better.any() and (damping >= 1e2).all():
             break
@@ -45,8 +45,8 @@ def examine(robot: Robot, ball: Array, goal: Array, q: Array) -> tuple[Array, Ar
     links = kinematics.chain(robot.mdh, q, robot.prismatic)
     point = kinematics.points(links, ball[None])[0]
     swing = kinematics.cross(links.z, point - links.before)
-    slope = np.where(robot.prismatic[:, None, None], links.z, swing)
-    return goal - point.T, np.moveaxis(slope, -1, 0).swapaxes(1, 2)
+    jacobian = np.where(robot.prismatic[:, None, None], links.z, swing)
+    return goal - point.T, np.moveaxis(jacobian, -1, 0).swapaxes(1, 2)
 
 
 def closing_poses(

@@ -11,7 +11,7 @@ from minimax_cal.fitting.calibration import Parameter
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
 from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified
-from minimax_cal.fitting.instruments.options import RelativeOptions, Report, wishes
+from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, wishes
 from minimax_cal.fitting.instruments.rows import (
     Closures,
     Instrument,
@@ -79,18 +79,18 @@ def start_of(robot: Robot, instrument: Instrument, q: Array, allowed: Array) -> 
 
 
 def fit_instrument(
-    robot: Robot, train: RelativeData, options: RelativeOptions, report: Report
+    robot: Robot, train: RelativeData, options: RelativeOptions, progress: Progress
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
-    report("start")
+    progress("start")
     instrument = instrument_of(robot, train, options)
     allowed, wanted = allowed_of(robot, instrument, options)
     nominal = start_of(robot, instrument, train.at.q, allowed)
-    report("identifiable parameters")
+    progress("identifiable parameters")
     unknowns = generic_count(robot, instrument, nominal, allowed)
     numbers = check_count(train, unknowns, len(options.known_distances))
     known = identified(robot, instrument, nominal, allowed, wanted, resolution=options.resolution)
-    report("least squares")
+    progress("least squares")
     found = least_squares.solve(
         Squares(instrument, known.active),
         nominal.batch(),
@@ -112,13 +112,13 @@ def covariance_of(
     s^2 H^-1 F H^-1 with H = sum w j j' and F = sum w^2 j j' over the rows j of weight w: a known
     distance weighs much and is no surer than a coordinate.  s^2: cost over spare numbers.
     """
-    _, slopes = instrument.rows(x, active)
+    _, jacobians = instrument.rows(x, active)
     weight = instrument.weights
-    bread = solve_normal(slopes @ slopes.T, np.eye(len(slopes)))
-    filling = (slopes * weight) @ slopes.T
-    variance = cost / max(numbers - len(slopes), 1)
+    bread = solve_normal(jacobians @ jacobians.T, np.eye(len(jacobians)))
+    meat = (jacobians * weight) @ jacobians.T
+    variance = cost / max(numbers - len(jacobians), 1)
     covariance = np.full((len(active),) * 2, np.nan)
-    covariance[np.ix_(active, active)] = variance * bread @ filling @ bread
+    covariance[np.ix_(active, active)] = variance * bread @ meat @ bread
     return covariance
 
 
@@ -185,7 +185,9 @@ def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Pa
     names, n = fit.instrument.names, robot.joints
 
     def values(x: State) -> Array:
-        return np.concatenate([links_of(x.mdh), np.zeros(6), x.targets.reshape(-1), x.effects])
+        return np.concatenate(
+            [links_of(x.mdh), np.zeros(6), x.target_positions.reshape(-1), x.effects]
+        )
 
     before, after = values(fit.nominal), values(fit.state)
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
@@ -213,7 +215,7 @@ def placed(fit: InstrumentFit, data: RelativeData, options: RelativeOptions) -> 
     def millimetres(values: Array) -> list[float]:
         return [1e3 * float(value) for value in values]
 
-    out: dict[str, Any] = {"target_mm": millimetres(fit.state.targets[0])}
+    out: dict[str, Any] = {"target_mm": millimetres(fit.state.target_positions[0])}
     if isinstance(fit.instrument, Wires):
         anchors, offsets = fit.instrument.split(fit.state.effects)
         wires = data.wires

@@ -91,7 +91,7 @@ def reference_of(robot: Robot, instrument: Instrument, x: State) -> Instrument:
         model = plenty_of_poses(robot, instrument.model, poses)
         return Wires(model, instrument.names, np.zeros((poses, instrument.length.shape[1])))
     rng = np.random.default_rng(0)
-    q, socket = closing_poses(robot, x.targets[0], SOCKETS, VISITS, rng)
+    q, socket = closing_poses(robot, x.target_positions[0], SOCKETS, VISITS, rng)
     if len(np.unique(socket)) < 2:  # an arm that hardly reaches a place in two ways
         return closed(robot, instrument, x)
     _, socket = np.unique(socket, return_inverse=True)
@@ -107,7 +107,7 @@ def closed(robot: Robot, closures: Closures, x: State) -> Closures:
     """
     centre = closures.barycentres(places(closures.model, x))
     goal = np.repeat(centre, closures.visits, axis=-1).T
-    q, _ = reach(robot, x.targets[0], goal, closures.model.q * robot.sign)
+    q, _ = reach(robot, x.target_positions[0], goal, closures.model.q * robot.sign)
     socket = np.repeat(np.arange(len(closures.first)), closures.visits)
     return Closures.of(robot, q, socket, closures.pairs, closures.distance)
 
@@ -193,12 +193,12 @@ def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> f
     told = np.isfinite(np.diag(covariance))
     told[5 * names.joints : 5 * names.joints + 6] = False  # the base, which is fitted again
     some = plenty_of_poses(robot, model)
-    slope = some.jacobian(x).mean(axis=0)[..., told].reshape(3 * len(some.q), -1)
+    jacobian = some.jacobian(x).mean(axis=0)[..., told].reshape(3 * len(some.q), -1)
     links = kinematics.chain(x.mdh, some.q, some.prismatic)
-    point = kinematics.points(links, x.targets).mean(axis=0).T
+    point = kinematics.points(links, x.target_positions).mean(axis=0).T
     point = point - point.mean(axis=0)
     rigid = np.concatenate([np.tile(np.eye(3), (len(point), 1, 1)), -hat(point)], axis=2)
     basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
-    slope = slope - basis @ (basis.T @ slope)
-    variance = np.einsum("ri,ij,rj->", slope, covariance[np.ix_(told, told)], slope)
+    jacobian = jacobian - basis @ (basis.T @ jacobian)
+    variance = np.einsum("ri,ij,rj->", jacobian, covariance[np.ix_(told, told)], jacobian)
     return float(np.sqrt(variance / len(point)))

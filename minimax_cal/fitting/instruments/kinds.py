@@ -21,8 +21,8 @@ from minimax_cal.fitting.instruments.fit import (
 )
 from minimax_cal.fitting.instruments.identify import position_sigma
 from minimax_cal.fitting.instruments.options import (
+    Progress,
     RelativeOptions,
-    Report,
     check_options,
     silent,
     wishes,
@@ -57,12 +57,12 @@ from minimax_cal.robots.robot import Robot, load_robot
 def relative(
     robot: Robot | str | Path,
     data: RelativeData | str | Path,
-    report: Report = silent,
+    progress: Progress = silent,
     **options: object,
 ) -> RelativeCalibration:
     """Calibrate a robot from lengths, closures or poses.
 
-    robot, data: loaded, or a name or path.  options: the fields of `RelativeOptions`.  report:
+    robot, data: loaded, or a name or path.  options: the fields of `RelativeOptions`.  progress:
     called with a word on each stage.  Raises CalibrationError for wrong input; how the numbers
     ended is in the result's `status`.
     """
@@ -75,11 +75,11 @@ def relative(
     check_options(data, chosen)
     checks.check_joints(robot, data.at)
     begin = from_poses if data.kind == "poses" else from_instrument
-    return begin(robot, data, chosen, report)
+    return begin(robot, data, chosen, progress)
 
 
 def from_instrument(
-    robot: Robot, data: RelativeData, options: RelativeOptions, report: Report
+    robot: Robot, data: RelativeData, options: RelativeOptions, progress: Progress
 ) -> RelativeCalibration:
     """Calibrate from lengths or closures."""
     began = time.perf_counter()
@@ -89,7 +89,7 @@ def from_instrument(
     else:
         held, notices = split_rows(data, options.holdout, options.seed)
     train = data.take(~held)
-    fit = fit_instrument(robot, train, options, report)
+    fit = fit_instrument(robot, train, options, progress)
     before, before_held = errors_at(robot, fit, fit.nominal, data, held)
     after, after_held = errors_at(robot, fit, fit.state, data, held)
     errors = dict(nominal=before_held, train=after, holdout=after_held, nominal_train=before)
@@ -125,7 +125,7 @@ def from_instrument(
 
 
 def from_poses(
-    robot: Robot, data: RelativeData, options: RelativeOptions, report: Report
+    robot: Robot, data: RelativeData, options: RelativeOptions, progress: Progress
 ) -> RelativeCalibration:
     """Calibrate from whole poses: `calibrate` on virtual reflectors, told as poses."""
     began = time.perf_counter()
@@ -136,7 +136,7 @@ def from_poses(
             robot,
             targets,
             objective="sum",
-            report=report,
+            progress=progress,
             holdout=options.holdout,
             seed=options.seed,
             fix=options.fix,

@@ -16,7 +16,7 @@ from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import METHODS
 
-Report = Callable[[str], None]
+Progress = Callable[[str], None]
 Known = tuple[str, str, float]
 
 

@@ -52,7 +52,7 @@ def poses_as_targets(data: RelativeData, lever: float = LEVER, count: int = 4) -
     """The poses as virtual reflectors smr1 ..., for `calibrate`.  lever: [m].  count: 3 or 4."""
     turned = np.einsum("mij,kj->mki", data.pose[:, :3, :3], spots_of(lever, count))
     names = tuple(f"smr{i + 1}" for i in range(count))
-    return replace(data.at, y=turned + data.pose[:, None, :3, 3], targets=names)
+    return replace(data.at, y=turned + data.pose[:, None, :3, 3], target_names=names)
 
 
 def lever_of(data: RelativeData, lever: float) -> tuple[float, str]:
@@ -69,9 +69,9 @@ def lever_of(data: RelativeData, lever: float) -> tuple[float, str]:
 
 def tool_of(cell: Cell, spots: Array) -> Array:
     """Pose (4, 4) of the measured frame in the flange that fits the reflectors best [m]."""
-    centre = cell.spots.mean(axis=0)
+    centre = cell.target_positions.mean(axis=0)
     tool = np.eye(4)
-    tool[:3, :3], tool[:3, 3] = project((cell.spots - centre).T @ spots), centre
+    tool[:3, :3], tool[:3, 3] = project((cell.target_positions - centre).T @ spots), centre
     return tool
 
 
@@ -100,7 +100,7 @@ class PoseFit:
     @property
     def shape(self) -> int:
         """How many numbers only tell how the reflectors lie to each other, which was given."""
-        return max(3 * len(self.fit.cell.targets) - 6, 0)
+        return max(3 * len(self.fit.cell.target_names) - 6, 0)
 
 
 def pose_fit(fit: Calibration, train: Measurements, spots: Array) -> PoseFit:
@@ -111,11 +111,11 @@ def pose_fit(fit: Calibration, train: Measurements, spots: Array) -> PoseFit:
     pose.  No other motion is in the fit's slopes, so that its covariance is that of 4 s^2 I.
     """
     cell, k = fit.cell, len(spots)
-    state = State(cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.spots)
+    state = cell.state
     model = model_of(fit.nominal.robot, train).only(fit.identification.active)
     normal = model.normal(state, model.active)
-    spare = max(6 * train.poses - (int(model.active.sum()) - (3 * k - 6)), 1)
-    variance = float(normal.cost.sum()) / spare
+    dof = max(6 * train.poses - (int(model.active.sum()) - (3 * k - 6)), 1)
+    variance = float(normal.cost.sum()) / dof
     covariance = np.full((model.names.count,) * 2, np.nan)
     gram = normal.gram.sum(axis=0)
     inverse = solve_normal(gram, np.eye(len(gram)))
@@ -131,7 +131,7 @@ def pose_parameters(found: PoseFit, nominal_tool: Array, spots: Array) -> tuple[
     links = tuple(
         replace(p, sigma=float(sigma[p.name]), reason=p.reason.replace(*whole))
         for p in found.fit.parameters
-        if p.name.rpartition("_")[0] not in names.targets
+        if p.name.rpartition("_")[0] not in names.target_names
     )
     axes = nominal_tool[:3, :3]
     arm = spots @ found.tool[:3, :3].T  # in the flange's axes
@@ -163,10 +163,10 @@ def beyond_one(
 
     train: the virtual reflectors.  allowed: (p,) of the model's parameters.
     """
-    one = replace(train, y=train.y.mean(axis=1, keepdims=True), targets=("smr1",))
+    one = replace(train, y=train.y.mean(axis=1, keepdims=True), target_names=("smr1",))
     model = model_of(robot, one)
     rows = model.names.count - 3
-    state = replace(found.state, targets=found.tool[None, :3, 3])
+    state = replace(found.state, target_positions=found.tool[None, :3, 3])
     order = identify.drop_order(robot, model.names)
     alone = identify.identify(
         model,

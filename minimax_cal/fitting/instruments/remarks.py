@@ -45,8 +45,8 @@ def offset_notices(
     """How weakly the offsets of wires are determined."""
     if not options.offset:
         return ()
-    spare = max(fit.numbers - int(fit.identification.active.sum()), 1)
-    noise_mm = 1e3 * float(np.sqrt(fit.found.cost[0] / spare))
+    dof = max(fit.numbers - int(fit.identification.active.sum()), 1)
+    noise_mm = 1e3 * float(np.sqrt(fit.found.cost[0] / dof))
     told = [p for p in parameters if p.name.startswith("offset")]
     each = ", ".join(
         f"{p.name} {1e3 * p.value:+.3f} +- {1e3 * p.sigma:.3f} mm"
@@ -70,7 +70,7 @@ def remarks(result: RelativeCalibration, data: RelativeData, held: Array) -> tup
     distance = np.full((len(result.parts), len(held)), np.nan)
     distance[:, ~held] = np.linalg.norm(result.errors["train"], axis=-1)
     distance[:, held] = np.linalg.norm(result.errors["holdout"], axis=-1)
-    return (*notices, *checks.outliers(replace(data.at, targets=result.parts), distance))
+    return (*notices, *checks.outliers(replace(data.at, target_names=result.parts), distance))
 
 
 def weak(result: RelativeCalibration) -> tuple[str, ...]:

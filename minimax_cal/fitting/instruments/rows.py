@@ -44,7 +44,7 @@ def state_of(mdh: Array, target: Array, own: Array) -> State:
 def places(model: Model, x: State) -> Array:
     """The point on the flange in the base: (..., 3, m) [m]."""
     links = kinematics.chain(x.mdh, model.q, model.prismatic)
-    return np.asarray(kinematics.points(links, x.targets)[..., 0, :, :])
+    return np.asarray(kinematics.points(links, x.target_positions)[..., 0, :, :])
 
 
 def motion(model: Model, x: State, active: Array) -> tuple[Array, Array]:
@@ -102,7 +102,7 @@ class Wires:
         The derivative is (..., active, rows).
         """
         arm = self.model.names.count
-        point, slope = motion(self.model, x, active[:arm])
+        point, arms = motion(self.model, x, active[:arm])
         anchors, offsets = self.split(x.effects)
         gap = point[..., None, :, :] - anchors[..., None]
         distance = np.maximum(np.linalg.norm(gap, axis=-2), 1e-12)
@@ -112,11 +112,11 @@ class Wires:
         for i in range(s):
             own[..., 3 * i : 3 * i + 3, i, :] = -unit[..., i, :, :]
             own[..., 3 * s + i, i, :] = 1.0
-        along = np.einsum("...scm,...pcm->...psm", unit, slope)
-        slopes = np.concatenate([along, own[..., active[arm:], :, :]], axis=-3)
+        along = np.einsum("...scm,...pcm->...psm", unit, arms)
+        jacobian = np.concatenate([along, own[..., active[arm:], :, :]], axis=-3)
         seen = np.isfinite(self.length.T)
         error = self.length.T - distance - offsets[..., None]
-        return error[..., seen], slopes[..., seen]
+        return error[..., seen], jacobian[..., seen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +178,13 @@ class Closures:
         eliminating it leaves the visits about it.  A known distance weighs as all of them together:
         else the fit would shrink the arm to shrink its misclosures.
         """
-        point, slope = motion(self.model, x, active)
-        *batch, p, _, m = slope.shape
-        error, slopes = -self.centred(point), self.centred(slope)
-        parts = [error.reshape(*batch, 3 * m), slopes.reshape(*batch, p, 3 * m)]
+        point, arms = motion(self.model, x, active)
+        *batch, p, _, m = arms.shape
+        error, jacobian = -self.centred(point), self.centred(arms)
+        parts = [error.reshape(*batch, 3 * m), jacobian.reshape(*batch, p, 3 * m)]
         if len(self.pairs):
             a, b = self.pairs.T
-            place, moved = self.barycentres(point), self.barycentres(slope)
+            place, moved = self.barycentres(point), self.barycentres(arms)
             gap = place[..., a] - place[..., b]
             length = np.maximum(np.linalg.norm(gap, axis=-2), 1e-12)
             weight = np.sqrt(3.0 * m)
@@ -216,16 +216,16 @@ class Squares:
         return np.zeros(int(self.active.sum()), dtype=bool)
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
-        """Cost (...), slope (..., free) and Gram matrix (..., free, free)."""
-        error, slopes = self.instrument.rows(x, self.active)
+        """Cost (...), gradient (..., free) and Gram matrix (..., free, free)."""
+        error, jacobian = self.instrument.rows(x, self.active)
         cost = np.einsum("...r,...r->...", error, error)
-        slope = (slopes @ error[..., None])[..., 0]
-        return np.asarray(cost), np.asarray(slope), slopes @ np.swapaxes(slopes, -1, -2)
+        gradient = (jacobian @ error[..., None])[..., 0]
+        return np.asarray(cost), np.asarray(gradient), jacobian @ np.swapaxes(jacobian, -1, -2)
 
     def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
         """The same: there is nothing to eliminate."""
-        cost, slope, gram = self.normal(x)
-        return x, cost, slope, gram, np.zeros((len(cost), 0, slope.shape[-1]))
+        cost, gradient, gram = self.normal(x)
+        return x, cost, gradient, gram, np.zeros((len(cost), 0, gradient.shape[-1]))
 
     def step(self, x: State, dx: Array) -> State:
         """The states moved by a step in the active parameters."""
@@ -237,5 +237,5 @@ class Squares:
 def gram_of(instrument: Instrument, x: State) -> Array:
     """The Gram matrix of all parameters at a state: (p, p)."""
     every = np.ones(instrument.names.count, dtype=bool)
-    _, slopes = instrument.rows(x, every)
-    return np.asarray(slopes @ slopes.T)
+    _, jacobian = instrument.rows(x, every)
+    return np.asarray(jacobian @ jacobian.T)

@@ -119,8 +119,8 @@ def ball_start(robot: Robot, closures: Closures) -> State:
     free[-3:] = True
     problem = Squares(replace(closures, pairs=closures.pairs[:0]), free)
     start = state_of(robot.mdh, np.zeros(3), np.zeros(0))
-    _, slope, gram = problem.normal(start)
+    _, gradient, gram = problem.normal(start)
     values, vectors = np.linalg.eigh(gram)
     told = values > LINEAR_RANK**2 * max(float(values[-1]), 1e-30)
-    ball = vectors[:, told] @ (vectors[:, told].T @ slope / values[told])
+    ball = vectors[:, told] @ (vectors[:, told].T @ gradient / values[told])
     return problem.step(start, ball)

@@ -65,7 +65,7 @@ class Iso9283:
 
     robot: str
     source: str
-    targets: tuple[str, ...]
+    target_names: tuple[str, ...]
     tcp: str
     parts: Mapping[str, Part]
     conditions: tuple[tuple[str, str, str], ...]
@@ -100,8 +100,8 @@ class Iso9283:
         rows: list[tuple[TableCell, ...]] = [
             (title, name, target, *summary(1e3 * np.linalg.norm(values.targets[:, i], axis=1)))
             for title, name, _, values in self.rows()
-            for i, target in enumerate(self.targets)
-            if len(self.targets) > 1
+            for i, target in enumerate(self.target_names)
+            if len(self.target_names) > 1
         ]
         header = ("poses", "cell", "target", "count", "AP mean mm", "RMS mm", "max mm")
         formats = ("", "", "", "d", *[".4f"] * 3)
@@ -209,9 +209,11 @@ class Iso9283:
             "kind": "iso9283",
             "robot": self.robot,
             "data": self.source,
-            "targets": list(self.targets),
+            "targets": list(self.target_names),
             "tcp": self.tcp,
-            "parts": {key: part_to_dict(part, self.targets) for key, part in self.parts.items()},
+            "parts": {
+                key: part_to_dict(part, self.target_names) for key, part in self.parts.items()
+            },
             "conditions": [
                 dict(zip(("clause", "asked", "told"), row, strict=True)) for row in self.conditions
             ],
@@ -322,28 +324,28 @@ def iso9283(
     parts = {}
     for key, mask in (("holdout", stops.held), ("train", ~stops.held)):
         if mask.any():
-            parts[key] = part_of(cells, stops.take(mask), data.targets, chosen)
+            parts[key] = part_of(cells, stops.take(mask), data.target_names, chosen)
     robot = next(iter(cells.values())).robot.name
     notices = tuple(remarks(data, stops, parts))
     asked = conditions(data, stops)
-    return Iso9283(robot, data.source, data.targets, told, parts, asked, notices)
+    return Iso9283(robot, data.source, data.target_names, told, parts, asked, notices)
 
 
 def tcp_of(data: Measurements, tcp: str | Sequence[float]) -> tuple[int | Array, str]:
     """The TCP for `view_of`, and in words.  Raises OptionError."""
     if isinstance(tcp, str):
-        if tcp != "centroid" and tcp not in data.targets:
+        if tcp != "centroid" and tcp not in data.target_names:
             raise OptionError(
-                f"no TCP {tcp!r}; choose centroid, {', '.join(data.targets)}, or X,Y,Z in mm"
+                f"no TCP {tcp!r}; choose centroid, {', '.join(data.target_names)}, or X,Y,Z in mm"
             )
         if tcp == "centroid":
-            centre = "the targets' centroid" if len(data.targets) > 1 else data.targets[0]
+            centre = "the targets' centroid" if len(data.target_names) > 1 else data.target_names[0]
             return np.zeros(0), centre
-        return data.targets.index(tcp), tcp
+        return data.target_names.index(tcp), tcp
     point = np.asarray(tcp, dtype=float)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise OptionError("the TCP: give three numbers X,Y,Z in the last frame")
-    if len(data.targets) < 3:
+    if len(data.target_names) < 3:
         raise DataError(f"{data.source}: a TCP away from the targets needs three of them")
     x, y, z = 1e3 * point
     return point, f"the point {x:g}, {y:g}, {z:g} mm of the flange"
@@ -357,7 +359,7 @@ def part_of(
     values, each, middle = {}, {}, {}
     real = mean_of(stops.attained, pose, len(names))
     for key, cell in cells.items():
-        spots = cell.spots[[cell.targets.index(target) for target in targets]]
+        spots = cell.target_positions[[cell.target_names.index(target) for target in targets]]
         told = mean_of(stops.commanded[key], pose, len(names))
         middle[key] = view_of(cell, real, told, spots, tcp)
         each[key] = view_of(cell, stops.attained, stops.commanded[key], spots, tcp)
@@ -382,7 +384,7 @@ def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list
         if not np.isfinite(part.values[next(iter(part.values))].position).any():
             out.append(
                 f"the TCP was measured at none of the {PARTS[key]} poses: choose one target for it "
-                f"(--tcp {data.targets[0]})"
+                f"(--tcp {data.target_names[0]})"
             )
     return out
 

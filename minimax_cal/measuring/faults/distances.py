@@ -36,7 +36,7 @@ class Between:
 def between(data: Measurements) -> Between:
     """The distances of all pairs of targets that were measured together often enough."""
     pairs, centre, off = [], [], []
-    for a, b in combinations(range(len(data.targets)), 2):
+    for a, b in combinations(range(len(data.target_names)), 2):
         distance = np.linalg.norm(data.y[:, a] - data.y[:, b], axis=-1)
         if np.isfinite(distance).sum() >= FEWEST:
             pairs.append((a, b))

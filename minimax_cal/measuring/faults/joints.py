@@ -27,7 +27,7 @@ class Lag:
 
     fraction: Array
     explained: float
-    chance: float
+    by_others: float
     p: float
 
 
@@ -77,7 +77,7 @@ def unsettled(data: Measurements) -> tuple[Fault, ...]:
     rows = np.flatnonzero(known & followed(data) & moves(data).any(axis=1))
     found = lag(apart[rows], moves(data)[rows])
     many = data.q.shape[1] > 1
-    lagging = many and found.p < 1e-3 and found.explained > max(0.3, 1.5 * found.chance)
+    lagging = many and found.p < 1e-3 and found.explained > max(0.3, 1.5 * found.by_others)
     middle = float(np.median(found.fraction)) if lagging else 0.0
     says = f"read-back joints differ from the given ones by {1e3 * size:.3g} mrad RMS"
     if lagging:

@@ -9,9 +9,9 @@ import numpy as np
 from scipy import stats
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.chance import ALIKE, FALSE_ALARM
 from minimax_cal.measuring.faults.distances import Between, between, scatter
 from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.faults.limits import ALIKE, FALSE_ALARM
 from minimax_cal.measuring.history import visits
 from minimax_cal.measuring.measurements import Measurements
 
@@ -133,9 +133,9 @@ def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fa
     rows = order[step.at :]
     amounts = [Amount("size", size, float(step.sigma[own].max()), "m")]
     for pair in own:
-        a, b = (data.targets[i] for i in apart.pairs[pair])
+        a, b = (data.target_names[i] for i in apart.pairs[pair])
         amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), float(step.sigma[pair]), "m"))
-    place = " or ".join(data.targets[i] for i in step.targets)
+    place = " or ".join(data.target_names[i] for i in step.targets)
     text = (
         f"{place} moved by {1e3 * size:.3g} mm or more before line {data.line[rows[0]]} "
         f"(visit {step.at + 1} of {len(order)})"

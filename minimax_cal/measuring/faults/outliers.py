@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.chance import ALIKE
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST, Between, between, scatter
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
+from minimax_cal.measuring.faults.limits import ALIKE
 from minimax_cal.measuring.faults.surprise import heights, unlikely
 from minimax_cal.measuring.measurements import Measurements
 
@@ -38,9 +38,9 @@ def outlying(
         return ()
     points = sorted(found)
     rows, targets = np.array(points).T
-    named = listed([f"line {data.line[row]} {data.targets[target]}" for row, target in points])
+    named = listed([f"line {data.line[row]} {data.target_names[target]}" for row, target in points])
     by = " and by ".join(sorted(set(found.values())))
-    places = sorted({data.targets[target] for target in targets})
+    places = sorted({data.target_names[target] for target in targets})
     return (
         Fault(
             "outliers",
@@ -128,7 +128,7 @@ def level(apart: Between, data: Measurements, shifts: tuple[Fault, ...]) -> Betw
         if fault.rows.size == 0:
             continue
         for pair in np.flatnonzero(apart.of(int(fault.targets[0]))):
-            a, b = (data.targets[i] for i in apart.pairs[pair])
+            a, b = (data.target_names[i] for i in apart.pairs[pair])
             for amount in fault.parameters:
                 if amount.name == f"{a}-{b}":
                     off[pair, later] -= amount.value

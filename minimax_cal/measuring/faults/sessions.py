@@ -8,9 +8,9 @@ import numpy as np
 from scipy import stats
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.chance import FALSE_ALARM
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
+from minimax_cal.measuring.faults.limits import FALSE_ALARM
 from minimax_cal.measuring.history import sessions
 from minimax_cal.measuring.measurements import Measurements
 
@@ -81,9 +81,9 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
         [np.where((label == s)[:, None, None], design, 0.0) for s in np.unique(label)], axis=2
     ).reshape(len(value), -1)
     left = [float(((value - a @ np.linalg.lstsq(a, value)[0]) ** 2).sum()) for a in (one, each)]
-    spare, more = len(value) - each.shape[1], each.shape[1] - 6
-    ratio = (left[0] - left[1]) / more / max(left[1] / spare, 1e-30)
-    if stats.f.sf(ratio, more, spare) > 0.1 * FALSE_ALARM or left[0] < 1.1 * left[1]:
+    dof, more = len(value) - each.shape[1], each.shape[1] - 6
+    ratio = (left[0] - left[1]) / more / max(left[1] / dof, 1e-30)
+    if stats.f.sf(ratio, more, dof) > 0.1 * FALSE_ALARM or left[0] < 1.1 * left[1]:
         return ()
     jump = float(np.sqrt(max(left[0] - left[1], 0.0) / len(rows)))
     return (

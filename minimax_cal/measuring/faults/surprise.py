@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults.chance import outlier_limit
 from minimax_cal.measuring.faults.distances import FEWEST, Between, scatter
+from minimax_cal.measuring.faults.limits import outlier_limit
 from minimax_cal.measuring.measurements import Measurements
 
 TAIL = 1.6  # sigma: what 95 % of a fit's errors keep to (1.96 were they Gaussian)
@@ -18,7 +18,7 @@ def heights(data: Measurements, error: Array) -> Array:
     NaN where a target is missing.  Along the plane the distances say more: no turn of the flange
     changes them.
     """
-    k = len(data.targets)
+    k = len(data.target_names)
     if k < 3 or not len(error):
         return np.full((k, data.poses), np.nan)
     whole = data.seen.all(axis=1) & np.isfinite(error).all(axis=(0, 2))

@@ -8,9 +8,9 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.checks import transpositions
-from minimax_cal.measuring.faults.chance import outlier_limit
 from minimax_cal.measuring.faults.distances import Between, between
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
+from minimax_cal.measuring.faults.limits import outlier_limit
 from minimax_cal.measuring.measurements import Measurements
 
 MOST_ORDERED = 5  # targets of which all orders are tried

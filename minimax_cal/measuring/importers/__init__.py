@@ -78,7 +78,8 @@ class Imported:
         """What came out, in a line."""
         data = self.data
         whole = ", ".join(
-            f"{name} at {count}" for name, count in zip(data.targets, data.seen.sum(0), strict=True)
+            f"{name} at {count}"
+            for name, count in zip(data.target_names, data.seen.sum(0), strict=True)
         )
         return f"{data.poses} poses, {data.q.shape[1]} joints; points: {whole}"
 

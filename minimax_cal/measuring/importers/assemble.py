@@ -136,7 +136,7 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
     data = Measurements(
         q=raw_q * scale,
         y=raw * LENGTHS[scales.y],
-        targets=targets,
+        target_names=targets,
         sliding=sliding,
         line=joints.line,
         columns=columns,

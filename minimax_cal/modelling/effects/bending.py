@@ -115,7 +115,11 @@ def tool_columns(scene: Scene, place: str, choice: Choice) -> Columns:
         turn = (axes[:, None] * attitude[None, :, None]).reshape(9, 3, -1)
         names = [f"turn {a}{b}" for a in "xyz" for b in "xyz"]
     else:
-        spot = scene.spots.mean(axis=0) if choice["lever"] == 0.0 else np.array([0.0, 0.0, 1.0])
+        spot = (
+            scene.target_positions.mean(axis=0)
+            if choice["lever"] == 0.0
+            else np.array([0.0, 0.0, 1.0])
+        )
         lever = np.einsum("a,acm->cm", spot / max(float(np.linalg.norm(spot)), 1e-3), axes)
         turn = cross(lever, np.broadcast_to(down, lever.shape))[None]
         names = ["turn"]

@@ -26,7 +26,7 @@ class Scene:
     """An arm at its measured poses, in its base frame.
 
     robot: with the geometry at hand.  data: m poses with the columns of `with_history`.
-    links: the chain there.  spots: (k, 3) targets in the last frame [m].
+    links: the chain there.  target_positions: (k, 3) in the last frame [m].
     points: (k, 3, m) the targets in the base frame [m].
     rotation, origin: (3, 3), (3,) pose of the base in the measurement frame [m].
     """
@@ -34,7 +34,7 @@ class Scene:
     robot: Robot
     data: Measurements
     links: Chain
-    spots: Array
+    target_positions: Array
     points: Array
     rotation: Array
     origin: Array
@@ -69,7 +69,7 @@ class Scene:
         return np.ascontiguousarray((self.data.q * self.robot.sign).T)
 
     @cached_property
-    def slope(self) -> Array:
+    def jacobian(self) -> Array:
         """(n, k, 3, m) motion of every target per unit of every joint [m per rad or m]."""
         z, o = self.links.z[:, None], self.links.before[:, None]
         turned = kinematics.cross(np.broadcast_to(z, (self.joints, *self.points.shape)),
@@ -136,7 +136,7 @@ class Scene:
         one = np.zeros(self.joints)
         one[-1] = 1.0
         com = np.zeros((self.joints, 3))
-        com[-1] = self.spots.mean(axis=0)
+        com[-1] = self.target_positions.mean(axis=0)
         return self.torque(one, com) * self.column("payload")
 
     @cached_property
@@ -217,7 +217,7 @@ class Columns:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
         out = np.zeros((len(self.names), *scene.points.shape))
         if self.turn.size:
-            out = out + np.einsum("dnm,nkcm->dkcm", self.turn, scene.slope, optimize=True)
+            out = out + np.einsum("dnm,nkcm->dkcm", self.turn, scene.jacobian, optimize=True)
         if self.shift.size:
             out = out + self.shift
         return out
@@ -225,7 +225,7 @@ class Columns:
     def doubts(self, scene: Scene) -> list[tuple[int, Array]]:
         """Parameter and (r, k, 3, m) displacements that its field may differ by, one sigma each."""
         turned = [
-            (owner, np.einsum("dnm,nkcm->dkcm", part, scene.slope, optimize=True))
+            (owner, np.einsum("dnm,nkcm->dkcm", part, scene.jacobian, optimize=True))
             for owner, part in enumerate(self.doubt)
             if len(part)
         ]

@@ -201,7 +201,7 @@ class Fitted:
         links = kinematics.chain(
             scene.robot.mdh, scene.q.T + self.turn(scene), scene.robot.prismatic
         )
-        return kinematics.points(links, scene.spots) + self.shift(scene)
+        return kinematics.points(links, scene.target_positions) + self.shift(scene)
 
     def to_list(self) -> list[dict[str, object]]:
         """For JSON, in SI; an infinite time constant is null."""

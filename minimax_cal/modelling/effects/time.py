@@ -118,7 +118,7 @@ FRAME_DRIFT = Effect(
 
 def nest(scene: Scene, place: str, choice: Choice) -> Columns:
     """One target sits elsewhere on the flange from a moment on."""
-    target = scene.data.targets.index(place)
+    target = scene.data.target_names.index(place)
     after = (scene.column("clock") >= choice["since"]).astype(float)
     shift = np.zeros((3, *scene.points.shape))
     shift[:, target] = after * scene.links.axes
@@ -138,7 +138,7 @@ TARGET_SHIFT = Effect(
     "target_shift",
     "a reflector's nest moved during the session",
     "the target sits elsewhere after row k",
-    lambda scene: scene.data.targets if scene.targets > 1 and scene.has("clock") else (),
+    lambda scene: scene.data.target_names if scene.targets > 1 and scene.has("clock") else (),
     nest,
     finer=finer,
     needs=lambda scene: "" if scene.targets > 1 else "a second target",
@@ -152,7 +152,7 @@ def sight(scene: Scene, place: str, choice: Choice) -> Columns:
     seen = scene.points - scene.instrument[:, None]
     unit = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     shift = np.zeros((1, *scene.points.shape))
-    chosen = slice(None) if place == "all" else scene.data.targets.index(place)
+    chosen = slice(None) if place == "all" else scene.data.target_names.index(place)
     shift[0, chosen] = unit[chosen]
     return Columns(("r",), ("m",), shift=shift)
 
@@ -161,7 +161,7 @@ TARGET_OFFSET = Effect(
     "target_offset",
     "a reflector's offset or the instrument's zero is wrong along the line of sight",
     "dp = r u, u from the instrument to the point",
-    lambda scene: (*scene.data.targets, "all") if scene.targets > 1 else ("all",),
+    lambda scene: (*scene.data.target_names, "all") if scene.targets > 1 else ("all",),
     sight,
     typical=5e-3,
 )

@@ -85,7 +85,7 @@ def relax(
     for _ in range(rounds):
         support = np.flatnonzero(weights + found > NOTHING)
         newer = union(begin, support, highest(menu.scores(latest), count + FEW))
-        worse = union(posed, worst_of(criterion, cov))
+        worse = union(posed, minimax_problem(criterion, cov))
         known = np.isin(newer, given).all() and np.isin(worse, posed).all()
         if bound >= size * (1.0 - gap) or known:
             break
@@ -113,7 +113,7 @@ def union(*parts: Array) -> Array:
     return np.unique(np.concatenate(parts))
 
 
-def worst_of(criterion: Criterion, cov: Array) -> Array:
+def minimax_problem(criterion: Criterion, cov: Array) -> Array:
     """The predictions that matter most where the largest counts; none otherwise."""
     if not isinstance(criterion, Largest):
         return np.zeros(0, dtype=int)

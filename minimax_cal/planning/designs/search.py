@@ -48,16 +48,16 @@ def first_design(menu: Menu, criterion: Criterion, count: int, seed: int) -> Arr
 
 
 def best_design(
-    menu: Menu, criterion: Criterion, first: Array, report: Callable[[str], None]
+    menu: Menu, criterion: Criterion, first: Array, progress: Callable[[str], None]
 ) -> Found:
     """The best design found of as many different experiments as in a first one, and a bound."""
     count = len(first)
-    report("relaxation")
+    progress("relaxation")
     relaxed = relax(menu, criterion, first)
     few = highest(relaxed.scores, PER_PLACE * count + BESIDE)
     order = np.lexsort((-relaxed.scores, -np.round(relaxed.weights, 4)))
     likely = np.union1d(np.union1d(few, order[:count]), first)
-    report("exchange")
+    progress("exchange")
     starts = [order[:count], first, likely[greedy(menu.take(likely), criterion, count)]]
     if not isinstance(criterion, Trace):
         mean = Trace(criterion.mix(inverse(menu.information(relaxed.weights))))

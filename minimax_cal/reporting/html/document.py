@@ -93,7 +93,7 @@ def counted(sources: Sources) -> str:
     else:
         first = sources.gaps[0].content.gap.ladder[0]
         held, train = first.holdout.poses, first.train.poses
-    targets = len(sources.cells[0].targets) if sources.cells else 0
+    targets = len(sources.cells[0].target_names) if sources.cells else 0
     seen = f", {targets} target{'s' if targets > 1 else ''}" if targets else ""
     return f"{train} training, {held} held out{seen}"
 

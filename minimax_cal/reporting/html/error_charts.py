@@ -129,7 +129,7 @@ def cumulative(poses: Poses, names: Names) -> Figure:
 def boxes(poses: Poses, names: Names) -> Figure:
     """Quartiles and extremes of each target."""
     found = groups(poses)
-    targets = [label(name) for name in poses.data.targets]
+    targets = [label(name) for name in poses.data.target_names]
     every = np.concatenate([known(v) for _, *pair in found for v in pair])
     traces: list[dict[str, Any]] = []
     layout = frame(

@@ -58,7 +58,7 @@ def accuracy_table(fit: Fit) -> Table:
         )
         for name, s in named
     ]
-    targets = tuple(f"{name} RMS mm" for name in fit.cell.targets)
+    targets = tuple(f"{name} RMS mm" for name in fit.cell.target_names)
     header = ("poses", "count", "RMS mm", *spread, "mean mm", "max mm", *tails, *targets)
     formats = ("", "d", *[".4f"] * (len(header) - 2))
     return Table("Position error (distance between measured and predicted points)", header,

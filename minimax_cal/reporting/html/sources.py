@@ -225,9 +225,9 @@ def fit_of(content: Mapping[str, Any], path: str, digest: str) -> Fit:
     with reading(path, "base, targets or effects"):
         cell = cell_from_dict(content, path)
     for name, scores in found.accuracy:
-        if not len(scores.sse_mm2) == len(scores.points) == len(cell.targets):
+        if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
             raise CalibrationError(
-                f"{path}: accuracy.{name} is not of {len(cell.targets)} targets; {AGAIN}"
+                f"{path}: accuracy.{name} is not of {len(cell.target_names)} targets; {AGAIN}"
             )
     poses = poses_of(content, path, "calibration", cell)
     return Fit(path, digest, found, cell, nominal_of(content, path), poses)
@@ -262,7 +262,7 @@ def poses_of(content: Mapping[str, Any], path: str, kind: str, cell: Cell) -> tu
     with reading(path, "list of poses"):
         data, held = read_poses(given, path)
         before, after = (errors_of(given, name, data) for name in (BEFORE[kind], "final"))
-        if data.q.shape[1] != cell.robot.joints or set(data.targets) - set(cell.targets):
+        if data.q.shape[1] != cell.robot.joints or set(data.target_names) - set(cell.target_names):
             raise ValueError("joints or targets are not those of the robot")
         told = bool(given["visits_told"])
     return (Poses(data, held, before, after, told),)

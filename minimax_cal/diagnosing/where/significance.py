@@ -36,8 +36,8 @@ def explained(rest: Residual, features: Array, size: float) -> tuple[float, floa
     after = rest.rows - unit @ pull
     lever = np.minimum(summed((unit**2).sum((1, 2)), rest.group), 0.9)
     left = summed(np.einsum("mrs,mr->ms", unit, after), rest.group)
-    chance = float(((left**2).sum(1) / (1.0 - lever)).sum())
-    share = (float(pull @ pull) - chance) / total
+    expected = float(((left**2).sum(1) / (1.0 - lever)).sum())
+    share = (float(pull @ pull) - expected) / total
     return min(1.0, max(0.0, share)), score_flips(float(pull @ pull), score)
 
 
@@ -93,5 +93,5 @@ def pearson(excess: float, second: float, third: float) -> float:
     skew = third / second**1.5
     if skew < 1e-3:
         return float(norm.sf(excess / math.sqrt(2.0 * second)))
-    freedom = skew**-2.0
-    return float(chi2.sf(freedom + excess / math.sqrt(second) * math.sqrt(freedom), freedom))
+    dof = skew**-2.0
+    return float(chi2.sf(dof + excess / math.sqrt(second) * math.sqrt(dof), dof))
