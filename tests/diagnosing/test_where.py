@@ -465,7 +465,7 @@ def test_an_uncertain_noise_makes_p_larger(rng: np.random.Generator) -> None:
     error = made.noise(rng, 1.2 * SIGMA)
     data, rest = made.measured(error), made.fitted(error)
     sure = where(data, rest, made.joint_jacobian, made.cell.base, SIGMA)
-    guess = where(data, rest, made.joint_jacobian, made.cell.base, SIGMA, freedom=10)
+    guess = where(data, rest, made.joint_jacobian, made.cell.base, SIGMA, dof=10)
     assert sure.triage.shape.p < 1e-3
     assert guess.triage.shape.p > 0.05
 
