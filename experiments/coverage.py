@@ -23,8 +23,9 @@ import minimax_cal as mc
 from experiments import sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
-from minimax_cal.fitting.calibrate import Fit, Options, fit_cell, silent
 from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.uncertainty import (
     Poses,
     Uncertainty,
@@ -165,7 +166,7 @@ def measured(
     return measurements(q, y + spread * rng.normal(size=y.shape))
 
 
-def reference(arm: Cell, case: Case) -> Fit:
+def reference(arm: Cell, case: Case) -> Solved:
     """The fit of plenty of poses without noise: the truth in the parameters that are identified.
 
     What redundant parameters are off, others absorb; with model error, the best fit.
@@ -184,7 +185,7 @@ def along(axes: Array, x: State) -> Array:
     )
 
 
-def known_by_noise(fit: Fit) -> Uncertainty:
+def known_by_noise(fit: Solved) -> Uncertainty:
     """The uncertainty of a fit by its noises alone."""
     active = fit.estimator.model.active
     out = np.full((len(active),) * 2, np.nan)
@@ -236,7 +237,9 @@ def run(batch: Batch) -> Runs:
                 judged(cell, arm, case, rng),
             )
         )
-    names = tuple(name for name, on in zip(true.names.all, active, strict=True) if on)
+    names = tuple(
+        name for name, on in zip(true.estimator.model.names.all, active, strict=True) if on
+    )
     columns = (np.array(column) for column in zip(*rows, strict=True))
     return Runs(names, batch.count - len(rows), *columns)
 
@@ -323,7 +326,7 @@ def resampled(batch: Batch) -> tuple[Array, Array]:
         if not np.array_equal(found.place, place):
             continue
         low, high = found.interval(LEVEL).T
-        truth = along(fit.nominal.base[:3, :3], true.state)[place]
+        truth = along(fit.before.base[:3, :3], true.state)[place]
         held.append((low <= truth) & (truth <= high))
         q = random_poses(robot, WORKSPACE, rng)
         low, high = found.position_interval(q, LEVEL)

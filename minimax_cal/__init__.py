@@ -3,8 +3,9 @@
 from minimax_cal.correcting.compensate import Compensation, compensate
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.calibrate import Options, calibrate
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
 from minimax_cal.measuring import datasets
 from minimax_cal.measuring.measurements import (
@@ -18,12 +19,12 @@ from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
 from minimax_cal.solvers.minimize import minimize_max
 
 __all__ = [
-    "Calibration",
     "CalibrationError",
     "Cell",
     "Compensation",
     "DataError",
     "Diagnosis",
+    "Fit",
     "Measurements",
     "OptionError",
     "Options",
@@ -36,6 +37,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "load_cell",
+    "load_fit",
     "load_robot",
     "measurements",
     "minimize_max",

@@ -34,6 +34,7 @@ REAL = ("fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b")
 OBJECTIVES = ("minimax", "sum", "point", "pose", "smr:2")
 FORMATS = ("urdf", "ur-yaml", "ros-yaml", "dh-csv", "json", "moc")
 TIMES = {"seconds", "versions", "date", "cpu_seconds"}  # keys that no two runs share
+ADDED = {"arrays", "widening", "size"}  # keys that only the later revision has
 RENAMED: dict[str, str] = {}  # words of the earlier revision that were renamed on purpose
 POWER, SEED = 300.0, 41
 SEVERAL = 8  # pairs of effects, arms without a fault, arms of small effects
@@ -230,7 +231,8 @@ def differences(one: Any, other: Any, rel: float, at: str = "") -> Iterator[str]
     if isinstance(one, dict) and isinstance(other, dict):
         for key in sorted(one.keys() | other.keys()):
             new = RENAMED.get(key, key)
-            if key in TIMES or (key in RENAMED.values() and key not in one):
+            new_here = key not in one and (key in ADDED or key in RENAMED.values())
+            if key in TIMES or new_here:
                 continue
             if key not in one or new not in other:
                 yield f"{at}/{key}: only {'before' if key in one else 'now'}"

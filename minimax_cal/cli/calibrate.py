@@ -9,7 +9,8 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.fitting.calibrate import Options, calibrate
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import LOSSES, SQUARE
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
@@ -141,7 +142,6 @@ def calibrate_command(
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
     options.writable(output)
     options.writable(figure, kinds=PICTURES)
-    millimetres = float("nan") if distance_tolerance is None else distance_tolerance
     with options.stages(quiet=quiet) as progress:
         fit = calibrate(
             robot,
@@ -150,8 +150,8 @@ def calibrate_command(
             free=options.names_of(free),
             effects=options.names_of(effects),
             priors=dict(map(prior_of, prior)),
-            distance_tolerance=millimetres * 1e-3,
-            lever=float("nan") if lever is None else lever * 1e-3,
+            distance_tolerance=None if distance_tolerance is None else distance_tolerance * 1e-3,
+            lever=None if lever is None else lever * 1e-3,
             progress=progress,
             **choices,
         )

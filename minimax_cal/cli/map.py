@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 
 from minimax_cal.cli.options import JSON, QUIET, notify, show, writable
-from minimax_cal.fitting.uncertainty import FRAMES, uncertainty_from_dict
+from minimax_cal.fitting.uncertainty import FRAMES
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.maps import Grid, Predict, predictor, unknown, workspace_map
-from minimax_cal.judging.saved import AFTER, Saved, open_fit
+from minimax_cal.judging.saved import Saved, open_fit
 from minimax_cal.reporting.plots.figures import PICTURES
 from minimax_cal.reporting.plots.map import save_map
 
@@ -19,11 +19,9 @@ DEFAULTS = Grid()
 
 def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str, ...]]:
     """What the covariance of a saved fit predicts, and a notice where it holds none."""
-    cell = saved.cells[AFTER]
-    if "covariance" not in saved.content:
+    if saved.fit.uncertainty is None:
         return unknown, (f"{source}: holds no covariance, so nothing is predicted",)
-    known = uncertainty_from_dict(saved.content, cell, source)
-    return predictor(cell, known, frame), ()
+    return predictor(saved.fit.cell, saved.fit.uncertainty, frame), ()
 
 
 @click.command(name="map")

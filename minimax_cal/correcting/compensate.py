@@ -6,8 +6,7 @@ joints bring the calibrated arm, effects included, to that pose [docs/compensate
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -16,23 +15,22 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.fit import Fit, opened
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
-from minimax_cal.ground.files import read_text
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, load_cell, still
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import cross
-from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.robot import Robot
 
 FRAMES = ("best-fit", "flange", "own")
 # What moves the reflectors or the instrument, and not the flange of the arm.
@@ -194,7 +192,7 @@ def rms(values: Array) -> float:
 
 
 def compensate(
-    fit: Calibration | Cell | Path | str,
+    fit: Fit | Cell | Path | str,
     targets: Measurements | Array | Sequence[Sequence[float]],
     nominal: Robot | None = None,
     *,
@@ -224,15 +222,15 @@ def compensate(
         raise OptionError(f"lever {lever:g} m: must be positive and finite")
     if not 0.0 <= clock <= 1.0:
         raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
-    cell, robots, drawn = cells_of(fit)
-    if nominal is not None and not any(same(nominal, robot) for robot in robots):
-        robots, drawn = (nominal,), ()
-    if not robots:
+    cell, robot, drawn = cells_of(fit)
+    if nominal is not None and not (robot and same(nominal, robot)):
+        robot, drawn = nominal, None
+    if robot is None:
         raise CalibrationError("the fit does not tell its nominal robot; give it (--robot)")
-    check_like(robots[0], cell.robot)
+    check_like(robot, cell.robot)
     arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
-    base, tool, said = placed(cell, arm, robots[0], drawn, frame)
-    goal = base @ robots[0].pose(data.q) @ tool
+    base, tool, said = placed(cell, arm, robot, drawn, frame)
+    goal = base @ robot.pose(data.q) @ tool
     if np.isnan(lever):
         own = (
             rms(np.linalg.norm(cell.target_positions, axis=1))
@@ -260,42 +258,12 @@ def compensate(
     )
 
 
-def cells_of(
-    fit: Calibration | Cell | Path | str,
-) -> tuple[Cell, tuple[Robot, ...], tuple[Cell, ...]]:
+def cells_of(source: Fit | Cell | Path | str) -> tuple[Cell, Robot | None, Cell | None]:
     """The calibrated cell; the nominal robot and its cell, where the fit tells them."""
-    if isinstance(fit, Calibration):
-        return fit.cell, (fit.nominal.robot,), (fit.nominal,)
+    fit = opened(source)
     if isinstance(fit, Cell):
-        return fit, (), ()
-    cell = load_cell(fit)
-    content = json.loads(read_text(fit))
-    if "nominal_robot" not in content:
-        return cell, (), ()
-    robot = robot_from_dict(content["nominal_robot"], f"{fit}: nominal_robot")
-    return cell, (robot,), nominal_cell(cell, robot, content)
-
-
-def nominal_cell(cell: Cell, robot: Robot, content: Mapping[str, Any]) -> tuple[Cell, ...]:
-    """The nominal cell of a saved calibration, from its parameters; empty if they do not tell it.
-
-    Base entries are told along the nominal base's axes (`calibrate.parameter_table`).
-    """
-    try:
-        told = {p["name"]: p for p in content["parameters"]}
-        at, was = (np.array([told[f"base_{a}"][k] for a in "xyz"], dtype=float) * 1e-3
-                   for k in ("value", "nominal"))  # fmt: skip
-        turn = np.array([told[f"base_r{a}"]["value"] for a in "xyz"], dtype=float)
-        spots = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.target_names]
-        base = np.eye(4)
-        base[:3, :3] = cell.base[:3, :3] @ kinematics.rotation(-turn)
-        base[:3, 3] = base[:3, :3] @ was
-        apart = np.abs(base[:3, :3] @ at - cell.base[:3, 3]).max()
-        if not apart < 1e-5:
-            return ()
-        return (Cell(robot, base, cell.target_names, np.array(spots, dtype=float) * 1e-3),)
-    except (KeyError, TypeError, ValueError):
-        return ()
+        return fit, None, None
+    return fit.cell, fit.nominal.robot if fit.nominal else None, fit.nominal
 
 
 def same(one: Robot, other: Robot) -> bool:
@@ -399,7 +367,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
 
 
 def placed(
-    cell: Cell, arm: Cell, nominal: Robot, drawn: tuple[Cell, ...], frame: str
+    cell: Cell, arm: Cell, nominal: Robot, drawn: Cell | None, frame: str
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Where the nominal arm stands: its base in the calibrated base, its flange's own offset.
 
@@ -408,14 +376,10 @@ def placed(
     if frame == "own":
         return np.eye(4), np.eye(4), ()
     if drawn:
-        base = np.linalg.inv(cell.base) @ drawn[0].base
-        return (
-            base,
-            motion(cell.target_positions, drawn[0].target_positions)
-            if frame == "best-fit"
-            else np.eye(4),
-            (),
-        )
+        base = np.linalg.inv(cell.base) @ drawn.base
+        if frame == "flange":
+            return base, np.eye(4), ()
+        return base, motion(cell.target_positions, drawn.target_positions), ()
     q = random_poses(nominal, SAMPLE, np.random.default_rng(0))
     turn, moved = bent(arm, still(q, arm.target_names, arm.robot))
     flange = moved @ kinematics.forward(

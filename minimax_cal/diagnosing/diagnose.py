@@ -19,10 +19,11 @@ from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import ENOUGH, alternatives, resemblances
 from minimax_cal.evidence.noise import Noise, Rows, linearised
 from minimax_cal.evidence.selection import Choice, Library
-from minimax_cal.fitting.calibrate import Fit, Options, Progress, fit_cell, silent
-from minimax_cal.fitting.calibration import Provenance
 from minimax_cal.fitting.exchanged import misplaced, put_right
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.plausibility import check_sense
+from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
@@ -59,7 +60,7 @@ class Study:
     robot: Robot
     data: Measurements
     model: Model
-    fit: Fit
+    fit: Solved
     scene: Scene
     rows: Rows
 
@@ -83,7 +84,7 @@ class Study:
         return Cell.of(self.robot, self.fit.nominal, self.data.target_names, NOTHING)
 
 
-def studied(robot: Robot, data: Measurements, fit: Fit) -> Study:
+def studied(robot: Robot, data: Measurements, fit: Solved) -> Study:
     """A geometric fit linearised."""
     model, state = model_of(robot, data), fit.state
     scene = scene_of(robot, data, model, state)
@@ -183,7 +184,6 @@ def examined(
         data=sound,
         held=np.isin(sound.line, held.line),
         cells=tuple(cells),
-        maps=lies.turn,
     )
 
 
@@ -208,7 +208,7 @@ def located(study: Study) -> Where:
 
 def cleaned(
     robot: Robot, data: Measurements, seed: int, holdout: float, progress: Progress
-) -> tuple[Measurements, list[Fault], tuple[str, ...], Fit | None]:
+) -> tuple[Measurements, list[Fault], tuple[str, ...], Solved | None]:
     """The data with rows and points put right or left out, the faults, and remarks.
 
     Rows of the faults are lines of the file.  Also the geometric fit of the training poses, where

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.diagnosing.curves import Leftover, order_curve, residual_curve
-from minimax_cal.fitting.calibration import Provenance, finite
+from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
+from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
@@ -77,26 +79,30 @@ class Finding:
         """The effect and its place; of several lines the strongest."""
         return self.terms[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: lengths in millimetres."""
+    def parameters(self) -> list[dict[str, Any]]:
+        """Each with value, sigma and unit, for JSON: lengths in millimetres."""
         scale = [1e3 if unit == "m" else 1.0 for unit in self.units]
+        return [
+            {
+                "name": name,
+                "value": value * factor,
+                "sigma": finite(sigma * factor),
+                "unit": "mm" if unit == "m" else unit,
+            }
+            for name, unit, value, sigma, factor in zip(
+                self.names, self.units, self.values, self.sigmas, scale, strict=True
+            )
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
         return {
             "effect": self.term.effect,
             "place": self.term.place,
             "share": finite(self.share),
             "lambda": finite(self.size),
             "chance": finite(self.p_value),
-            "parameters": [
-                {
-                    "name": name,
-                    "value": value * factor,
-                    "sigma": finite(sigma * factor),
-                    "unit": "mm" if unit == "m" else unit,
-                }
-                for name, unit, value, sigma, factor in zip(
-                    self.names, self.units, self.values, self.sigmas, scale, strict=True
-                )
-            ],
+            "parameters": self.parameters(),
             "fixed": {key: finite(value) for key, value in self.fixed.items()},
             "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
             "alternatives": [other.to_dict() for other in self.alternatives],
@@ -113,7 +119,7 @@ class Step:
     holdout: Accuracy
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """What is still wrong with a calibrated robot.
 
@@ -125,8 +131,8 @@ class Diagnosis:
     noise: of a coordinate [m].  jitter: of a joint [rad].
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
-    held out.  cells: geometric, then with each effect.  maps: (training poses, n) what each joint
-    would have to turn to explain the geometric errors [rad].
+    held out.  cells: geometric, then with each effect.
+    stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
     robot: str
@@ -152,16 +158,40 @@ class Diagnosis:
     data: Measurements
     held: Array
     cells: tuple[Cell, ...]
-    maps: Array
+    stated_errors: tuple[Array, Array] | None = None
+    stated_curves: Mapping[str, Curve] | None = None
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        tables = "\n".join(table.html() for table in self.tables())
+        return f"<p>{escape(self.headline())}</p>\n{tables}"
 
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
         found = [finding.term for finding in self.findings]
         return Leftover.of(self.data, self.held, self.noise, self.cells, found)
 
+    @cached_property
+    def errors(self) -> tuple[Array, Array]:
+        """(k, m, 3) of all poses, geometry alone and with the effects, NaN not measured [m]."""
+        if self.stated_errors is not None:
+            return self.stated_errors
+        told = with_history(self.data)
+        return self.cells[0].error(told), self.cells[-1].error(told)
+
+    @cached_property
+    def curves(self) -> Mapping[str, Curve]:
+        """The errors against their cause (residual), and as the poses were visited (order)."""
+        if self.stated_curves is not None:
+            return self.stated_curves
+        left = self.leftover()
+        return {"residual": residual_curve(left), "order": order_curve(left)}
+
     def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more."""
-        left, told = self.leftover(), with_history(self.data)
+        """The JSON of the contract, and more; `from_dict` reads it back."""
 
         def held(kind: str) -> dict[str, float | None]:
             chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
@@ -200,20 +230,25 @@ class Diagnosis:
             "structure": {"p": finite(self.structure), "in": self.structure_in},
             "where": dict(self.where),
             "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
-            "curves": {
-                "residual": residual_curve(left).to_dict(),
-                "order": order_curve(left).to_dict(),
-            },
+            "curves": {name: curve.to_dict() for name, curve in self.curves.items()},
             "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
             "poses": pose_rows(
-                self.data,
-                self.held,
-                {"geometric": self.cells[0].error(told), "final": self.cells[-1].error(told)},
+                self.data, self.held, dict(zip(("geometric", "final"), self.errors, strict=True))
             ),
             "notices": list(self.notices),
             "seconds": self.seconds,
             "provenance": vars(self.provenance),
         }
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "diagnosis") -> Diagnosis:
+        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError.
+
+        Of the cells between geometry and the last effect nothing is kept.
+        """
+        from minimax_cal.diagnosing.result_file import read
+
+        return read(content, source)
 
     def json(self) -> str:
         """`to_dict` as text."""
@@ -272,3 +307,11 @@ class Diagnosis:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+
+def load_diagnosis(path: Path | str) -> Diagnosis:
+    """The diagnosis that `Diagnosis.save` or `minimax-cal diagnose -o` wrote.
+
+    Raises CalibrationError.
+    """
+    return Diagnosis.from_dict(saved_content(path), str(path))

@@ -36,10 +36,10 @@ class Distances:
     tolerance: Array
 
 
-def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distances:
+def measured_distances(data: Measurements, tolerance: float | None = None) -> Distances:
     """The distances of all pairs measured together three times or more, and how well known.
 
-    tolerance: for all pairs [m].  NaN takes the instrument's own accuracy: sqrt(2) times the
+    tolerance: for all pairs [m].  None takes the instrument's own accuracy: sqrt(2) times the
     typical `u95` where there is such a column, else the scatter of each measured distance.
     """
     pairs, mean, spread = [], [], []
@@ -54,7 +54,7 @@ def measured_distances(data: Measurements, tolerance: float = np.nan) -> Distanc
     scatter = np.array(spread)
     if "u95" in data.columns and np.isfinite(data.columns["u95"]).any():
         scatter = np.full(len(pairs), np.sqrt(2.0) * float(np.nanmedian(data.columns["u95"])))
-    if np.isfinite(tolerance):
+    if tolerance is not None:
         scatter = np.full(len(pairs), tolerance)
     return Distances(
         np.array(pairs, dtype=int).reshape(-1, 2),

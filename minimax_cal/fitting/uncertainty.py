@@ -9,10 +9,8 @@ all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +19,7 @@ from scipy import stats
 from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import read_text
-from minimax_cal.modelling.cell import Cell, load_cell, still
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
@@ -425,13 +422,6 @@ def holding_radius(covariance: Array, level: float = 0.95) -> Array:
 
 
 # ---- saved fits ------------------------------------------------------------------------------
-
-
-def load_uncertainty(path: Path | str) -> tuple[Cell, Uncertainty]:
-    """The cell of a saved calibration and how sure its parameters are.  Raises CalibrationError."""
-    cell = load_cell(path)
-    content = json.loads(read_text(path))
-    return cell, uncertainty_from_dict(content, cell, str(path))
 
 
 def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -> Uncertainty:

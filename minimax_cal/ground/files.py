@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 
 
@@ -72,3 +77,20 @@ def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationErr
         raise kind(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def finite(value: float) -> float | None:
+    """For JSON: null where there is no finite number."""
+    return value if math.isfinite(value) else None
+
+
+def plain(values: Array) -> Any:
+    """Nested lists for JSON, null where there is no number."""
+    out = values.astype(object)
+    out[~np.isfinite(values)] = None
+    return out.tolist()
+
+
+def numbers(values: Any) -> Array:
+    """An array of floats from JSON, NaN for null."""
+    return np.array(values, dtype=float)

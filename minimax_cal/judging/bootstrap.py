@@ -15,24 +15,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.fitting.calibrate import (
-    QP_TOLERANCE,
-    Fit,
-    Options,
-    Progress,
-    fit_cell,
-    silent,
-    usable,
-)
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.robust import flatness
+from minimax_cal.fitting.options import Progress, silent, usable
+from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.fitting.uncertainty import model_at
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.solvers import minimax
@@ -59,7 +50,7 @@ class Bootstrap:
     or whose solver did not end well.
     """
 
-    fit: Calibration
+    fit: Fit
     names: tuple[str, ...]
     units: tuple[str, ...]
     value: Array
@@ -142,7 +133,7 @@ def percentiles(values: Array, level: float) -> Array:
 
 
 def bootstrap(
-    fit: Calibration, replicates: int = 500, seed: int = 0, progress: Progress = silent
+    fit: Fit, replicates: int = 500, seed: int = 0, progress: Progress = silent
 ) -> Bootstrap:
     """Calibrate again on poses drawn from the training poses.
 
@@ -158,23 +149,19 @@ def bootstrap(
             "objective point rests on the few worst points, which a bootstrap cannot draw anew; "
             "choose sum, minimax, pose or smr:K"
         )
-    options, train = options_of(fit), fit.data.take(~fit.held)
-    found = fit_cell(fit.nominal.robot, train, options, silent)
-    draws = draw(found.group, replicates, np.random.default_rng(seed))
-    change, good = (solved_again if found.worst else stepped)(
-        found, train, options, draws, progress
-    )
+    draws = draw(fit.group, replicates, np.random.default_rng(seed))
+    change, good = (solved_again if fit.minimax else stepped)(fit, draws, progress)
     # a robust loss would weigh each draw anew, and so give way more than with weights that are kept
-    change = change * flatness(found.robust, found.state)
+    change = change * fit.widening
     lost = replicates - int(np.count_nonzero(good))
     if lost > MOST_LOST * replicates:
         raise DataError(
             f"{fit.data.source}: {lost} of {replicates} draws of {draws.times.shape[1]} poses do "
             f"not determine the {change.shape[1]} parameters; measure more poses"
         )
-    place = np.flatnonzero(found.identification.active)
-    by_name = {p.name: p for p in fit.parameters}
-    chosen = [by_name[found.names.all[i]] for i in place]
+    place = np.flatnonzero(fit.identification.active)
+    names = fit.estimator.model.names.all
+    chosen = [fit.parameters[names[i]] for i in place]
     return Bootstrap(
         fit=fit,
         names=tuple(p.name for p in chosen),
@@ -182,7 +169,7 @@ def bootstrap(
         value=np.array([p.value for p in chosen]),
         change=change[good],
         place=place,
-        out_of_bag=unseen(found, change[good], draws, good),
+        out_of_bag=unseen(fit, change[good], draws, good),
         lost=lost,
     )
 
@@ -207,27 +194,18 @@ def draw(group: Array, replicates: int, rng: np.random.Generator) -> Draws:
     return Draws(rng.multinomial(count, np.full(count, 1.0 / count), size=replicates), member)
 
 
-def options_of(fit: Calibration) -> Options:
-    """The options that a calibration was made with, its effects with the variants chosen."""
-    settings = dict(fit.provenance.settings)
-    nan = {key: np.nan for key, value in settings.items() if value is None}
-    return Options(**{**settings, **nan, "effects": fit.cell.effects.terms})  # type: ignore[arg-type]
-
-
-def stepped(
-    found: Fit, train: Measurements, options: Options, draws: Draws, progress: Progress
-) -> tuple[Array, Array]:
+def stepped(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Array]:
     """Replicates of a sum of squares: two Gauss-Newton steps from the fit.
 
     The first takes all at once, since each row's part of the normal equations is the same for all.
     Returns the changes (B, p) of the free parameters, and (B,) True where the draws determine them.
     """
-    model, share = found.estimator.model, found.estimator.share
-    model = model.emphasise(share)
-    model = with_poses(model, found.estimator.mix) if len(found.estimator.mix) else model
-    part, gradient = normal_parts(model, found.state, draws)
+    estimator, state = fit.estimator, fit.cell.state
+    model = estimator.model.emphasise(estimator.share)
+    model = with_poses(model, estimator.mix) if len(estimator.mix) else model
+    part, gradient = normal_parts(model, state, draws)
     prior = model.prior.weight[model.active]
-    off = (model.prior.mean - model.values(found.state))[model.active]
+    off = (model.prior.mean - model.values(state))[model.active]
     good = determined(draws, part, prior)
     gram = np.tensordot(draws.times[good], part, 1) + np.diag(prior)
     change = np.zeros((len(good), len(prior)))
@@ -238,32 +216,31 @@ def stepped(
         if done % PACE == 0:
             progress(f"replicate {number + 1} of {len(good)}")
         problem = SumOfSquares(replace(model, weight=model.weight * draws.rows(number)))
-        x = problem.step(found.state, change[number])
+        x = problem.step(state, change[number])
         _, gradient, gram = problem.normal(x)
         x = problem.step(x, solve_normal(gram, gradient[:, None])[:, 0])
-        change[number] = between(found.state, x)[model.active]
+        change[number] = between(state, x)[model.active]
     return change, good
 
 
-def solved_again(
-    found: Fit, train: Measurements, options: Options, draws: Draws, progress: Progress
-) -> tuple[Array, Array]:
+def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Array]:
     """Replicates of a minimax, each solved from the fit.  Returns as `stepped`."""
+    options, estimator, state, train = fit.options, fit.estimator, fit.cell.state, fit.train
     qp = partial(solve_qp, name=usable(options.qp)[0], tolerance=QP_TOLERANCE)
-    active = found.estimator.model.active
-    part, _ = normal_parts(found.estimator.model, found.state, draws)
-    good = determined(draws, part, found.estimator.model.prior.weight[active])
+    active = estimator.model.active
+    part, _ = normal_parts(estimator.model, state, draws)
+    good = determined(draws, part, estimator.model.prior.weight[active])
     change = np.zeros((len(good), int(active.sum())))
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % PACE == 0:
             progress(f"replicate {number + 1} of {len(good)}")
         rows = np.repeat(np.arange(len(draws.member)), draws.rows(number))
-        model = found.estimator.at(rows).model
+        model = estimator.at(rows).model
         distances = measured_distances(train.take(rows), options.distance_tolerance)
-        problem = minimax_problem(model, found.state, distances, options.distance, "target")
-        best = minimax.solve(problem, found.state, qp, Sqp(hessian=options.hessian))
+        problem = minimax_problem(model, state, distances, options.distance, "target")
+        best = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
         good[number] = best.status is Status.CONVERGED
-        change[number] = between(found.state, best.x)[active]
+        change[number] = between(state, best.x)[active]
     return change, good
 
 
@@ -307,11 +284,11 @@ def between(start: State, end: State) -> Array:
     )
 
 
-def unseen(found: Fit, change: Array, draws: Draws, good: Array) -> Array:
+def unseen(fit: Fit, change: Array, draws: Draws, good: Array) -> Array:
     """(B,) RMS distance of each replicate on the poses that it has not seen, to first order [m]."""
-    model = found.estimator.model
-    error = np.swapaxes(np.nan_to_num(model.error(found.state)), 0, 1)
-    jacobian = np.swapaxes(model.jacobian(found.state), 0, 1)[..., model.active]
+    model, state = fit.estimator.model, fit.cell.state
+    error = np.swapaxes(np.nan_to_num(model.error(state)), 0, 1)
+    jacobian = np.swapaxes(model.jacobian(state), 0, 1)[..., model.active]
     out = np.full(len(change), np.nan)
     for i, number in enumerate(np.flatnonzero(good).tolist()):
         left = draws.rows(number) == 0

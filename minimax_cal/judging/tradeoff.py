@@ -20,9 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.calibrate import QP_TOLERANCE, Progress, calibrate, silent, usable
-from minimax_cal.fitting.calibration import Calibration, Provenance
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.minimax_problem import MinimaxProblem, minimax_problem
+from minimax_cal.fitting.options import Progress, silent, usable
+from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, write_whole
@@ -262,41 +264,36 @@ def tradeoff(
     if not 0 <= steps <= MOST_STEPS:
         raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")
     began = time.perf_counter()
-    split = {"holdout": holdout, "seed": seed}
-    first = calibrate(robot, data, "sum", qp, progress, **split)
-    last = calibrate(robot, data, "point", qp, progress, **split)
+    first, last = (
+        calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
+        for objective in ("sum", "point")
+    )
     worst = problem_of(first)
     ends = (
-        Compromise.of(worst, 1.0, state_of(first), first.status),
-        Compromise.of(worst, 0.0, state_of(last), last.status),
+        Compromise.of(worst, 1.0, first.cell.state, first.status),
+        Compromise.of(worst, 0.0, last.cell.state, last.status),
     )
     solver = partial(solve_qp, name=usable(qp)[0], tolerance=QP_TOLERANCE)
     curve = curve_of(worst, ends, steps, solver, progress)
+    settings = {"steps": steps, "qp": qp, "holdout": holdout, "seed": seed}
     names = ("sum", *["compromise"] * (len(curve) - 2), "point")
     return Tradeoff(
         robot=first.robot.name,
         choices=tuple(choice_of(first, *each) for each in zip(names, curve, strict=True)),
         seconds=time.perf_counter() - began,
         notices=tuple(dict.fromkeys((*first.notices, *last.notices))),
-        provenance=Provenance.of(first.robot, first.data, {"steps": steps, "qp": qp, **split}),
+        provenance=Provenance.of(first.robot, first.data, settings),
     )
 
 
-def problem_of(fit: Calibration) -> MinimaxProblem:
+def problem_of(fit: Fit) -> MinimaxProblem:
     """The worst-point problem on the training poses of a fit, with its identified parameters."""
-    model = model_of(fit.nominal.robot, fit.data.take(~fit.held))
-    model = model.only(fit.identification.active)
-    return minimax_problem(model, state_of(fit), fit.distances, "two-sided", "point")
+    model = model_of(fit.before.robot, fit.train).only(fit.identification.active)
+    return minimax_problem(model, fit.cell.state, fit.distances, "two-sided", "point")
 
 
-def state_of(fit: Calibration) -> State:
-    """The parameters of a fit."""
-    cell = fit.cell
-    return cell.state
-
-
-def choice_of(fit: Calibration, name: str, compromise: Compromise) -> Choice:
+def choice_of(fit: Fit, name: str, compromise: Compromise) -> Choice:
     """A compromise as a cell, judged on the training and held-out poses of a fit."""
-    cell = Cell.of(fit.nominal.robot, compromise.state, fit.cell.target_names)
+    cell = Cell.of(fit.before.robot, compromise.state, fit.cell.target_names)
     train, held = (accuracy(cell.error(fit.data.take(rows))) for rows in (~fit.held, fit.held))
     return Choice(name, compromise.share, cell, train, held, compromise.status)

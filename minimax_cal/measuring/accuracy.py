@@ -27,6 +27,13 @@ class Accuracy:
     counts: tuple[int, ...]
     worst: tuple[int, int] = (-1, -1)
 
+    def by_target(self) -> tuple[float, ...]:
+        """RMS of each target, NaN where it was not measured [mm]."""
+        return tuple(
+            math.sqrt(square / count) if count else math.nan
+            for square, count in zip(self.sse_mm2, self.counts, strict=True)
+        )
+
     def table(self, title: str, targets: tuple[str, ...]) -> Table:
         """As a table, a row a target and one for all."""
         rows: list[tuple[Cell, ...]] = [

@@ -9,6 +9,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import numbers, plain
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements, measurements
 
@@ -44,13 +45,6 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
     }
 
 
-def plain(values: Array) -> Any:
-    """Nested lists, null where there is no number."""
-    out = values.astype(object)
-    out[~np.isfinite(values)] = None
-    return out.tolist()
-
-
 def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, Array]:
     """Measurements and (m,) which are held out, from `pose_rows`.  Raises DataError."""
     try:
@@ -58,7 +52,8 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
             name: np.array(column) if name in LABELS else numbers(column)
             for name, column in content["columns"].items()
         }
-        columns["order"] = np.array(content["visit"], dtype=float)
+        if content.get("visits_told", True):
+            columns["order"] = np.array(content["visit"], dtype=float)
         data = measurements(numbers(content["q"]), 1e-3 * numbers(content["measured_mm"]))
         held = np.array(content["split"]) == "holdout"
         line = np.array(content["line"], dtype=int)
@@ -75,8 +70,3 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
             "minimax-cal calibrate -o"
         ) from error
     return Measurements(data.q, data.y, names, sliding, line, columns, source=source), held
-
-
-def numbers(values: Any) -> Array:
-    """An array of floats, NaN for null."""
-    return np.array(values, dtype=float)

@@ -23,6 +23,10 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, robot_from_dict
 
 
+class NotSaved(CalibrationError):
+    """A file that holds no saved result."""
+
+
 @dataclass(frozen=True, eq=False)
 class Cell:
     """A robot, its base in the measurement frame, and the targets on its flange.
@@ -160,14 +164,18 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
 
 def load_cell(path: Path | str) -> Cell:
     """The calibrated cell of a file that `minimax-cal calibrate -o` wrote."""
-    text = read_text(path)
+    return cell_from_dict(saved_content(path), str(path))
+
+
+def saved_content(path: Path | str) -> Mapping[str, Any]:
+    """The JSON of a saved calibration.  Raises NotSaved."""
     try:
-        content = json.loads(text)
+        content = json.loads(read_text(path, kind=NotSaved))
     except (json.JSONDecodeError, RecursionError) as error:
-        raise CalibrationError(f"{path}: is not JSON ({error})") from error
+        raise NotSaved(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, Mapping):
-        raise CalibrationError(f"{path}: is not a saved calibration")
-    return cell_from_dict(content, str(path))
+        raise NotSaved(f"{path}: is not a saved calibration")
+    return content
 
 
 def evaluate(cell: Cell, data: Measurements) -> Accuracy:

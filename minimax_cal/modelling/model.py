@@ -445,13 +445,13 @@ def model_of(robot: Robot, data: Measurements) -> Model:
     )
 
 
-def pose_weights(data: Measurements, lever: float) -> Array:
+def pose_weights(data: Measurements, lever: float | None = None) -> Array:
     """W (m, 3k, 3k) that turns the errors of three or more targets into pose errors, squared.
 
     e'We = k |e_c|^2 + k lever^2 |e_w|^2 + stiffness |e_s|^2 per pose: e_c is the error of the
     targets' centroid, e_w the small turn that fits their errors best, e_s what no rigid motion
     explains.  e_s depends on the targets' places alone, and must weigh as much as the turn: a
-    smaller triangle would turn errors into small ones.  lever: metres that a radian counts as; NaN
+    smaller triangle would turn errors into small ones.  lever: metres that a radian counts as; None
     for the targets' own, with which W is nearly the plain sum.  Rows where a target is missing
     are zero.
     """
@@ -461,7 +461,7 @@ def pose_weights(data: Measurements, lever: float) -> Array:
     inertia = (arm**2).sum((1, 2))[:, None, None] * np.eye(3) - np.swapaxes(arm, 1, 2) @ arm
     inertia[~whole] = np.eye(3)
     own = float(np.sqrt(np.trace(inertia[whole].mean(axis=0)) / 3.0 / k))
-    lever = lever if np.isfinite(lever) else own
+    lever = own if lever is None else lever
     centre = np.tile(np.eye(3) / k, k)
     turned = np.concatenate(np.moveaxis(hat(arm), 1, 0), axis=-1)
     turn = np.linalg.solve(inertia, turned)

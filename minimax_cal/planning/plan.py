@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.calibrate import silent
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.options import silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
@@ -36,7 +36,7 @@ def plan(
     robot: Robot | str | Path,
     poses: int,
     *,
-    fit: Calibration | Cell | str | Path = "",
+    fit: Fit | Cell | str | Path = "",
     data: Measurements | str | Path = "",
     progress: Progress = silent,
     **options: object,

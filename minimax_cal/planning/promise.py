@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from minimax_cal.fitting.calibration import finite
+from minimax_cal.ground.files import finite
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.calibration import finite
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import Cell

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,13 +10,11 @@ import numpy as np
 
 from minimax_cal.evidence.noise import Noise, linearised, restricted
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.fit import Fit, opened
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import read_text
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.measuring.pose_rows import read_poses
-from minimax_cal.modelling.cell import Cell, load_cell
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import fields_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
@@ -44,21 +41,18 @@ class Ground:
 
 def ground_of(
     robot: Robot,
-    fit: Calibration | Cell | str | Path,
+    fit: Fit | Cell | str | Path,
     data: Measurements | str | Path,
     wish: Wishes,
 ) -> Ground:
     """Cell, poses at hand and noise.  Raises CalibrationError."""
     notices: list[str] = []
     own: tuple[Measurements, ...] = ()
-    if isinstance(fit, Calibration):
-        cells, own = [fit.cell], (fit.data,)
-    elif isinstance(fit, Cell):
-        cells = [fit]
-    elif fit:
-        cells, own = [load_cell(fit)], stored(fit)
-    else:
-        cells = []
+    cells: list[Cell] = []
+    if fit:
+        known = opened(fit)
+        cells = [known if isinstance(known, Cell) else known.cell]
+        own = (known.data,) if isinstance(known, Fit) and known.data.poses else ()
     if isinstance(data, Measurements):
         own = (data,)
     elif data:
@@ -90,14 +84,6 @@ def ground_of(
     notices += [text] if text else []
     noise, text = shown_noise(cell, (), wish)
     return Ground(cell, (), noise, (*notices, text))
-
-
-def stored(fit: str | Path) -> tuple[Measurements, ...]:
-    """The poses that a file of a calibration holds, none where it is an old one."""
-    content = json.loads(read_text(fit))
-    if "poses" not in content:
-        return ()
-    return (read_poses(content["poses"], str(fit))[0],)
 
 
 def assumed(robot: Robot, wish: Wishes) -> tuple[Cell, str]:

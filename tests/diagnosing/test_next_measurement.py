@@ -22,7 +22,8 @@ from minimax_cal.diagnosing.next_measurement import (
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.evidence.noise import Noise, linearised
-from minimax_cal.fitting.calibrate import Options, fit_cell, silent
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term

@@ -9,7 +9,8 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.diagnose import Study, studied
 from minimax_cal.evidence.noise import Noise, Rows, restricted
-from minimax_cal.fitting.calibrate import Options, fit_cell, silent
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import split
 

@@ -14,7 +14,8 @@ import minimax_cal as mc
 from experiments import coverage
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting import uncertainty
-from minimax_cal.fitting.calibrate import Fit, Options, fit_cell, silent
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.uncertainty import (
     Estimator,
     Poses,
@@ -40,13 +41,13 @@ H = 1e-6  # step of the central differences [m, rad]: errors of 1e-9 relative
 SLOPES = 1e-6  # tolerance of what is compared with them
 
 
-def fitted(robot: mc.Robot, data: Measurements, **options: object) -> Fit:
+def fitted(robot: mc.Robot, data: Measurements, **options: object) -> Solved:
     chosen = Options(**{"objective": "sum", **options})  # type: ignore[arg-type]
     return fit_cell(robot, data, chosen, silent)
 
 
 @pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> Fit:
+def fit(robot: mc.Robot, noisy: Simulation) -> Solved:
     return fitted(robot, noisy.data)
 
 
@@ -61,7 +62,7 @@ def differences(fun: Callable[[Array], Array], count: int, h: float = H) -> Arra
     return np.stack([(fun(step) - fun(-step)) / (2 * h) for step in steps], axis=-1)
 
 
-def predictor(robot: mc.Robot, found: Fit, targets: tuple[str, ...], q: Array):  # type: ignore[no-untyped-def]
+def predictor(robot: mc.Robot, found: Solved, targets: tuple[str, ...], q: Array):  # type: ignore[no-untyped-def]
     """Points (m, k, 3) in the instrument's frame after a step in all parameters."""
 
     def points(step: Array) -> Array:
@@ -70,7 +71,7 @@ def predictor(robot: mc.Robot, found: Fit, targets: tuple[str, ...], q: Array): 
     return points
 
 
-def dense(robot: mc.Robot, data: Measurements, found: Fit) -> tuple[Array, Array, Array]:
+def dense(robot: mc.Robot, data: Measurements, found: Solved) -> tuple[Array, Array, Array]:
     """Slopes J (m, 3k, p) and arms S (m, 3k, n) by differences, errors (m, 3k), as measured."""
     m, k = data.poses, len(data.target_names)
     points = predictor(robot, found, data.target_names, data.q)
@@ -99,7 +100,7 @@ def alike(found: Array, expected: Array, tolerance: float) -> None:
 
 
 def test_plain_noise_is_the_inverse_of_the_normal_matrix(
-    robot: mc.Robot, noisy: Simulation, fit: Fit
+    robot: mc.Robot, noisy: Simulation, fit: Solved
 ) -> None:
     J, _, _ = dense(robot, noisy.data, fit)
     flat = J.reshape(-1, J.shape[-1])
@@ -158,7 +159,7 @@ def test_a_slide_jitters_along_its_axis() -> None:
 
 
 def test_leaving_out_each_pose_is_the_jackknife(
-    robot: mc.Robot, noisy: Simulation, fit: Fit
+    robot: mc.Robot, noisy: Simulation, fit: Solved
 ) -> None:
     """The linear least squares of all poses but one, solved anew each time."""
     J, _, error = dense(robot, noisy.data, fit)
@@ -175,7 +176,7 @@ def test_leaving_out_each_pose_is_the_jackknife(
 
 
 def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(
-    robot: mc.Robot, noisy: Simulation, fit: Fit
+    robot: mc.Robot, noisy: Simulation, fit: Solved
 ) -> None:
     """Nonlinear refits of three reduced data sets: within a hundredth of a sigma."""
     poses = Poses.of(fit.estimator, fit.state)
@@ -212,7 +213,7 @@ def test_a_pose_measured_twice_is_one_pose(robot: mc.Robot, noisy: Simulation) -
     alike(2.0 * halves[1], halves[0], 1e-6)
 
 
-def test_a_prior_is_knowledge(robot: mc.Robot, noisy: Simulation, fit: Fit) -> None:
+def test_a_prior_is_knowledge(robot: mc.Robot, noisy: Simulation, fit: Solved) -> None:
     """With noise of one kind: (J'J / s^2 + 1 / sigma^2)^-1, Bayes' rule for the linear model."""
     model = fit.estimator.model
     weight = np.zeros(model.names.count)
@@ -324,7 +325,9 @@ def test_a_fit_that_needs_every_pose_asks_the_noise(robot: mc.Robot) -> None:
     assert fitted(robot, data).uncertainty.source == "poses"
 
 
-def test_without_spare_rows_nothing_is_known(robot: mc.Robot, noisy: Simulation, fit: Fit) -> None:
+def test_without_spare_rows_nothing_is_known(
+    robot: mc.Robot, noisy: Simulation, fit: Solved
+) -> None:
     estimator = fit.estimator.at(np.arange(3))
     found = uncertainty_of(estimator, fit.state, np.arange(3))
     assert np.isnan(found.covariance).all()
@@ -379,7 +382,7 @@ def anywhere(robot: mc.Robot) -> Array:
 
 
 def test_position_covariance_is_that_of_the_prediction(
-    robot: mc.Robot, noisy: Simulation, fit: Fit, anywhere: Array
+    robot: mc.Robot, noisy: Simulation, fit: Solved, anywhere: Array
 ) -> None:
     """Central differences of the predicted points by all parameters, in both frames."""
     known, targets = fit.uncertainty, noisy.data.target_names
@@ -416,7 +419,7 @@ def test_jitter_of_a_new_pose_is_added(frame: str, result: mc.Calibration, anywh
 
 
 def test_the_centroid_is_the_mean_of_the_factors(
-    robot: mc.Robot, noisy: Simulation, fit: Fit, anywhere: Array
+    robot: mc.Robot, noisy: Simulation, fit: Solved, anywhere: Array
 ) -> None:
     known = fit.uncertainty
     cell = Cell.of(robot, fit.state, noisy.data.target_names)

@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.calibrate import Fit, Options, fit_cell, silent
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.bootstrap import (
@@ -42,7 +43,7 @@ def found(fit: mc.Calibration) -> Bootstrap:
     return bootstrap(fit, 120, seed=3)
 
 
-def inner(robot: mc.Robot, data: mc.Measurements, options: Options) -> tuple[Fit, Draws]:
+def inner(robot: mc.Robot, data: mc.Measurements, options: Options) -> tuple[Solved, Draws]:
     one = fit_cell(robot, data, options, silent)
     return one, draw(one.group, 4, np.random.default_rng(7))
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from minimax_cal.fitting.fit import Fit, opened
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import read_text
-from minimax_cal.modelling.cell import Cell, cell_from_dict, still
-from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict
+from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
@@ -59,21 +58,23 @@ def read_job(source: Path | str) -> Job:
     """A saved calibration, or any robot that `load_robot` takes.  Raises CalibrationError."""
     path = Path(source)
     if path.suffix.lower() == ".json" and path.is_file():
-        try:
-            content = json.loads(read_text(path))
-        except (json.JSONDecodeError, RecursionError):
-            content = None  # load_robot says what is wrong with it
-        if isinstance(content, Mapping) and "targets_mm" in content:
-            cell, before = cell_from_dict(content, str(path)), content.get("nominal_robot")
-            labels = tuple(term.label for term in cell.effects.terms)
-            known = isinstance(before, Mapping)
-            where = f"{path}: nominal_robot"
-            before = robot_from_dict(before, where) if isinstance(before, Mapping) else cell.robot
-            return Job(cell.robot, before, str(path), labels, compliance_of(cell), fitted=known)
+        with suppress(NotSaved):  # load_robot says what is wrong with it
+            if "targets_mm" in saved_content(path):
+                return job_of(opened(path), str(path))
     robot = load_robot(source)
     notices = load_urdf(source).notices if is_urdf(source) else ()
     nothing = np.full(robot.joints, np.nan)
     return Job(robot, robot, str(source), (), nothing, notices=notices)
+
+
+def job_of(fit: Fit | Cell, source: str) -> Job:
+    """Of a saved calibration, or of a cell whose nominal robot nobody knows."""
+    cell = fit if isinstance(fit, Cell) else fit.cell
+    nominal = fit.nominal if isinstance(fit, Fit) else None
+    labels = tuple(term.label for term in cell.effects.terms)
+    before = nominal.robot if nominal else cell.robot
+    known = nominal is not None
+    return Job(cell.robot, before, source, labels, compliance_of(cell), fitted=known)
 
 
 def compliance_of(cell: Cell) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.calibration import Parameter
+from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
 from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified

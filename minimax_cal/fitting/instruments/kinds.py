@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.calibration import Provenance
+from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.fit import (
@@ -148,13 +148,13 @@ def from_poses(
         raise DataError(str(wrong).replace("smr1_x_", "flange_x_")) from wrong
     held = fit.held
     found = pose_fit(fit, targets.take(~held), spots)
-    nominal_tool = tool_of(fit.nominal, spots)
+    nominal_tool = tool_of(fit.before, spots)
     errors, turns = {}, {}
     for key, cell, tool, rows in (
-        ("nominal", fit.nominal, nominal_tool, held),
+        ("nominal", fit.before, nominal_tool, held),
         ("train", fit.cell, found.tool, ~held),
         ("holdout", fit.cell, found.tool, held),
-        ("nominal_train", fit.nominal, nominal_tool, ~held),
+        ("nominal_train", fit.before, nominal_tool, ~held),
     ):
         error, angle = pose_errors(cell, tool, data.take(rows))
         errors[key] = error[None]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.calibration import Calibration, Parameter
+from minimax_cal.fitting.fit import Fit, Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array
@@ -91,7 +91,7 @@ class PoseFit:
     covariance: (p, p) of the model's parameters, NaN where not identified [SI].
     """
 
-    fit: Calibration
+    fit: Fit
     model: Model
     state: State
     tool: Array
@@ -103,7 +103,7 @@ class PoseFit:
         return max(3 * len(self.fit.cell.target_names) - 6, 0)
 
 
-def pose_fit(fit: Calibration, train: Measurements, spots: Array) -> PoseFit:
+def pose_fit(fit: Fit, train: Measurements, spots: Array) -> PoseFit:
     """The covariance of a fit to poses, and the tool.
 
     The reflectors' errors are those of six numbers a pose, not of 3k: with k = 4 their covariance
@@ -112,7 +112,7 @@ def pose_fit(fit: Calibration, train: Measurements, spots: Array) -> PoseFit:
     """
     cell, k = fit.cell, len(spots)
     state = cell.state
-    model = model_of(fit.nominal.robot, train).only(fit.identification.active)
+    model = model_of(fit.before.robot, train).only(fit.identification.active)
     normal = model.normal(state, model.active)
     dof = max(6 * train.poses - (int(model.active.sum()) - (3 * k - 6)), 1)
     variance = float(normal.cost.sum()) / dof

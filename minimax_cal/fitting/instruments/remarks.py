@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.calibrate import WILD_ANGLE
-from minimax_cal.fitting.calibration import Parameter
+from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
 from minimax_cal.fitting.instruments.identify import has_scale

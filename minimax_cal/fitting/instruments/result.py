@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.fitting.calibration import SCHEMA, Parameter, Provenance, finite
+from minimax_cal.fitting.fit import Parameter, Provenance
+from minimax_cal.fitting.fit_file import SCHEMA
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.robots.robot import Robot

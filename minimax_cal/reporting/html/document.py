@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass
 from importlib.metadata import version
 
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.tables import Table
 from minimax_cal.reporting.html.content import Block, Note, Report, Section, text
 from minimax_cal.reporting.html.fit_sections import (
@@ -25,7 +27,6 @@ from minimax_cal.reporting.html.gap_sections import (
     untestable_section,
     where_section,
 )
-from minimax_cal.reporting.html.schema import FitFile, GapFile, Provenance
 from minimax_cal.reporting.html.sources import Sources, visible
 from minimax_cal.reporting.html.verdict import fit_verdict, gap_verdict
 
@@ -58,10 +59,8 @@ class Wording:
 
 def compose(sources: Sources, wording: Wording) -> Report:
     """The whole report.  Raises CalibrationError for a part of a file that cannot be read."""
-    told = provenance_of(sources)
-    both = "Calibration" if sources.fits else "Diagnosis"
-    if sources.fits and sources.gaps:
-        both = "Calibration and diagnosis"
+    told = sources.provenance
+    both = " and ".join(kind for kind, _ in named(sources)).capitalize()
     facts = [("Robot", sources.robot)]
     facts += [("Customer", visible(wording.customer))] if wording.customer else []
     facts += [("Author", visible(wording.author))] if wording.author else []
@@ -87,31 +86,29 @@ def signers(author: str, customer: str) -> tuple[tuple[str, str], ...]:
 
 def counted(sources: Sources) -> str:
     """How many poses and targets there are."""
-    if sources.fits:
-        a = sources.fits[0].content.accuracy
-        held, train = a.holdout.poses, a.train.poses
-    else:
-        first = sources.gaps[0].content.gap.ladder[0]
+    if sources.fit:
+        held, train = sources.fit.accuracy["holdout"].poses, sources.fit.accuracy["train"].poses
+    elif sources.gap:
+        first = sources.gap.ladder[0]
         held, train = first.holdout.poses, first.train.poses
-    targets = len(sources.cells[0].target_names) if sources.cells else 0
+    targets = len(sources.cell.target_names) if sources.cell else 0
     seen = f", {targets} target{'s' if targets > 1 else ''}" if targets else ""
     return f"{train} training, {held} held out{seen}"
 
 
-def provenance_of(sources: Sources) -> Provenance:
-    """Of the calibration, or else of the diagnosis."""
-    return (sources.fits[0] if sources.fits else sources.gaps[0]).content.provenance
+def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis]]:
+    """The results with what they are."""
+    both = (("calibration", sources.fit), ("diagnosis", sources.gap))
+    return [(kind, result) for kind, result in both if result]
 
 
 def verdict_section(sources: Sources) -> Section:
     """The result in words and in four numbers."""
     blocks: list[Block] = [Note(notice, "warning") for notice in sources.notices]
-    for fit in sources.fits:
-        blocks += fit_verdict(fit)
+    blocks += fit_verdict(sources.fit) if sources.fit else ()
     table = glance_table(sources)
     blocks += [table] if table.rows else []
-    for gap in sources.gaps:
-        blocks += gap_verdict(gap)
+    blocks += gap_verdict(sources.gap) if sources.gap else ()
     return Section("verdict", "Verdict", tuple(blocks))
 
 
@@ -120,18 +117,15 @@ def provenance_section(sources: Sources) -> Section:
     files: list[tuple[str, str, str]] = []
     settings: list[Table] = []
     notices: list[Block] = []
-    contents: list[tuple[str, str, str, FitFile | GapFile]] = []
-    contents += [("calibration", part.path, part.digest, part.content) for part in sources.fits]
-    contents += [("diagnosis", part.path, part.digest, part.content) for part in sources.gaps]
-    for kind, path, digest, content in contents:
-        files.append((kind, visible(path), digest))
-        told = content.provenance
+    for kind, result in named(sources):
+        files += [(f.kind, visible(f.path), f.digest) for f in sources.files if f.kind == kind]
+        told = result.provenance
         if (row := ("measurements", told.data, told.data_sha256 or "not recorded")) not in files:
             files.append(row)
         settings.append(settings_table(f"Settings of the {kind}", told.settings))
         settings.append(Table(f"Versions used by the {kind}", ("package", "version"),
                               tuple(told.versions.items())))  # fmt: skip
-        notices += [Note(f"{kind}: {notice}", "notice") for notice in content.notices]
+        notices += [Note(f"{kind}: {notice}", "notice") for notice in result.notices]
     made = (("minimax-cal", version("minimax-cal")), ("plotly", version("plotly")))
     settings.append(Table("This report was made by", ("package", "version"), made))
     return Section(

@@ -248,7 +248,7 @@ def over_time(poses: Poses, names: Names) -> tuple[Figure, ...]:
     """Against visit order, and against time, temperature and load where these were written down."""
     told = ("Error by visit order", "visit (first to last)") if poses.told else (
         "Error by row", "row of the file (it tells no visit order)")  # fmt: skip
-    out = [against(poses, names, ("order", *told), poses.data.columns["order"])]
+    out = [against(poses, names, ("order", *told), poses.visit)]
     for column, name, title, xlabel in (
         ("time", "time", "Error over time", "time (s)"),
         ("temperature", "temperature", "Error against temperature", "temperature (°C)"),

@@ -6,23 +6,23 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from minimax_cal.diagnosing.result import Diagnosis, Finding
 from minimax_cal.diagnosing.sentences import at, cause
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.reporting.html.schema import Effect, GapFile
 from minimax_cal.reporting.tables import number, where_tables
 
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 
 
-def ladder_table(content: GapFile) -> Table:
+def ladder_table(gap: Diagnosis) -> Table:
     """The gap, rung by rung, held out beside training."""
     rows: list[tuple[Cell, ...]] = [
-        (r.step, r.holdout.rms_mm, r.holdout.max_mm, r.train.rms_mm, r.train.max_mm)
-        for r in content.gap.ladder
+        (r.name, r.holdout.rms_mm, r.holdout.max_mm, r.train.rms_mm, r.train.max_mm)
+        for r in gap.ladder
     ]
-    floor = content.gap.noise_floor_mm
-    rows.append((f"noise floor ({content.gap.noise_floor_from})", floor, "", floor, ""))
+    floor = gap.floor
+    rows.append((f"noise floor ({gap.floor_from})", floor, "", floor, ""))
     return Table(
         "The gap, step by step",
         ("model", "held-out RMS mm", "held-out max mm", "training RMS mm", "training max mm"),
@@ -31,19 +31,19 @@ def ladder_table(content: GapFile) -> Table:
     )
 
 
-def effects_table(content: GapFile) -> Table:
+def effects_table(gap: Diagnosis) -> Table:
     """The effects found, with what each does for held-out poses."""
     rows = tuple(
         (
-            e.effect,
-            at(e.place) + lines_of(e),
-            cause(e.effect),
+            e.term.effect,
+            at(e.term.place) + lines_of(e),
+            cause(e.term.effect),
             100.0 * e.share,
-            e.holdout_rms_mm.before,
-            e.holdout_rms_mm.after,
-            chance(e.chance),
+            e.before,
+            e.after,
+            chance(e.p_value),
         )
-        for e in content.effects
+        for e in gap.findings
     )
     return Table(
         "Effects found, the largest first",
@@ -59,32 +59,39 @@ def chance(value: float) -> str:
     return "-" if math.isnan(value) else f"< {SURE:g}" if value < SURE else f"{value:.1g}"
 
 
-def lines_of(effect: Effect) -> str:
+def lines_of(effect: Finding) -> str:
     """Lines of the file that a fault of the data concerns, in brackets."""
-    if not effect.lines:
+    if not effect.rows:
         return ""
-    named = ", ".join(map(str, effect.lines[:SHOWN_LINES]))
-    more = len(effect.lines) - SHOWN_LINES
+    named = ", ".join(map(str, effect.rows[:SHOWN_LINES]))
+    more = len(effect.rows) - SHOWN_LINES
     return f" (line {named}{f' and {more} more' if more > 0 else ''})"
 
 
-def effect_parameters(content: GapFile) -> Table:
+def effect_parameters(gap: Diagnosis) -> Table:
     """The parameters of every effect found."""
     rows = tuple(
-        (e.effect, e.place, p.name, p.value, p.sigma, p.unit)
-        for e in content.effects
-        for p in e.parameters
+        (
+            e.term.effect,
+            e.term.place,
+            p["name"],
+            p["value"],
+            p["sigma"] or math.nan,
+            p["unit"],
+        )
+        for e in gap.findings
+        for p in e.parameters()
     )
     header = ("effect", "place", "parameter", "value", "sigma", "unit")
     return Table("Parameters of the effects", header, rows, ("", "", "", ".4g", ".2g", ""))
 
 
-def rival_table(content: GapFile) -> Table:
+def rival_table(gap: Diagnosis) -> Table:
     """What these data cannot tell from the effects found."""
     rows = tuple(
-        (f"{e.effect} {e.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
+        (f"{e.term.effect} {e.term.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
          a.separate_with or "no measurement considered would")
-        for e in content.effects
+        for e in gap.findings
         for a in e.alternatives
     )  # fmt: skip
     header = ("named", "or rather", "likeness", "power", "fits worse by", "what to measure next")
@@ -92,10 +99,9 @@ def rival_table(content: GapFile) -> Table:
                  ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
 
 
-def untestable_table(content: GapFile) -> Table:
+def untestable_table(gap: Diagnosis) -> Table:
     """Effects that are neither found nor excluded."""
-    rows = tuple((u.effect, u.needs) for u in content.not_testable)
-    return Table("Not testable with these data", ("effect", "needs"), rows)
+    return Table("Not testable with these data", ("effect", "needs"), gap.not_testable)
 
 
 def place_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:

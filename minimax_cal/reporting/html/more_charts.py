@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.diagnosing.curves import VIEWS, Curve
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.pose_rows import numbers
 from minimax_cal.reporting.html.charts import (
     LOOKS,
     axis,
@@ -25,21 +28,20 @@ from minimax_cal.reporting.html.charts import (
 from minimax_cal.reporting.html.content import Figure, label, plain, some
 from minimax_cal.reporting.html.error_charts import panel_axes
 from minimax_cal.reporting.html.fit_tables import correlations
-from minimax_cal.reporting.html.schema import Covariance, CurveFile, FitFile, GapFile
 
 LOWEST = 1e-18  # what a logarithmic axis shows of zero
 STRETCH = 2.0  # an axis that a few points stretch more than this is cut
 
 
-def iterations(content: FitFile) -> Figure:
+def iterations(fit: Fit) -> Figure:
     """Cost of the least squares, and how far from optimal the minimax was, step by step."""
     panels: list[tuple[str, str, Array, Array]] = []
-    if content.trace_mm2:
-        cost = np.array(content.trace_mm2)
+    if fit.trace:
+        cost = 1e6 * np.array(fit.trace)
         panels.append(("least squares", "cost (mm²)", np.arange(len(cost)), cost))
-    if content.minimax.trace:
-        kkt = np.array([s.kkt for s in content.minimax.trace])
-        at = np.array([s.iteration for s in content.minimax.trace])
+    if fit.minimax and fit.minimax.trace:
+        kkt = np.array([s.kkt for s in fit.minimax.trace])
+        at = np.array([s.iteration for s in fit.minimax.trace])
         panels.append(("minimax", "KKT residual", at, kkt))
     traces: list[dict[str, Any]] = []
     layout = frame(
@@ -63,9 +65,10 @@ def iterations(content: FitFile) -> Figure:
     return figure("iterations", "How the fit converged", f"{says}.", traces, layout, 300)
 
 
-def correlation_map(covariance: Covariance) -> Figure:
+def correlation_map(known: Uncertainty) -> Figure:
     """Correlations of the identified parameters, as a matrix of colours."""
-    found, names = correlations(covariance), [label(name) for name in covariance.names]
+    told, found = correlations(known)
+    names = [label(name) for name in told]
     rows = [plain(row, 3) for row in found]
     trace = {
         "type": "heatmap", "x": names, "y": names, "z": rows, "zmin": -1.0, "zmax": 1.0,
@@ -86,9 +89,9 @@ def correlation_map(covariance: Covariance) -> Figure:
     return figure("correlations", "Which parameters hang together", says, (trace,), layout, height)
 
 
-def waterfall(content: GapFile) -> Figure:
+def waterfall(gap: Diagnosis) -> Figure:
     """The gap from the nominal robot down to the noise."""
-    steps, floor = content.gap.ladder, content.gap.noise_floor_mm
+    steps, floor = gap.ladder, gap.floor
     held = np.array([s.holdout.rms_mm for s in steps])
     train = np.array([s.train.rms_mm for s in steps])
     worst = np.array([s.holdout.max_mm for s in steps])
@@ -113,7 +116,7 @@ def waterfall(content: GapFile) -> Figure:
             line("third", "noise floor", np.full(2, floor), np.array([-0.5, at[-1] + 0.5]))
         )
     every = np.concatenate([held, train, worst, [floor] if floor > 0.0 else []])
-    names = [label(s.step) for s in steps]
+    names = [label(s.name) for s in steps]
     layout = frame(
         xaxis=log_axis("error (mm)", every),
         yaxis=axis("", tickvals=at.tolist(), ticktext=names, range=[len(steps) - 0.5, -0.5],
@@ -121,7 +124,7 @@ def waterfall(content: GapFile) -> Figure:
     )  # fmt: skip
     last = f", {steps[-1].holdout.rms_mm:.3f} mm with all effects" if len(steps) > 2 else ""
     says = (
-        f"Held-out RMS: {steps[0].step} {steps[0].holdout.rms_mm:.3f} mm, {steps[1].step} "
+        f"Held-out RMS: {steps[0].name} {steps[0].holdout.rms_mm:.3f} mm, {steps[1].name} "
         f"{steps[1].holdout.rms_mm:.3f} mm{last}"
     )
     tail = f"; noise alone would leave {floor:.3f} mm" if math.isfinite(floor) else ""
@@ -129,32 +132,29 @@ def waterfall(content: GapFile) -> Figure:
                   traces, layout, 120 + 44 * len(steps))  # fmt: skip
 
 
-def curve_chart(name: str, curve: CurveFile, held: Array) -> Figure:
+def curve_chart(name: str, curve: Curve, held: Array) -> Figure:
     """Something against something, as the diagnosis saved it.
 
     held: (m,) True where held out, or of length 0 where that is not known.
     """
-    x = numbers(curve.x.values)
-    views = [(v.name, numbers(v.values)) for v in curve.views]
-    if any(y.shape != x.shape for _, y in views) or not x.size or len(views) > len(LOOKS):
-        raise ValueError(f"{name} has values that differ in length")
+    x, views = curve.x, list(zip(VIEWS, curve.y, strict=False))
     mask = held if len(held) else np.zeros(x.shape[-1], dtype=bool)
     mask = np.broadcast_to(mask, x.shape).ravel()
     chosen = some(np.nanmax(np.abs([np.nan_to_num(y.ravel()) for _, y in views]), axis=0))
     looks = zip(LOOKS, views, strict=False)
     drawn = [(look, words, y.ravel()[chosen]) for look, (words, y) in looks]
     sizes = [y for _, _, y in drawn]
-    ylabel, outside = broken(curve.y.label), ""
+    ylabel, outside = broken(curve.ylabel), ""
     if name == "order":
         yaxis = log_axis(ylabel, *sizes)
     else:
         ends, outside = most_of(np.concatenate(sizes))
         yaxis = axis(ylabel, range=ends) if ends else axis(ylabel)
     traces = two_looks(x.ravel()[chosen], drawn, mask[chosen])
-    layout = frame(xaxis=axis(label(curve.x.label)), yaxis=yaxis)
+    layout = frame(xaxis=axis(label(curve.xlabel)), yaxis=yaxis)
     cut = f" {len(chosen)} of {x.size} points are drawn." if len(chosen) < x.size else ""
     title = curve.title[:1].upper() + curve.title[1:]
-    says = f"{title}: {curve.y.label} against {curve.x.label}; {spread(views)}.{cut}{outside}"
+    says = f"{title}: {curve.ylabel} against {curve.xlabel}; {spread(views)}.{cut}{outside}"
     return figure(f"curve-{name}", title, says, traces, layout)
 
 

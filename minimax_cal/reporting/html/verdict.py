@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.intervals import UNKNOWN, Interval
+from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.reporting.html.content import Note, caveat, text
-from minimax_cal.reporting.html.schema import UNKNOWN, FitFile, Scores
-from minimax_cal.reporting.html.sources import Diagnosed, Fit
 
 VERDICTS = {
     "none": "Nothing beyond geometry and noise was found.",
@@ -29,57 +31,59 @@ def number(value: float) -> str:
     return f"{value:.3f}\N{NO-BREAK SPACE}mm" if math.isfinite(value) else "an unknown amount"
 
 
-def within(interval: tuple[float, float]) -> str:
+def within(interval: Interval) -> str:
     """An interval, nothing where it is not known."""
-    if interval == UNKNOWN or any(math.isnan(end) for end in interval):
+    low, high = 1e3 * interval.low, 1e3 * interval.high
+    if math.isnan(low) or math.isnan(high):
         return ""
-    return f", 95 % interval {interval[0]:.3f} to {interval[1]:.3f}\N{NO-BREAK SPACE}mm"
+    return f", 95 % interval {low:.3f} to {high:.3f}\N{NO-BREAK SPACE}mm"
 
 
-def changed(before: Scores, after: Scores) -> str:
+def changed(before: Accuracy, after: Accuracy, interval: Interval = UNKNOWN) -> str:
     """Accuracy before and after."""
     return (
         f"the nominal robot missed the measured points by {number(before.rms_mm)} RMS, at most "
         f"{number(before.max_mm)}; the calibrated robot misses them by {number(after.rms_mm)} RMS"
-        f"{within(after.rms_ci95_mm)}; at most {number(after.max_mm)}"
+        f"{within(interval)}; at most {number(after.max_mm)}"
     )
 
 
 def fit_verdict(fit: Fit) -> tuple[Note, ...]:
     """The calibration in some sentences."""
-    c, a = fit.content, fit.content.accuracy
-    notes = []
-    if a.holdout.poses:
-        first = f"On {a.holdout.poses} poses that were not used for the fit, "
-        notes.append(text(first + changed(a.nominal, a.holdout) + "."))
+    train, held = fit.accuracy["train"], fit.accuracy["holdout"]
+    nominal, notes = fit.accuracy["nominal"], []
+    if held.poses:
+        first = f"On {held.poses} poses that were not used for the fit, "
+        known = fit.intervals.get("holdout", (UNKNOWN, UNKNOWN))[0]
+        notes.append(text(first + changed(nominal, held, known) + "."))
         notes.append(
             text(
-                f"On the {a.train.poses} poses of the fit itself the calibrated robot misses by "
-                f"{number(a.train.rms_mm)} RMS, at most {number(a.train.max_mm)}."
+                f"On the {train.poses} poses of the fit itself the calibrated robot misses by "
+                f"{number(train.rms_mm)} RMS, at most {number(train.max_mm)}."
             )
         )
     else:
-        first = f"On the {a.train.poses} poses of the fit itself, "
-        notes.append(text(first + changed(a.nominal_train, a.train) + "."))
+        first = f"On the {train.poses} poses of the fit itself, "
+        notes.append(text(first + changed(fit.accuracy["nominal_train"], train) + "."))
         notes.append(
             caveat(
                 "No pose was held out: these numbers were reached on the poses of the fit and are "
                 "too good for new ones."
             )
         )
-    if a.holdout.poses and not a.holdout.rms_mm < a.nominal.rms_mm:
+    if held.poses and not held.rms_mm < nominal.rms_mm:
         notes.append(
             Note("On poses not used for the fit, the calibration is no improvement.", "warning")
         )
-    return (*notes, how(c), *trouble(c.status, c.advice))
+    return (*notes, how(fit), *trouble(fit.status, fit.status.advice))
 
 
-def how(content: FitFile) -> Note:
+def how(fit: Fit) -> Note:
     """What was asked for, and how much of it the data told."""
-    known = sum(p.identifiable for p in content.parameters)
-    objective = OBJECTIVES.get(content.objective, content.objective)
+    known = sum(p.identifiable for p in fit.parameters)
+    objective = OBJECTIVES.get(fit.objective, fit.objective)
     return text(
-        f"{known} of {len(content.parameters)} parameters were identified; the others keep their "
+        f"{known} of {len(fit.parameters)} parameters were identified; the others keep their "
         f"nominal values, each for a reason that is given. Objective: {objective}."
     )
 
@@ -92,11 +96,10 @@ def trouble(status: str, advice: str) -> tuple[Note, ...]:
     return (Note(f"The fit did not converge ({status.replace('_', ' ')}){tail}", "warning"),)
 
 
-def gap_verdict(gap: Diagnosed) -> tuple[Note, ...]:
+def gap_verdict(gap: Diagnosis) -> tuple[Note, ...]:
     """The diagnosis, its reasons as they stand in the file."""
-    c = gap.content
-    reasons = (Note(reason, "reason") for reason in c.reasons)
-    return (Note(VERDICTS[c.verdict], "verdict"), *reasons, *trouble(c.status, ""))
+    reasons = (Note(reason, "reason") for reason in gap.reasons)
+    return (Note(VERDICTS[gap.verdict], "verdict"), *reasons, *trouble(gap.status, ""))
 
 
 REASONS = (
@@ -116,9 +119,9 @@ REASONS = (
 )
 
 
-def why_not(content: FitFile) -> tuple[Note, ...]:
+def why_not(fit: Fit) -> tuple[Note, ...]:
     """The kinds of reasons that occur, explained."""
-    given = [p.reason for p in content.parameters if not p.identifiable]
+    given = [p.reason for p in fit.parameters if not p.identifiable]
     return tuple(
         text(words) for start, words in REASONS if any(reason.startswith(start) for reason in given)
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from minimax_cal.fitting.calibration import Calibration
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
@@ -29,7 +29,7 @@ def save(figure: Figure, path: Path) -> None:
     write_whole(path, stream.getvalue())
 
 
-def save_errors(fit: Calibration, path: Path) -> None:
+def save_errors(fit: Fit, path: Path) -> None:
     """Errors before and after: pose by pose, and their distribution on held-out poses."""
     try:
         import matplotlib as mpl

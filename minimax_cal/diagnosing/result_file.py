@@ -1,0 +1,220 @@
+"""The file of a diagnosis: what `Diagnosis.from_dict` reads; `Diagnosis.to_dict` writes it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from minimax_cal.diagnosing.curves import Curve
+from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
+from minimax_cal.fitting.fit_file import ParameterPart, ProvenancePart, ScoresPart, measured_poses
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import numbers
+from minimax_cal.ground.records import AGAIN, FAULTS, UNKNOWN, Ends, Number, Part, checked
+from minimax_cal.modelling.cell import Cell, cell_from_dict
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.solvers.status import Status
+
+SCHEMA = 1
+
+
+class AlternativePart(Part):
+    """An effect that the data cannot tell from the one named."""
+
+    effect: str
+    place: str
+    rho2: Number = math.nan
+    power: Number = math.nan
+    loss: Number = math.nan
+    separate_with: str = ""
+
+
+class FallPart(Part):
+    """Held-out RMS without and with an effect [mm]."""
+
+    before: Number = math.nan
+    after: Number = math.nan
+
+
+class FindingPart(Part):
+    """An effect that was found.  size: lambda.  lines: rows of a fault of the data."""
+
+    effect: str
+    place: str
+    share: Number = math.nan
+    size: Number = Field(alias="lambda", default=math.nan)
+    chance: Number = math.nan
+    parameters: tuple[ParameterPart, ...] = ()
+    fixed: dict[str, Number] = Field(default_factory=dict)
+    holdout_rms_mm: FallPart = FallPart()
+    alternatives: tuple[AlternativePart, ...] = ()
+    lines: tuple[int, ...] = ()
+
+    def finding(self, known: Sequence[Term]) -> Finding:
+        """As the code has it.  known: terms that were fitted, with their choices."""
+        own = [t for t in known if (t.effect, t.place) == (self.effect, self.place)]
+        scale = [1e-3 if p.unit == "mm" else 1.0 for p in self.parameters]
+        return Finding(
+            terms=tuple(own) or (Term(self.effect, self.place),),
+            names=tuple(p.name for p in self.parameters),
+            units=tuple("m" if p.unit == "mm" else p.unit for p in self.parameters),
+            values=tuple(
+                p.value * factor for p, factor in zip(self.parameters, scale, strict=True)
+            ),
+            sigmas=tuple(
+                p.sigma * factor for p, factor in zip(self.parameters, scale, strict=True)
+            ),
+            size=self.size,
+            p_value=self.chance,
+            alternatives=tuple(Alternative(**dict(other)) for other in self.alternatives),
+            share=self.share,
+            before=self.holdout_rms_mm.before,
+            after=self.holdout_rms_mm.after,
+            fixed=self.fixed,
+            rows=self.lines,
+        )
+
+
+class RungPart(Part):
+    """One step of the gap ladder."""
+
+    step: str
+    train: ScoresPart
+    holdout: ScoresPart
+
+
+class GapPart(Part):
+    """The gap, how far it closes, and what noise would leave."""
+
+    noise_floor_mm: Number = math.nan
+    noise_floor_from: str = ""
+    closed: Number = math.nan
+    closed_ci95: Ends = UNKNOWN
+    ladder: Annotated[tuple[RungPart, ...], Field(min_length=2)]
+    blocked: dict[str, Number] = Field(default_factory=dict)
+
+
+class NoisePart(Part):
+    """Of instrument and joints."""
+
+    instrument_mm: Number = math.nan
+    joint_jitter_mrad: Number = math.nan
+
+
+class StructurePart(Part):
+    """Whether what remains is noise."""
+
+    p: Number = math.nan
+    place: str = Field(alias="in", default="")
+
+
+class UntestablePart(Part):
+    """What could not be tested, and what that needs."""
+
+    effect: str
+    needs: str
+
+
+class SeriesPart(Part):
+    """Values along an axis, or of a view; nested by target where each has its own."""
+
+    label: str = ""
+    name: str = ""
+    values: list[Number] | list[list[Number]] = Field(default_factory=list)
+
+
+class CurvePart(Part):
+    """Something against something, in several views."""
+
+    title: str
+    x: SeriesPart
+    y: SeriesPart
+    views: tuple[SeriesPart, ...]
+
+    def curve(self) -> Curve:
+        """As the code has it.  Raises ValueError."""
+        x = numbers(self.x.values)
+        y = tuple(numbers(view.values) for view in self.views)
+        if not x.size or any(part.shape != x.shape for part in y):
+            raise ValueError(f"curve {self.title!r} has values that differ in length")
+        return Curve(self.title, self.x.label, self.y.label, x, y)
+
+
+class DiagnosisPart(Part):
+    """The file of `minimax-cal diagnose -o`."""
+
+    robot: str
+    status: Status
+    verdict: Literal["none", "named", "one_of", "unknown", "not_repeatable"]
+    reasons: tuple[str, ...]
+    effects: tuple[FindingPart, ...]
+    gap: GapPart
+    noise: NoisePart = NoisePart()
+    structure: StructurePart = StructurePart()
+    where: dict[str, Any] = Field(default_factory=dict)
+    not_testable: tuple[UntestablePart, ...] = ()
+    curves: dict[str, CurvePart] = Field(default_factory=dict)
+    notices: tuple[str, ...] = ()
+    seconds: Number = math.nan
+    provenance: ProvenancePart
+
+
+def read(content: Mapping[str, Any], source: str) -> Diagnosis:
+    """A diagnosis from its JSON.  Raises CalibrationError."""
+    if content.get("schema", 1) != SCHEMA:
+        raise CalibrationError(
+            f"{source}: is of schema {content['schema']!r}, this version knows {SCHEMA}; update "
+            "minimax-cal"
+        )
+    if content.get("kind") != "diagnosis":
+        raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose -o")
+    part = checked(DiagnosisPart, content, source)
+    try:
+        cells = tuple(
+            cell_from_dict(cell, f"{source}: cells[{i}]")
+            for i, cell in enumerate(content.get("cells", ()))
+        )
+        return assembled(content, source, part, cells)
+    except FAULTS as error:
+        raise CalibrationError(f"{source}: cannot be read ({error}); {AGAIN}") from error
+
+
+def assembled(
+    content: Mapping[str, Any], source: str, part: DiagnosisPart, cells: tuple[Cell, ...]
+) -> Diagnosis:
+    """The diagnosis from what was read.  Raises one of FAULTS."""
+    fitted = cells[-1].effects.terms if cells else ()
+    data, held, errors = measured_poses(content, source, cells[0] if cells else None, "geometric")
+    return Diagnosis(
+        robot=part.robot,
+        status=part.status,
+        verdict=part.verdict,
+        reasons=part.reasons,
+        findings=tuple(finding.finding(fitted) for finding in part.effects),
+        ladder=tuple(
+            Step(rung.step, rung.train.accuracy(), rung.holdout.accuracy())
+            for rung in part.gap.ladder
+        ),
+        floor=part.gap.noise_floor_mm,
+        floor_from=part.gap.noise_floor_from,
+        closed=part.gap.closed,
+        closed_ci=part.gap.closed_ci95,
+        blocked={key: None if math.isnan(x) else x for key, x in part.gap.blocked.items()},
+        noise=1e-3 * part.noise.instrument_mm,
+        jitter=1e-3 * part.noise.joint_jitter_mrad,
+        structure=part.structure.p,
+        structure_in=part.structure.place,
+        where=part.where,
+        not_testable=tuple((each.effect, each.needs) for each in part.not_testable),
+        notices=part.notices,
+        provenance=part.provenance.provenance(),
+        seconds=part.seconds,
+        data=data,
+        held=held,
+        cells=cells,
+        stated_errors=errors,
+        stated_curves={name: curve.curve() for name, curve in part.curves.items()},
+    )

@@ -1,0 +1,485 @@
+"""Everything that a calibration knows: what was found, how well it does, where it came from."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
+from minimax_cal.fitting.minimax_problem import Distances, measured_distances
+from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.suspects import Suspect, table_of
+from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.optional import optional
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
+from minimax_cal.modelling.joint_fit import extended
+from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.minimax import Kkt, Step
+from minimax_cal.solvers.status import Status
+
+PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
+ACCURACIES = (  # where accuracy is told: title, key
+    ("training, nominal", "nominal_train"),
+    ("training, calibrated", "train"),
+    ("held out, nominal", "nominal"),
+    ("held out, calibrated", "holdout"),
+)
+DOUBTED = 0.5  # a point of less weight tells no distance between targets
+MILLI = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}  # how people read a parameter
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter in SI; sigma is NaN where it is not identified, reason says why it is not."""
+
+    name: str
+    value: float
+    nominal: float
+    sigma: float
+    unit: str
+    identifiable: bool
+    reason: str = ""
+
+    @property
+    def of_effect(self) -> bool:
+        """Whether it belongs to an effect beyond geometry."""
+        return ":" in self.name
+
+    @property
+    def scale(self) -> tuple[float, str]:
+        """Factor and unit in which people read it: millimetres, milliradians."""
+        return MILLI.get(self.unit, (1.0, self.unit))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, lengths in millimetres."""
+        scale, unit = (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        out = {
+            "name": self.name,
+            "value": self.value * scale,
+            "nominal": self.nominal * scale,
+            "sigma": finite(self.sigma * scale),
+            "unit": unit,
+            "identifiable": self.identifiable,
+        }
+        return out | ({"reason": self.reason} if self.reason else {})
+
+
+@dataclass(frozen=True, repr=False)
+class Parameters(Sequence[Parameter]):
+    """All p parameters of a fit, link by link; by number or by name.
+
+    dof: degrees of freedom behind their sigmas.
+    """
+
+    every: tuple[Parameter, ...]
+    dof: float
+
+    def __len__(self) -> int:
+        return len(self.every)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self.every)
+
+    @overload
+    def __getitem__(self, key: int | str) -> Parameter: ...
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Parameter]: ...
+    def __getitem__(self, key: int | str | slice) -> Parameter | Sequence[Parameter]:
+        """A parameter by number or name, or some.  Raises IndexError, KeyError."""
+        if isinstance(key, str):
+            try:
+                return next(p for p in self.every if p.name == key)
+            except StopIteration:
+                raise KeyError(f"no parameter {key!r}; there are {', '.join(self.names)}") from None
+        return self.every[key]
+
+    def __repr__(self) -> str:
+        known = sum(p.identifiable for p in self.every)
+        return f"<{len(self)} parameters, {known} identified>"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,) as d1 or joint_compliance:J2.c2."""
+        return tuple(p.name for p in self.every)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(p,) SI."""
+        return tuple(p.unit for p in self.every)
+
+    @property
+    def value(self) -> Array:
+        """(p,) [SI]."""
+        return np.array([p.value for p in self.every])
+
+    @property
+    def nominal(self) -> Array:
+        """(p,) [SI]."""
+        return np.array([p.nominal for p in self.every])
+
+    @property
+    def sigma(self) -> Array:
+        """(p,) standard deviations, NaN where not identified [SI]."""
+        return np.array([p.sigma for p in self.every])
+
+    @property
+    def ci95(self) -> Array:
+        """(p, 2) ends of the 95 % intervals by Student's law, NaN where not identified [SI]."""
+        half = quantile(0.95, self.dof) * self.sigma
+        return np.stack([self.value - half, self.value + half], axis=1)
+
+    def frame(self) -> Any:
+        """As a pandas data frame, a row a parameter, SI.  Raises OptionError without pandas."""
+        low, high = self.ci95.T
+        return optional("pandas", "a data frame", "pandas").DataFrame(
+            {
+                "name": self.names, "unit": self.units, "value": self.value,
+                "nominal": self.nominal, "sigma": self.sigma, "low95": low, "high95": high,
+                "identifiable": [p.identifiable for p in self.every],
+                "reason": [p.reason for p in self.every],
+            }
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result came from, so that it can be had again."""
+
+    robot: str
+    data: str
+    data_sha256: str
+    settings: Mapping[str, object]
+    versions: Mapping[str, str]
+
+    @staticmethod
+    def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
+        """Of this run, on this machine."""
+        versions = {name: version(name) for name in PACKAGES}
+        versions["python"] = platform.python_version()
+        return Provenance(robot.name, data.source, data.digest, dict(settings), versions)
+
+
+@dataclass(frozen=True)
+class KeptDistance:
+    """A distance between two targets that the minimax keeps [m]."""
+
+    pair: tuple[str, str]
+    measured: float
+    tolerance: float
+    multiplier: float
+
+
+@dataclass(frozen=True, eq=False)
+class WorstCase:
+    """What the minimax rests on: targets, or points by line of the file.
+
+    functions: of every target, or of the points with a multiplier.  size: F_i [mm^2], or distance
+    [mm], of each.  active: those that equal the largest, named.  trace: a step a QP.
+    """
+
+    functions: tuple[str, ...]
+    size: Array
+    multiplier: Array
+    active: tuple[str, ...]
+    distances: tuple[KeptDistance, ...]
+    kkt: Kkt
+    iterations: int
+    trace: tuple[Step, ...]
+
+    def table(self) -> Table:
+        """Errors, multipliers, activity."""
+        rows = tuple(
+            (name, float(size), float(mu), "yes" if name in self.active else "")
+            for name, size, mu in zip(self.functions, self.size, self.multiplier, strict=True)
+        )
+        header = ("target", "F_i mm^2", "multiplier", "active")
+        return Table("worst target on the training poses", header, rows, ("", ".4f", ".4f", ""))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """A calibrated robot and everything that is known about its fit.
+
+    cell: the calibrated robot with base and targets.  nominal: the nominal robot with its best
+    base and targets, None where an old file does not tell it.
+    accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
+    poses.  uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
+    minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
+    is from its optimum.  trace: cost at each iterate of the least squares [m^2].
+    data: all m poses, with their history where effects need it; none in an old file.
+    held: (m,) True where held out.  error_nominal, error: (k, m, 3) measured minus predicted, NaN
+    where not measured [m].
+    loss: of the least squares.  suspects: training points that stand out from the fit.
+    weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
+    weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
+    weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
+    """
+
+    cell: Cell
+    nominal: Cell | None
+    objective: str
+    qp: str
+    status: Status
+    iterations: int
+    seconds: float
+    parameters: Parameters
+    accuracy: Mapping[str, Accuracy]
+    identification: Identification
+    uncertainty: Uncertainty | None
+    minimax: WorstCase | None
+    certificate: Certificate | None
+    trace: tuple[float, ...]
+    data: Measurements
+    held: Array
+    error_nominal: Array
+    error: Array
+    notices: tuple[str, ...]
+    loss: str
+    suspects: tuple[Suspect, ...]
+    weights: Array
+    share: Array
+    prior: Array
+    widening: float
+    provenance: Provenance
+    stated: Mapping[str, tuple[Interval, Interval]] | None = None
+
+    def __repr__(self) -> str:
+        return f"<Fit of {self.robot.name}: {self.objective}. {self.headline()}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        tables = "\n".join(table.html() for table in self.tables())
+        return f"<p>{escape(self.headline())}</p>\n{tables}"
+
+    @property
+    def robot(self) -> Robot:
+        """The calibrated robot, usable wherever a robot is."""
+        return self.cell.robot
+
+    @property
+    def train(self) -> Measurements:
+        """The training poses."""
+        return self.data.take(~self.held)
+
+    @property
+    def errors(self) -> Mapping[str, Array]:
+        """Errors (k, m, 3) by the keys of `accuracy` [m]."""
+        return {
+            "nominal": self.error_nominal[:, self.held],
+            "train": self.error[:, ~self.held],
+            "holdout": self.error[:, self.held],
+            "nominal_train": self.error_nominal[:, ~self.held],
+        }
+
+    @property
+    def covariance(self) -> Array:
+        """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
+        return self.known.covariance
+
+    @property
+    def known(self) -> Uncertainty:
+        """The uncertainty of the parameters.  Raises CalibrationError where a file has none."""
+        if self.uncertainty is None:
+            raise CalibrationError(f"{self.provenance.data}: the fit does not hold a covariance")
+        return self.uncertainty
+
+    @property
+    def before(self) -> Cell:
+        """The nominal cell.  Raises CalibrationError where a file does not tell it."""
+        if self.nominal is None:
+            raise CalibrationError("the fit does not tell its nominal robot; calibrate again")
+        return self.nominal
+
+    @property
+    def options(self) -> Options:
+        """How it was made, its effects with the variants that were chosen."""
+        settings = {k: v for k, v in self.provenance.settings.items() if k in vars(Options())}
+        return Options(**{**settings, "effects": self.cell.effects.terms})  # type: ignore[arg-type]
+
+    @property
+    def group(self) -> Array:
+        """(training poses,) rows with one number are one pose."""
+        return groups(self.train)
+
+    @cached_property
+    def distances(self) -> Distances:
+        """Between targets, as the believed training points tell them."""
+        believed = np.where(self.weights.T[..., None] > DOUBTED, self.train.y, np.nan)
+        return measured_distances(self.train.with_y(believed), self.options.distance_tolerance)
+
+    @cached_property
+    def estimator(self) -> Estimator:
+        """How the fit weighed its poses, linear where it ended."""
+        train, state = self.train, self.cell.state
+        model = model_of(self.before.robot, train)
+        if self.cell.effects.terms:
+            model, _ = extended(model, self.before.robot, train, state, self.cell.effects.terms)
+        model = model.only(self.identification.active)
+        model = model.with_prior(Prior(model.prior.mean, self.prior))
+        mix = pose_weights(train, self.options.lever) if self.objective == "pose" else NO_MIX
+        weights = self.weights
+        if len(mix):  # a pose needs all of its targets
+            weights = np.where(model.seen, weights, 1.0).min(axis=0)
+        return Estimator(replace(model, weight=model.weight * weights), self.share, mix)
+
+    @cached_property
+    def intervals(self) -> Mapping[str, tuple[Interval, Interval]]:
+        """95 % intervals of RMS and largest error on poses like those held out, by key."""
+        if self.stated is not None:
+            return self.stated
+        rng = np.random.default_rng(self.options.seed)
+        return {
+            key: (rms_interval(self.errors[key], rng=rng), max_interval(self.errors[key], rng=rng))
+            for key in ("nominal", "holdout")
+        }
+
+    def predict(self, q: Array) -> Array:
+        """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
+        return self.cell.predict(q)
+
+    def accuracy_table(self) -> Table:
+        """Accuracy before and after, on the training and on the held-out poses."""
+        rows: list[tuple[TableCell, ...]] = [
+            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
+            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
+        ]
+        targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
+        return Table(
+            f"{self.robot.name}: position accuracy, objective {self.objective}",
+            ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
+            tuple(rows),
+            ("", "d", *[".4f"] * (3 + len(targets))),
+        )
+
+    def interval_rows(self) -> Table:
+        """95 % intervals of the held-out accuracy; empty where the poses are too few."""
+        rows = tuple(
+            (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
+             1e3 * largest.high)
+            for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
+            for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
+            if math.isfinite(rms.low)
+        )  # fmt: skip
+        return Table(
+            "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
+            "many new ones",
+            ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
+            rows,
+            ("", *[".4f"] * 6),
+        )
+
+    def parameter_rows(self) -> Table:
+        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
+        rows = tuple(
+            (p.name, p.scale[1], p.nominal * p.scale[0], (p.value - p.nominal) * p.scale[0],
+             p.sigma * p.scale[0], "" if p.identifiable else p.reason or "not identifiable")
+            for p in self.parameters
+            if not p.of_effect
+        )  # fmt: skip
+        return Table(
+            "parameters",
+            ("name", "unit", "nominal", "change", "sigma", "not identified because"),
+            rows,
+            ("", "", ".4f", "+.4f", ".4f", ""),
+        )
+
+    def effect_rows(self) -> Table:
+        """The parameters of effects beyond geometry, SI; empty without any."""
+        rows = tuple(
+            (p.name, p.unit, p.value, p.sigma, "" if p.identifiable else p.reason)
+            for p in self.parameters
+            if p.of_effect
+        )
+        header = ("effect", "unit", "value", "sigma", "not identified because")
+        return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        before, after = self.accuracy["nominal"], self.accuracy["holdout"]
+        where = f"on {after.poses} poses that were not used for the fit"
+        if not after.poses:
+            before, after = self.accuracy["nominal_train"], self.accuracy["train"]
+            where = f"on the {after.poses} poses of the fit itself (none was held out)"
+        identified = sum(p.identifiable for p in self.parameters)
+        text = (
+            f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, {where}. "
+            f"{identified} of {len(self.parameters)} parameters identified "
+            f"(condition {self.identification.condition:.3g}); {self.status} after "
+            f"{self.iterations} iterations, {self.seconds:.2f} s."
+        )
+        return text + (f" {self.status.advice}." if self.status.advice else "")
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        every = [self.accuracy_table(), self.interval_rows()]
+        if self.minimax and self.objective != "point":
+            every.append(self.minimax.table())
+        if self.certificate:
+            every.append(self.certificate.table())
+        every += [self.effect_rows(), table_of(self.suspects), self.parameter_rows()]
+        return tuple(table for table in every if table.rows)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back to the last digit."""
+        from minimax_cal.fitting.fit_file import written
+
+        return written(self)
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "fit") -> Fit:
+        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError."""
+        from minimax_cal.fitting.fit_file import read
+
+        return read(content, source)
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())
+
+
+def load_fit(path: Path | str) -> Fit:
+    """The fit that `Fit.save` or `minimax-cal calibrate -o` wrote, whole.
+
+    Raises CalibrationError.  Example: ``mc.load_fit("fit.json").summary()``.
+    """
+    return Fit.from_dict(saved_content(path), str(path))
+
+
+def opened(source: Fit | Cell | Path | str) -> Fit | Cell:
+    """A fit, or the bare cell where a file tells no more (the truth of a simulation).
+
+    Raises CalibrationError.
+    """
+    if isinstance(source, Fit | Cell):
+        return source
+    content = saved_content(source)
+    whole = {"parameters", "accuracy", "provenance"} <= set(content)
+    return (Fit.from_dict if whole else cell_from_dict)(content, str(source))

@@ -1,0 +1,620 @@
+"""The file of a fit: what `Fit.to_dict` writes and `Fit.from_dict` reads.
+
+People read millimetres there.  What a change of unit takes of the last digit, and what no person
+asks for, stands in `arrays`, in SI.  Files of earlier versions lack some parts; these are then
+worked out from the others, or missing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.suspects import Suspect
+from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import finite, numbers
+from minimax_cal.ground.records import (
+    AGAIN,
+    FAULTS,
+    UNKNOWN,
+    Count,
+    Ends,
+    Number,
+    Packed,
+    Part,
+    Square,
+    checked,
+    packed,
+    restored,
+    unpacked,
+)
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.measurements import FARTHEST, Measurements
+from minimax_cal.measuring.pose_rows import pose_rows, read_poses
+from minimax_cal.modelling.cell import Cell, cell_from_dict
+from minimax_cal.modelling.parameters import Names
+from minimax_cal.robots.kinematics import rotation
+from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.solvers.minimax import Kkt, Step
+from minimax_cal.solvers.status import Status
+
+SCHEMA = 1
+NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
+
+
+# ---- what stands in the file -------------------------------------------------------------------
+
+
+class ScoresPart(Part):
+    """Accuracy on some poses, with its 95 % intervals where they are known [mm, mm^2]."""
+
+    rms_mm: Number = math.nan
+    max_mm: Number = math.nan
+    mean_mm: Number = math.nan
+    poses: Count = 0
+    sse_mm2: tuple[Square, ...] = ()
+    points: tuple[Count, ...] = ()
+    rms_ci95_mm: Ends = UNKNOWN
+    max_ci95_mm: Ends = UNKNOWN
+
+    def accuracy(self) -> Accuracy:
+        """As the code has it."""
+        return Accuracy(
+            self.rms_mm, self.max_mm, self.mean_mm, self.poses, self.sse_mm2, self.points
+        )
+
+
+class AccuraciesPart(Part):
+    """Before and after, on the held-out and on the training poses."""
+
+    nominal: ScoresPart
+    train: ScoresPart
+    holdout: ScoresPart
+    nominal_train: ScoresPart
+
+
+class ParameterPart(Part):
+    """A parameter in its unit (mm, rad, or that of an effect)."""
+
+    name: str
+    unit: str = ""
+    value: Number
+    nominal: Number = math.nan
+    sigma: Number = math.nan
+    identifiable: bool = True
+    reason: str = ""
+
+
+class KktPart(Part):
+    """Residuals of the optimality conditions."""
+
+    stationarity: Number = math.nan
+    complementarity: Number = math.nan
+    violation: Number = math.nan
+
+
+class StepPart(Part):
+    """One step of the minimax; backend: the QP solver that answered."""
+
+    iteration: int
+    value: Number = math.nan
+    violation: Number = math.nan
+    kkt: Number = math.nan
+    length: Number = math.nan
+    backend: str = ""
+
+
+class DistancePart(Part):
+    """A distance between two targets that the minimax keeps."""
+
+    pair: tuple[str, str]
+    measured_mm: Number
+    tolerance_mm: Number
+    multiplier: Number
+
+
+class MinimaxPart(Part):
+    """How the minimax ended."""
+
+    functions: tuple[str, ...] = ()
+    size: tuple[Number, ...] = ()
+    multipliers: tuple[Number, ...] = ()
+    active: tuple[str, ...] = ()
+    distances: tuple[DistancePart, ...] = ()
+    kkt: KktPart = KktPart()
+    iterations: int = 0
+    trace: tuple[StepPart, ...] = ()
+
+
+class PointPart(Part):
+    """A point that decides."""
+
+    target: str
+    line: int
+    distance_mm: Number
+    multiplier: Number
+
+
+class CertificatePart(Part):
+    """How far the worst point is from its optimum."""
+
+    value_mm: Number
+    bound_mm: Number
+    kkt: KktPart = KktPart()
+    points: tuple[PointPart, ...] = ()
+
+
+class SuspectPart(Part):
+    """A point that does not fit the others.  together: all points of its pose are suspect."""
+
+    line: int
+    target: str
+    distance_mm: Number = math.nan
+    score: Number = math.nan
+    chance: Number = math.nan
+    together: bool = False
+
+
+class ProvenancePart(Part):
+    """Where a result came from."""
+
+    robot: str = ""
+    data: str = ""
+    data_sha256: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    versions: dict[str, str] = Field(default_factory=dict)
+
+    def provenance(self) -> Provenance:
+        """As the code has it."""
+        return Provenance(self.robot, self.data, self.data_sha256, self.settings, self.versions)
+
+
+class FitPart(Part):
+    """The file of `minimax-cal calibrate -o`."""
+
+    objective: str
+    qp: str = ""
+    status: Status
+    iterations: int = 0
+    seconds: Number = math.nan
+    parameters: tuple[ParameterPart, ...]
+    accuracy: AccuraciesPart
+    condition: Number = math.nan
+    trace_mm2: tuple[Number, ...] = ()
+    minimax: MinimaxPart | None = None
+    certificate: CertificatePart | None = None
+    suspects: tuple[SuspectPart, ...] = ()
+    notices: tuple[str, ...] = ()
+    loss: str = "square"
+    widening: float = 1.0
+    provenance: ProvenancePart
+    arrays: dict[str, Packed] = Field(default_factory=dict)
+
+
+# ---- writing -----------------------------------------------------------------------------------
+
+
+def written(fit: Fit) -> dict[str, Any]:
+    """The JSON of the contract, and more."""
+    out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", "robot": fit.robot.to_dict()}
+    if fit.nominal:
+        out["nominal_robot"] = fit.nominal.robot.to_dict()
+    out |= fit.cell.to_dict()
+    if fit.nominal:
+        out["nominal_cell"] = fit.nominal.to_dict()
+    out |= {
+        "objective": fit.objective,
+        "loss": fit.loss,
+        "suspects": [suspect.to_dict() for suspect in fit.suspects],
+        "qp": fit.qp,
+        "status": str(fit.status),
+        "advice": fit.status.advice,
+        "iterations": fit.iterations,
+        "seconds": finite(fit.seconds),
+        "parameters": [p.to_dict() for p in fit.parameters],
+        "accuracy": {key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+        "condition": finite(fit.identification.condition),
+        "trace_mm2": [value * 1e6 for value in fit.trace],
+        "notices": list(fit.notices),
+        "provenance": vars(fit.provenance),
+    }
+    if fit.uncertainty:
+        out["covariance"] = fit.uncertainty.to_dict()
+    if fit.data.poses:
+        errors = {"nominal": fit.error_nominal, "final": fit.error}
+        out["poses"] = pose_rows(fit.data, fit.held, errors)
+    if fit.minimax:
+        out["minimax"] = minimax_to_dict(fit.minimax)
+    if fit.certificate:
+        out["certificate"] = fit.certificate.to_dict()
+    return out | {"widening": fit.widening, "arrays": arrays_of(fit)}
+
+
+def ends(fit: Fit, key: str) -> dict[str, list[float | None]]:
+    """The intervals of some poses; nothing for training poses."""
+    names = ("rms_ci95_mm", "max_ci95_mm")
+    return {
+        name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
+        for name, interval in zip(names, fit.intervals.get(key, ()), strict=False)
+    }
+
+
+def minimax_to_dict(worst: WorstCase) -> dict[str, Any]:
+    """How the minimax ended."""
+    return {
+        "functions": list(worst.functions),
+        "size": worst.size.tolist(),
+        "multipliers": worst.multiplier.tolist(),
+        "active": list(worst.active),
+        "distances": [
+            {
+                "pair": list(kept.pair),
+                "measured_mm": kept.measured * 1e3,
+                "tolerance_mm": kept.tolerance * 1e3,
+                "multiplier": kept.multiplier,
+            }
+            for kept in worst.distances
+        ],
+        "kkt": vars(worst.kkt),
+        "iterations": worst.iterations,
+        "trace": [vars(step) for step in worst.trace],
+    }
+
+
+def arrays_of(fit: Fit) -> dict[str, Any]:
+    """What is kept to the last digit, by name."""
+    out = {
+        "value": fit.parameters.value,
+        "nominal": fit.parameters.nominal,
+        "sigma": fit.parameters.sigma,
+        "singular": fit.identification.singular,
+        "sensitivity": fit.identification.scale,
+        "weights": fit.weights,
+        "share": fit.share,
+        "prior": fit.prior,
+        "trace": np.array(fit.trace),
+        "intervals": np.array(
+            [[(i.low, i.high) for i in fit.intervals[key]] for key in ("nominal", "holdout")]
+        ),
+        **cell_arrays(fit.cell, "cell"),
+        **(cell_arrays(fit.nominal, "nominal") if fit.nominal else {}),
+    }
+    if fit.uncertainty:
+        out["covariance"] = fit.uncertainty.covariance
+        out["noise"] = np.array([fit.uncertainty.noise.variance])
+    if fit.data.poses:
+        out["measured"] = fit.data.y
+    return {name: packed(values) for name, values in out.items()}
+
+
+def cell_arrays(cell: Cell, name: str) -> dict[str, Array]:
+    """What predictions rest on."""
+    return {
+        f"{name}.mdh": cell.robot.mdh,
+        f"{name}.com": cell.robot.com,
+        f"{name}.up": cell.robot.up,
+        f"{name}.base": cell.base,
+        f"{name}.targets": cell.target_positions,
+    }
+
+
+# ---- reading -----------------------------------------------------------------------------------
+
+
+def read(content: Mapping[str, Any], source: str) -> Fit:
+    """A fit from its JSON.  Raises CalibrationError."""
+    if content.get("schema", 1) != SCHEMA:
+        raise CalibrationError(
+            f"{source}: is of schema {content['schema']!r}, this version knows {SCHEMA}; update "
+            "minimax-cal"
+        )
+    cell = cell_from_dict(content, source)
+    part = checked(FitPart, content, source)
+    try:
+        arrays = {name: unpacked(array) for name, array in part.arrays.items()}
+    except ValueError as error:
+        raise CalibrationError(f"{source}: its arrays cannot be read ({error}); {AGAIN}") from error
+    cell = refined(cell, arrays, "cell")
+    for name, scores in part.accuracy:
+        if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
+            raise CalibrationError(
+                f"{source}: accuracy.{name} is not of {len(cell.target_names)} targets; {AGAIN}"
+            )
+    data, held, told = measured_poses(content, source, cell, "nominal")
+    exact = restored(data.y, arrays.get("measured"))
+    data = replace(data, y=exact, digest=part.provenance.data_sha256)
+    nominal = nominal_of(content, source, cell, arrays)
+    try:
+        before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
+        return assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
+    except FAULTS as error:
+        raise CalibrationError(f"{source}: cannot be read ({error}); {AGAIN}") from error
+
+
+def assembled(
+    content: Mapping[str, Any],
+    source: str,
+    part: FitPart,
+    arrays: Mapping[str, Array],
+    cell: Cell,
+    nominal: Cell | None,
+    data: Measurements,
+    held: Array,
+    before: Array,
+    after: Array,
+) -> Fit:
+    """The fit from what was read.  Raises one of FAULTS."""
+    known = uncertainty_of(content, source, cell, arrays)
+    parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
+    train = data.take(~held)
+    k, names = len(cell.target_names), parameter_names(parameters, cell)
+    return Fit(
+        cell=cell,
+        nominal=nominal,
+        objective=part.objective,
+        qp=part.qp,
+        status=part.status,
+        iterations=part.iterations,
+        seconds=part.seconds,
+        parameters=parameters,
+        accuracy={key: scores.accuracy() for key, scores in part.accuracy},
+        identification=identification_of(part, parameters, names, arrays),
+        uncertainty=known,
+        minimax=minimax_of(part),
+        certificate=certificate_of(part.certificate),
+        trace=tuple(exactly(1e-6 * np.array(part.trace_mm2), arrays.get("trace")).tolist()),
+        data=data,
+        held=held,
+        error_nominal=before,
+        error=after,
+        notices=part.notices,
+        loss=part.loss,
+        suspects=tuple(suspect_of(suspect, train) for suspect in part.suspects),
+        weights=arrays.get("weights", train.seen.T.astype(float)),
+        share=arrays.get("share", np.ones(k)),
+        prior=arrays.get("prior", np.zeros(names.count)),
+        widening=part.widening,
+        provenance=part.provenance.provenance(),
+        stated=intervals_of(part, arrays),
+    )
+
+
+def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:
+    """A cell with the digits that millimetres and a rotation vector took."""
+    robot, exact = cell.robot, {key: arrays.get(f"{name}.{key}") for key in CELL}
+    base = restored(cell.base, exact["base"])
+    if exact["base"] is not None and not np.array_equal(base[:3, :3], exact["base"][:3, :3]):
+        base[:3, :3] = cell.base[:3, :3]  # a rotation is taken whole or not at all
+    robot = replace(
+        robot,
+        mdh=restored(robot.mdh, exact["mdh"]),
+        com=restored(robot.com, exact["com"]),
+        up=restored(robot.up, exact["up"]),
+    )
+    positions = restored(cell.target_positions, exact["targets"])
+    return replace(cell, robot=robot, base=base, target_positions=positions)
+
+
+CELL = ("mdh", "com", "up", "base", "targets")
+
+
+def nominal_of(
+    content: Mapping[str, Any], source: str, cell: Cell, arrays: Mapping[str, Array]
+) -> Cell | None:
+    """The nominal robot in its place; from the table of parameters where an old file has no more.
+
+    Base entries are told there along the nominal base's axes.
+    """
+    if "nominal_robot" not in content:
+        return None
+    robot = robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot")
+    if "nominal_cell" in content:
+        whole = {"robot": content["nominal_robot"], **content["nominal_cell"]}
+        return refined(cell_from_dict(whole, f"{source}: nominal_cell"), arrays, "nominal")
+    told = {p["name"]: p for p in content["parameters"]}
+    try:
+        at, was = (
+            np.array([told[f"base_{axis}"][key] for axis in "xyz"], dtype=float) * 1e-3
+            for key in ("value", "nominal")
+        )
+        turn = np.array([told[f"base_r{axis}"]["value"] for axis in "xyz"], dtype=float)
+        targets = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.target_names]
+    except FAULTS:
+        return None
+    base = np.eye(4)
+    base[:3, :3] = cell.base[:3, :3] @ rotation(-turn)
+    base[:3, 3] = base[:3, :3] @ was
+    if not np.abs(base[:3, :3] @ at - cell.base[:3, 3]).max() < 1e-5:
+        return None
+    return Cell(robot, base, cell.target_names, 1e-3 * np.array(targets, dtype=float))
+
+
+def measured_poses(
+    content: Mapping[str, Any], source: str, cell: Cell | None, first: str
+) -> tuple[Measurements, Array, tuple[Array, Array]]:
+    """The poses of a result file, (m,) which are held out, and errors (k, m, 3) of `first` and
+    `final` as they stand there [m].  None where the file has none.  Raises CalibrationError.
+    """  # fmt: skip
+    if content.get("poses") is None or cell is None:
+        nowhere = np.zeros((0, 0, 3)) if cell is None else np.zeros((0, len(cell.target_names), 3))
+        joints = cell.robot.joints if cell else 0
+        nothing, lines = np.zeros((0, joints)), np.zeros(0, dtype=int)
+        names = cell.target_names if cell else ()
+        data = Measurements(nothing, nowhere, names, np.zeros(joints, dtype=bool), lines, {})
+        none = np.moveaxis(nowhere, 1, 0)
+        return replace(data, source=source), np.zeros(0, dtype=bool), (none, none)
+    given = content["poses"]
+    data, held = read_poses(given, source)
+    try:
+        if data.q.shape[1] != cell.robot.joints or set(data.target_names) - set(cell.target_names):
+            raise ValueError("joints or targets are not those of the robot")
+        errors = (told_errors(given, first, data), told_errors(given, "final", data))
+        return replace(data, source=str(given["source"])), held, errors
+    except FAULTS as error:
+        raise CalibrationError(
+            f"{source}: its list of poses cannot be read ({error}); {AGAIN}"
+        ) from error
+
+
+def told_errors(given: Mapping[str, Any], name: str, data: Measurements) -> Array:
+    """(k, m, 3) errors of a name as they stand in a file [m].  Raises ValueError."""
+    told = 1e-3 * numbers(given["errors_mm"][name])
+    if told.shape != data.y.shape:
+        raise ValueError(f"errors_mm.{name} differs in length")
+    if np.nanmax(np.abs(told), initial=0.0) > FARTHEST:
+        raise ValueError(f"errors_mm.{name} holds a distance that no instrument measures")
+    return np.moveaxis(np.where(np.isfinite(told), told, np.nan), 1, 0)
+
+
+def errors_of(cell: Cell | None, data: Measurements, told: Array) -> Array:
+    """(k, m, 3) errors of a cell [m]: worked out, or as they stand in a file that lacks columns of
+    the measurements which its effects look at.
+    """  # fmt: skip
+    if cell is None or not data.poses:
+        return told
+    exact = cell.error(data)
+    same = np.nanmax(np.abs(exact - told), initial=0.0) <= NEAR
+    return exact if same else told
+
+
+def uncertainty_of(
+    content: Mapping[str, Any], source: str, cell: Cell, arrays: Mapping[str, Array]
+) -> Uncertainty | None:
+    """How sure the parameters are; None in an old file."""
+    if "covariance" not in content:
+        return None
+    known = uncertainty_from_dict(content, cell, source)
+    noise = known.noise
+    variance = restored(np.array([noise.variance]), arrays.get("noise"))
+    return replace(
+        known,
+        covariance=exactly(known.covariance, arrays.get("covariance")),
+        noise=replace(noise, variance=float(variance[0])),
+    )
+
+
+def exactly(read: Array, exact: Array | None) -> Array:
+    """As `restored`, of a matrix whose entries are as small as they please."""
+    if exact is None or exact.shape != read.shape:
+        return read
+    same = np.isclose(exact, read, rtol=1e-12, atol=0.0, equal_nan=True)
+    return np.where(same, exact, read)
+
+
+def parameters_of(part: FitPart, arrays: Mapping[str, Array]) -> tuple[Parameter, ...]:
+    """The parameters in SI."""
+    every = part.parameters
+    scale = np.array([1e-3 if p.unit == "mm" else 1.0 for p in every])
+    read = {
+        key: exactly(scale * np.array([getattr(p, key) for p in every]), arrays.get(key))
+        for key in ("value", "nominal", "sigma")
+    }
+    return tuple(
+        Parameter(
+            name=p.name,
+            value=float(read["value"][i]),
+            nominal=float(read["nominal"][i]),
+            sigma=float(read["sigma"][i]),
+            unit="m" if p.unit == "mm" else p.unit,
+            identifiable=p.identifiable,
+            reason=p.reason,
+        )
+        for i, p in enumerate(every)
+    )
+
+
+def parameter_names(parameters: Parameters, cell: Cell) -> Names:
+    """All names in their order."""
+    effects = tuple(p.name for p in parameters if p.of_effect)
+    return Names(cell.robot.joints, cell.target_names, effects)
+
+
+def identification_of(
+    part: FitPart, parameters: Parameters, names: Names, arrays: Mapping[str, Array]
+) -> Identification:
+    """What was identified, and why the rest was not."""
+    active = np.zeros(names.count, dtype=bool)
+    for p in parameters:
+        active[names.index(p.name)] = p.identifiable
+    return Identification(
+        active=active,
+        reasons={p.name: p.reason for p in parameters if p.reason},
+        singular=arrays.get("singular", np.array([part.condition, 1.0])),
+        scale=arrays.get("sensitivity", np.zeros(names.count)),
+    )
+
+
+def intervals_of(
+    part: FitPart, arrays: Mapping[str, Array]
+) -> dict[str, tuple[Interval, Interval]]:
+    """Of RMS and largest error on poses like those held out [m]."""
+    told = (part.accuracy.nominal, part.accuracy.holdout)
+    read = 1e-3 * np.array([[scores.rms_ci95_mm, scores.max_ci95_mm] for scores in told])
+    (a, b), (c, d) = exactly(read, arrays.get("intervals")).tolist()
+    return {
+        "nominal": (Interval(*a), Interval(*b)),
+        "holdout": (Interval(*c), Interval(*d)),
+    }
+
+
+def minimax_of(part: FitPart) -> WorstCase | None:
+    """What the minimax rests on, where there was one."""
+    worst = part.minimax
+    if worst is None:
+        return None
+    size = worst.size or (math.nan,) * len(worst.functions)
+    if not len(worst.functions) == len(worst.multipliers) == len(size):
+        raise ValueError("minimax: functions and multipliers differ in number")
+    return WorstCase(
+        functions=worst.functions,
+        size=np.array(size),
+        multiplier=np.array(worst.multipliers),
+        active=worst.active,
+        distances=tuple(
+            KeptDistance(d.pair, 1e-3 * d.measured_mm, 1e-3 * d.tolerance_mm, d.multiplier)
+            for d in worst.distances
+        ),
+        kkt=Kkt(**dict(worst.kkt)),
+        iterations=worst.iterations,
+        trace=tuple(Step(**dict(step)) for step in worst.trace),
+    )
+
+
+def certificate_of(part: CertificatePart | None) -> Certificate | None:
+    """Of the worst point, where it was the objective."""
+    if part is None:
+        return None
+    return Certificate(
+        target=tuple(point.target for point in part.points),
+        line=np.array([point.line for point in part.points], dtype=int),
+        multiplier=np.array([point.multiplier for point in part.points]),
+        distance=1e-3 * np.array([point.distance_mm for point in part.points]),
+        kkt=Kkt(**dict(part.kkt)),
+        value=1e-3 * part.value_mm,
+        bound=1e-3 * part.bound_mm,
+    )
+
+
+def suspect_of(part: SuspectPart, train: Measurements) -> Suspect:
+    """A point that stands out."""
+    rows = np.flatnonzero(train.line == part.line)
+    return Suspect(
+        line=part.line,
+        target=part.target,
+        pose=int(rows[0]) if len(rows) else -1,
+        distance=1e-3 * part.distance_mm,
+        score=part.score,
+        p_value=part.chance,
+        together=part.together,
+    )

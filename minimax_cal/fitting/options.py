@@ -1,0 +1,133 @@
+"""How to calibrate, and whether that can be done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+import qp_backends
+from minimax_cal.fitting import identify
+from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
+from minimax_cal.fitting.robust import SQUARE, check_robust
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.least_squares import METHODS
+from qp_backends import BackendError, Problem
+from qp_backends import solve as solve_qp
+
+FALLBACK = "daqp"  # a required package
+TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
+
+Progress = Callable[[str], None]
+T = TypeVar("T")
+
+
+def silent(message: str) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to calibrate.
+
+    objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.
+    lever: metres that a radian counts as in the pose objective, None for the targets' own.
+    qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
+    seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
+    method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
+    distance constraints, two-sided, squared or off.  distance_tolerance: [m], None for the
+    instrument's own accuracy.  resolution: relative singular value that counts as not measured.
+    effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
+    loss: of the distances in the least squares: square, huber, cauchy or tukey.
+    trim: at most this share of the points, those that stand out, is set aside.
+    """
+
+    objective: str = "minimax"
+    qp: str = "daqp"
+    holdout: float = 0.2
+    seed: int = 0
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    priors: Mapping[str, float] = field(default_factory=dict)
+    method: str = "snllm"
+    lever: float | None = None
+    hessian: str = "gauss-newton"
+    distance: str = "two-sided"
+    distance_tolerance: float | None = None
+    resolution: float = identify.RESOLUTION
+    effects: Sequence[str | Term] = ()
+    loss: str = SQUARE
+    trim: float = 0.0
+
+    def settings(self) -> dict[str, object]:
+        """For the record, effects in their written form."""
+        effects = [e.text if isinstance(e, Term) else e for e in self.effects]
+        return {**vars(self), "effects": effects}
+
+
+def listed(names: str | Sequence[T]) -> Sequence[T | str]:
+    """Names from a list, or from one text with commas."""
+    if isinstance(names, str):
+        return tuple(filter(None, names.replace(" ", "").split(",")))
+    return names
+
+
+def objective_of(objective: str, data: Measurements) -> int:
+    """Index of the single target of smr:K, else -1.  Raises OptionError."""
+    if objective in ("sum", "minimax", "point", "pose"):
+        return -1
+    kind, _, which = objective.partition(":")
+    if kind != "smr" or not which:
+        raise OptionError(
+            f"no objective {objective!r}; choose sum, minimax, point, pose or smr:K (K as in smr1)"
+        )
+    if f"smr{which}" not in data.target_names:
+        raise OptionError(
+            f"objective {objective}: {data.source} has no target smr{which}; "
+            f"it has {', '.join(data.target_names)}"
+        )
+    return data.target_names.index(f"smr{which}")
+
+
+def check_options(options: Options) -> None:
+    """Raise an error for a choice that does not exist, before any work."""
+    for name, value, choices in (
+        ("method", options.method, tuple(METHODS)),
+        ("hessian", options.hessian, minimax.HESSIANS),
+        ("distance form", options.distance, DISTANCE_FORMS),
+    ):
+        if value not in choices:
+            raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
+    check_robust(options.loss, options.trim)
+    if not 0.0 <= options.resolution < 1.0:
+        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    for name, length in (
+        ("lever", options.lever),
+        ("distance tolerance", options.distance_tolerance),
+    ):
+        if length is not None and not 0.0 < length < np.inf:
+            raise OptionError(f"{name} {length:g} m: must be positive and finite")
+    for pattern, sigma in options.priors.items():
+        if not (np.isfinite(sigma) and sigma > 0.0):
+            raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
+
+
+def usable(qp: str) -> tuple[str, tuple[str, ...]]:
+    """The QP backend to use, and a notice where it is not the one that was named.
+
+    A backend that exists but is not installed is replaced; a name that does not exist is a
+    mistake.  Raises OptionError.
+    """
+    try:
+        solve_qp(TRIVIAL, qp)
+    except BackendError as error:
+        if qp.partition(":")[0] not in qp_backends.names():
+            raise OptionError(str(error)) from error
+        return FALLBACK, (f"QP: {error}; {FALLBACK} is used",)
+    return qp, ()

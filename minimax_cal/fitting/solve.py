@@ -1,0 +1,371 @@
+"""From training poses to a fit: start, identification, least squares, weights, effects, minimax."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from minimax_cal.evidence.noise import linearised
+from minimax_cal.evidence.selection import best_variant
+from minimax_cal.fitting import identify, start
+from minimax_cal.fitting.certificate import Certificate, certify
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
+from minimax_cal.fitting.options import Options, Progress, objective_of, silent, usable
+from minimax_cal.fitting.plausibility import POOR_FIT
+from minimax_cal.fitting.robust import Robust, flatness, robust_fit
+from minimax_cal.fitting.start import BaseFit
+from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring import checks
+from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.modelling.effects.table import Fitted, Term, names_of
+from minimax_cal.modelling.effects.table import terms as terms_of
+from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
+from minimax_cal.modelling.model import (
+    NO_MIX,
+    Model,
+    Prior,
+    SumOfSquares,
+    model_of,
+    pose_weights,
+    with_poses,
+)
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares, minimax
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+from minimax_cal.solvers.minimax import Optimum, Sqp
+from minimax_cal.solvers.status import Status
+from qp_backends import solve as solve_qp
+
+QP_TOLERANCE = 1e-9
+# With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
+# beside 1, but leaves their own coordinates determined.
+ASIDE = 1e-9
+PASSES = 2  # of a fit with effects: the second takes finite turns into account
+PRIOR_ROUNDS = 20  # of weighing a prior against the noise that remains
+FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
+LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
+DOUBTED = 0.5  # a point of less weight tells no distance between targets
+LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
+PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What the solvers found.
+
+    nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
+    estimator: how the poses were weighed.  group: (m,) rows with one number are one pose.
+    optimum: the minimax answer, where there was one to find.  certificate: of the worst point.
+    trace: cost at each iterate of the least squares [m^2].
+    effects: those asked for, with their values; units: of each value.
+    robust: the weights of the points, and which stand out.
+    """
+
+    nominal: State
+    state: State
+    identification: Identification
+    estimator: Estimator
+    group: Array
+    status: Status
+    iterations: int
+    optimum: Optimum[State] | None
+    certificate: Certificate | None
+    distances: Distances
+    trace: tuple[float, ...]
+    notices: tuple[str, ...]
+    effects: Fitted
+    units: tuple[str, ...]
+    robust: Robust
+
+    @cached_property
+    def widening(self) -> float:
+        """What a robust loss adds to all sigmas: `robust.flatness`."""
+        return flatness(self.robust, self.state)
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Of all parameters, the base's along its own axes."""
+        known = uncertainty_of(self.estimator, self.state, self.group, self.units)
+        return known.widened(self.widening)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is to be fitted, and what the user wants of the parameters.
+
+    base: the geometric model of the training poses.  frame: the nominal geometry's best base.
+    reference: plenty of poses, which tell what no pose could.  share: (k,) weight of each target.
+    allowed: (p,) False for parameters that stay nominal.  order: those to give up first at the
+    front.  sigma: (p,) of the prior, inf for none.
+    """
+
+    robot: Robot
+    data: Measurements
+    options: Options
+    base: Model
+    frame: BaseFit
+    reference: Model
+    share: Array
+    allowed: Array
+    order: Array
+    sigma: Array
+
+    def identified(self, model: Model, state: State) -> Identification:
+        """The parameters that the poses of a model tell; those of effects are given up first."""
+        more, count = len(model.fields), self.base.names.count
+        return identify.identify(
+            model,
+            state,
+            np.concatenate([np.arange(count, count + more), self.order]),
+            allowed=np.pad(self.allowed, (0, more), constant_values=True),
+            reference=self.reference,
+            known=np.pad(np.isfinite(self.sigma), (0, more)),
+            resolution=self.options.resolution,
+        )
+
+    def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
+        """Least squares; with priors, weighed against the noise that remains."""
+        sigma = np.pad(self.sigma, (0, len(model.fields)), constant_values=np.inf)
+        points = float(model.counts.sum())
+        method = METHODS[self.options.method]
+        mean_square = self.frame.mean_square / 3.0
+        for _ in range(PRIOR_ROUNDS if np.isfinite(sigma).any() else 1):
+            model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
+            problem = SumOfSquares(model)
+            found = least_squares.solve(
+                problem, begin.batch(), 1, points, method, least_squares.NEAR
+            )
+            state = found.x.take(np.array(0))
+            _, _, gram = problem.normal(state)
+            weight = np.diag(model.prior.weight[model.active])
+            paid = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
+            previous = mean_square
+            dof = max(3.0 * points - paid, 1.0)
+            mean_square = max(float(model.cost(state).sum()) / dof, LEAST_NOISE**2)
+            if abs(mean_square - previous) <= 0.01 * previous:
+                break
+        return model, found
+
+    def robust(self, model: Model, found: LeastSquares[State]) -> Robust:
+        """The fit with the loss and the trimming that were asked for."""
+        line, options = self.data.line, self.options
+        judged = self.share > ASIDE
+        return robust_fit(self.squares, model, found, line, options.loss, options.trim, judged)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """How far a fit has come.
+
+    base: the model with all columns, unweighted.  squares: the least squares that count now.
+    terms: effects in the model.
+    """
+
+    base: Model
+    identification: Identification
+    robust: Robust
+    squares: LeastSquares[State]
+    terms: tuple[Term, ...] = ()
+    notices: tuple[str, ...] = ()
+
+    @property
+    def state(self) -> State:
+        """Where the least squares ended."""
+        return self.squares.x.take(np.array(0))
+
+
+def fit_cell(
+    robot: Robot, data: Measurements, options: Options, progress: Progress = silent
+) -> Solved:
+    """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError."""
+    task = prepared(robot, data, options)
+    mix = NO_MIX
+    if options.objective == "pose":
+        check_poses(data)
+        mix = pose_weights(data, options.lever)
+    stage = geometry(task, progress)
+    if options.effects:
+        progress("effects")
+        stage = with_effects(task, stage)
+    model = stage.robust.model
+    if len(mix):
+        model = stage.robust.by_pose
+        stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
+    believed = np.where(stage.robust.weights.T[..., None] > DOUBTED, data.y, np.nan)
+    distances = measured_distances(data.with_y(believed), options.distance_tolerance)
+    optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
+    state = optimum.x if optimum else stage.state
+    scene = scene_of(robot, data, model, state)
+    plain = replace(stage.base, weight=model.weight / task.share[:, None])
+    plain = plain.only(stage.identification.active).with_prior(model.prior)
+    rounds = int(stage.squares.iterations[0]) + stage.robust.rounds
+    return Solved(
+        nominal=task.frame.state,
+        state=state,
+        identification=stage.identification,
+        estimator=Estimator(plain, shares(task, model, optimum), mix),
+        group=groups(data),
+        status=optimum.status if optimum else stage.squares.status[0],
+        iterations=rounds + (optimum.iterations if optimum else 0),
+        optimum=optimum,
+        certificate=certificate,
+        distances=distances,
+        trace=tuple(float(value) for value in stage.squares.trace[:, 0]),
+        notices=(*stage.notices, *stage.robust.notices, *said),
+        effects=fitted(stage.terms, scene, state.effects),
+        units=names_of(stage.terms, scene)[1],
+        robust=stage.robust,
+    )
+
+
+def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
+    """The task, with poses enough for its unknowns.  Raises OptionError, DataError."""
+    base, k = model_of(robot, data), len(data.target_names)
+    allowed, order, sigma = wanted(robot, base, options)
+    reference = identify.plenty_of_poses(robot, base)
+    unknowns = identify.generic_count(robot, reference, order, allowed)
+    only = objective_of(options.objective, data)
+    telling = data if only < 0 else data.only(only)
+    following = 0 if only < 0 else 3 * (k - 1)  # coordinates of targets that follow
+    poses, known = len(np.unique(groups(telling))), int(np.isfinite(sigma[allowed]).sum())
+    checks.check_count(telling, poses, unknowns - following, known)
+    share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
+    frame = start.fit_base(base, robot.mdh)
+    return Task(robot, data, options, base, frame, reference, share, allowed, order, sigma)
+
+
+def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, Array]:
+    """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
+    names = model.names
+    allowed = ~names.match(options.fix, "--fix")
+    order = identify.drop_order(robot, names)
+    kept = names.match(options.free, "--free")
+    if (kept & ~allowed).any():
+        name = names.all[int(np.argmax(kept & ~allowed))]
+        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+    order = np.concatenate([order[~kept[order]], order[kept[order]]])
+    sigma = np.full(names.count, np.inf)
+    for pattern, value in options.priors.items():
+        chosen = names.match([pattern], "--prior")
+        if (chosen & ~names.links).any():
+            raise OptionError(
+                f"--prior {pattern}: base and targets have no nominal value to keep to"
+            )
+        sigma[chosen] = value
+    return allowed, order, sigma
+
+
+def check_poses(data: Measurements) -> None:
+    """Raise OptionError if the targets give no orientation."""
+    if len(data.target_names) < 3 or checks.collinear(data):
+        raise OptionError("objective pose needs three targets that are not on a line")
+    whole = int(data.seen.all(axis=1).sum())
+    if whole < LEAST_POSES:
+        raise OptionError(
+            f"objective pose needs poses at which all targets were measured; there are {whole}"
+        )
+
+
+def geometry(task: Task, progress: Progress) -> Stage:
+    """The least-squares fit of the geometry."""
+    progress("identifiable parameters")
+    model = task.base.emphasise(task.share)
+    identification = task.identified(model, task.frame.state)
+    progress("least squares")
+    model, squares = task.squares(model.only(identification.active), task.frame.state)
+    robust = task.robust(model, squares)
+    # a few gross outliers are no reason to search: what counts is how the believed points are met
+    wide, notices = wider(task.robot, robust.model, robust.fit, progress)
+    if wide is not robust.fit:
+        robust = task.robust(robust.plain, wide)
+    return Stage(task.base, identification, robust, robust.fit, notices=notices)
+
+
+def wider(
+    robot: Robot, model: Model, found: LeastSquares[State], progress: Progress
+) -> tuple[LeastSquares[State], tuple[str, ...]]:
+    """The fit, or a better one from a search over base rotations where it misses grossly."""
+    points = float(model.counts.sum())
+    limit = POOR_FIT * robot.reach()
+
+    def miss(fit: LeastSquares[State]) -> float:
+        return float(np.sqrt(fit.cost[0] / points))
+
+    if miss(found) <= limit:
+        return found, ()
+    progress("search over base rotations")
+    wide = start.search(model, robot.mdh, points, limit)
+    notices: tuple[str, ...] = ()
+    if wide.cost[0] < 0.99 * found.cost[0]:
+        found = wide
+        notices = ("the nominal angles are far off; a search over base rotations found this fit",)
+    if miss(found) > limit:
+        notices += (
+            f"the best fit still misses by {1e3 * miss(found):.3g} mm: check joint signs, units "
+            "and the link lengths in the robot file",
+        )
+    return found, notices
+
+
+def with_effects(task: Task, stage: Stage) -> Stage:
+    """The fit with the effects beside the geometry."""
+    robot, data, robust = task.robot, task.data, stage.robust
+    scene = scene_of(robot, data, robust.plain, stage.state)
+    rows = linearised(robust.model, stage.state, scene.jacobian)
+    terms = terms_of(scene, task.options.effects, partial(best_variant, scene, rows))
+    identification = stage.identification
+    for _ in range(PASSES):
+        here = robust.fit.x.take(np.array(0))
+        active = identification.active
+        model, begin = extended(robust.plain.only(active), robot, data, here, terms)
+        identification = task.identified(model, begin)
+        known = identification.active[task.base.names.count :]
+        begin = replace(begin, effects=np.where(known, begin.effects, 0.0))
+        model, squares = task.squares(model.only(identification.active), begin)
+        robust = task.robust(model, squares)
+    base = replace(task.base, names=model.names, fields=model.fields, moved=model.moved)
+    return Stage(base, identification, robust, robust.fit, terms, stage.notices)
+
+
+def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
+    """The least squares of pose errors, from that of points.
+
+    The turn that fits the errors best vanishes for half a turn too: start near the answer.
+    """
+    points, method = float(model.counts.sum()), METHODS[task.options.method]
+    problem = SumOfSquares(model)
+    return least_squares.solve(problem, stage.squares.x, 1, points, method, least_squares.NEAR)
+
+
+def worst_case(
+    task: Task, model: Model, state: State, distances: Distances, progress: Progress
+) -> tuple[Optimum[State] | None, Certificate | None, tuple[str, ...]]:
+    """The minimax answer and its certificate, where the objective asks for one, and notices."""
+    options = task.options
+    per = PER.get(options.objective)
+    if per is None or (per == "target" and len(task.share) == 1):
+        return None, None, ()
+    progress("minimax")
+    problem = minimax_problem(model, state, distances, options.distance, per)
+    name, notices = usable(options.qp)
+    qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
+    optimum = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+    certificate = None
+    if per == "point" and optimum.status is not Status.FAILED:
+        certificate = certify(problem, optimum, task.data.line)
+    return optimum, certificate, (*notices, *(f"QP: {note}" for note in optimum.notes))
+
+
+def shares(task: Task, model: Model, optimum: Optimum[State] | None) -> Array:
+    """How much each target (k,), or each point (k, m) of the worst, counts in the fit."""
+    if optimum is None:
+        return task.share
+    if PER[task.options.objective] == "point":
+        return point_share(optimum.mu, model.seen)
+    return np.asarray(np.maximum(optimum.mu, FLOOR) * model.counts.sum() / model.counts)

@@ -1,0 +1,89 @@
+"""Parts of result files: numbers that may be missing, arrays to the last digit, checked records."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError
+
+AGAIN = "write it again with minimax-cal"
+FAULTS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+SAME = 1e-12  # relative, and absolute in m or rad: what rounding to other units may change
+
+
+def number_or_nan(value: object) -> object:
+    """JSON has null where there is no number."""
+    return math.nan if value is None else value
+
+
+def pair_or_nan(value: object) -> object:
+    """An interval that is not known."""
+    return (math.nan, math.nan) if value is None else value
+
+
+Number = Annotated[float, BeforeValidator(number_or_nan)]
+Ends = Annotated[tuple[Number, Number], BeforeValidator(pair_or_nan)]
+Count = Annotated[int, Field(ge=0, lt=10**9)]
+Square = Annotated[float, Field(ge=0.0)]
+UNKNOWN = (math.nan, math.nan)
+
+
+class Part(BaseModel):
+    """A part of a file, as it was written; what later versions add is left alone."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Packed(Part):
+    """An array of doubles, little-endian, in base64."""
+
+    shape: tuple[Count, ...]
+    float64: str
+
+
+Model = TypeVar("Model", bound=Part)
+
+
+def checked(model: type[Model], content: Mapping[str, Any], source: str) -> Model:
+    """A file as its schema.  Raises CalibrationError."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise CalibrationError(f"{source}: {explain(error)}; {AGAIN}") from error
+
+
+def explain(error: ValidationError) -> str:
+    """The first complaint of a schema, as place and text."""
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return f"{place}: {first['msg']}" if place else str(first["msg"])
+
+
+def packed(values: Array) -> dict[str, Any]:
+    """An array for JSON, to the last digit."""
+    raw = np.ascontiguousarray(values, dtype="<f8")
+    return {"shape": list(raw.shape), "float64": base64.b64encode(raw.tobytes()).decode("ascii")}
+
+
+def unpacked(part: Packed) -> Array:
+    """The array of `packed`.  Raises ValueError."""
+    raw = np.frombuffer(base64.b64decode(part.float64, validate=True), dtype="<f8")
+    return np.array(raw.reshape(part.shape), dtype=float)
+
+
+def restored(read: Array, exact: Array | None) -> Array:
+    """Numbers as people read them, with the digits that their unit took.
+
+    exact: the same to the last digit.  Where a file was changed by hand, what people read counts.
+    """
+    if exact is None or exact.shape != read.shape:
+        return read
+    same = np.isclose(exact, read, rtol=SAME, atol=SAME, equal_nan=True)
+    return np.where(same, exact, read)
