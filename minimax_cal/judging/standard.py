@@ -27,7 +27,7 @@ def iso9283(
     or name; that of the fit unless given.  tcp: centroid of the targets, one target (smr1), or a
     point (3,) in the last frame [m].  Raises CalibrationError for wrong input.
 
-    >>> print(mc.iso9283("fit.json").position_table().text())
+    >>> print(mc.iso9283("fit.json").summary())
     """
     if isinstance(fit, Calibration):
         if data or nominal:
