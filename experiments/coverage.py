@@ -237,9 +237,7 @@ def run(batch: Batch) -> Runs:
                 judged(cell, arm, case, rng),
             )
         )
-    names = tuple(
-        name for name, on in zip(true.estimator.model.names.all, active, strict=True) if on
-    )
+    names = tuple(name for name, on in zip(true.names.all, active, strict=True) if on)
     columns = (np.array(column) for column in zip(*rows, strict=True))
     return Runs(names, batch.count - len(rows), *columns)
 

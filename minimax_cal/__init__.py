@@ -1,24 +1,44 @@
-"""Calibrate robot arms, and tell why a calibrated arm still misses."""
+"""Calibrate robot arms, and tell why a calibrated arm still misses.
 
-from minimax_cal.correcting.compensate import Compensation, compensate
-from minimax_cal.diagnosing.diagnose import diagnose
-from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.fit import Fit, load_fit
-from minimax_cal.fitting.options import Options
-from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
-from minimax_cal.measuring import datasets
-from minimax_cal.measuring.measurements import (
-    Measurements,
-    measurements,
-    read_measurements,
-    write_measurements,
-)
-from minimax_cal.modelling.cell import Cell, evaluate, load_cell
-from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
-from minimax_cal.solvers.minimize import minimize_max
+Names are imported when they are first used: `import minimax_cal as mc` costs next to nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # the same names for editors and type checkers
+    from minimax_cal.correcting.compensate import Compensation, compensate
+    from minimax_cal.correcting.export import export
+    from minimax_cal.diagnosing.diagnose import diagnose
+    from minimax_cal.diagnosing.result import Diagnosis
+    from minimax_cal.fitting.calibrate import calibrate
+    from minimax_cal.fitting.fit import Fit, load_fit
+    from minimax_cal.fitting.instruments.kinds import relative
+    from minimax_cal.fitting.options import Options
+    from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
+    from minimax_cal.judging.bootstrap import bootstrap
+    from minimax_cal.judging.standard import iso9283
+    from minimax_cal.judging.tradeoff import tradeoff
+    from minimax_cal.measuring import datasets
+    from minimax_cal.measuring.importers import import_files
+    from minimax_cal.measuring.measurements import (
+        Measurements,
+        measurements,
+        read_measurements,
+        write_measurements,
+    )
+    from minimax_cal.modelling.cell import Cell, evaluate, load_cell
+    from minimax_cal.modelling.effects.table import EFFECTS, register
+    from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+    from minimax_cal.planning.plan import plan
+    from minimax_cal.reporting.report import report
+    from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
+    from minimax_cal.solvers.minimize import minimize_max
+
+    __version__: str
 
 __all__ = [
+    "EFFECTS",
     "CalibrationError",
     "Cell",
     "Compensation",
@@ -30,17 +50,87 @@ __all__ = [
     "Options",
     "Robot",
     "RobotError",
+    "Simulation",
+    "Truth",
+    "bootstrap",
     "builtin_robots",
     "calibrate",
     "compensate",
     "datasets",
     "diagnose",
     "evaluate",
+    "export",
+    "import_files",
+    "iso9283",
     "load_cell",
     "load_fit",
     "load_robot",
     "measurements",
     "minimize_max",
+    "plan",
     "read_measurements",
+    "register",
+    "relative",
+    "report",
+    "simulate",
+    "tradeoff",
     "write_measurements",
 ]
+
+MODULES = {  # name: where it is defined
+    "CalibrationError": "ground.errors",
+    "DataError": "ground.errors",
+    "OptionError": "ground.errors",
+    "RobotError": "ground.errors",
+    "minimize_max": "solvers.minimize",
+    "Robot": "robots.robot",
+    "builtin_robots": "robots.robot",
+    "load_robot": "robots.robot",
+    "Measurements": "measuring.measurements",
+    "measurements": "measuring.measurements",
+    "read_measurements": "measuring.measurements",
+    "write_measurements": "measuring.measurements",
+    "import_files": "measuring.importers",
+    "datasets": "measuring.datasets",  # the module itself
+    "Cell": "modelling.cell",
+    "evaluate": "modelling.cell",
+    "load_cell": "modelling.cell",
+    "EFFECTS": "modelling.effects.table",
+    "register": "modelling.effects.table",
+    "Simulation": "modelling.simulate",
+    "Truth": "modelling.simulate",
+    "simulate": "modelling.simulate",
+    "Fit": "fitting.fit",
+    "load_fit": "fitting.fit",
+    "Options": "fitting.options",
+    "calibrate": "fitting.calibrate",
+    "relative": "fitting.instruments.kinds",
+    "bootstrap": "judging.bootstrap",
+    "iso9283": "judging.standard",
+    "tradeoff": "judging.tradeoff",
+    "Diagnosis": "diagnosing.result",
+    "diagnose": "diagnosing.diagnose",
+    "plan": "planning.plan",
+    "Compensation": "correcting.compensate",
+    "compensate": "correcting.compensate",
+    "export": "correcting.export",
+    "report": "reporting.report",
+}
+
+
+def __getattr__(name: str) -> object:
+    """A public name on its first use, kept from then on [PEP 562]."""
+    if name == "__version__":
+        found: object = import_module("importlib.metadata").version("minimax-cal")
+    elif name in MODULES:
+        module = import_module(f"minimax_cal.{MODULES[name]}")
+        found = module if name == "datasets" else getattr(module, name)
+    else:
+        raise AttributeError(f"module 'minimax_cal' has no attribute {name!r}")
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Public names, also those that nobody used yet."""
+    return sorted({*globals(), *__all__, "__version__"})

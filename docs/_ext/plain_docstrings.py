@@ -2,8 +2,8 @@
 
 A docstring is a sentence, then notes on arrays and arguments (``q: (m, n) joint values [rad].  y:
 (m, 3) points [m].``), then more prose.  Notes become a list; fields of a dataclass become its
-attributes, with type and default; everything else keeps its words, and no letter of them is taken
-for markup.
+attributes, with type and default; an example (``>>>``) stays one; everything else keeps its words,
+and no letter of them is taken for markup.
 """
 
 from __future__ import annotations
@@ -102,6 +102,10 @@ def listed(blocks: Sequence[str], names: Sequence[str]) -> list[str]:
     lines: list[str] = []
     before: tuple[str, ...] = ()
     for block in blocks:
+        if block.lstrip().startswith(">>>"):
+            lines += ["", *inspect.cleandoc(block).splitlines(), ""]
+            before = ()
+            continue
         for note in notes(block, (*names, *own_names(block))):
             if not (note.names and before):
                 lines.append("")

@@ -2,4 +2,5 @@
 
 from minimax_cal.cli import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -10,11 +10,12 @@ import click
 
 from minimax_cal.cli import options
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import LOSSES, SQUARE
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
-from minimax_cal.judging.bootstrap import bootstrap
+from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
 from minimax_cal.reporting.plots.figures import PICTURES, save_errors
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers.least_squares import METHODS
@@ -161,13 +162,16 @@ def calibrate_command(
     options.notify(fit.notices, quiet=quiet)
     if figure:
         save_errors(fit, figure)
-    text = ""
-    if output or as_json:
-        content = fit.to_dict()
-        for found in drawn:
-            content["bootstrap"] = found.to_dict()
-        text = json_text(content)
+    text = text_of(fit, drawn) if output or as_json else ""
     if options.deliver(text, output, as_json=as_json):
         options.show(*fit.tables(), *(found.table() for found in drawn))
         click.echo(f"\n{fit.headline()}")
     return options.exit_code(fit.status)
+
+
+def text_of(fit: Fit, drawn: Sequence[Bootstrap]) -> str:
+    """The JSON of a calibration, with its bootstrap where there was one."""
+    content = fit.to_dict()
+    for found in drawn:
+        content["bootstrap"] = found.to_dict()
+    return json_text(content)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.correcting.exporters.job import read_job
-from minimax_cal.correcting.exporters.table import EXPORTERS, export
+from minimax_cal.correcting.export import exported
+from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.ground.files import write_whole
-from minimax_cal.robots.urdf_file import read_urdf
 
 
 @click.command(name="export")
@@ -43,9 +41,7 @@ def export_command(
 ) -> int:
     """Write the robot of FIT (a saved calibration or a robot) as a file others can load."""
     options.writable(output)
-    originals = (read_urdf(original),) if original else ()
-    job = replace(read_job(fit), originals=originals, tip=tip, experimental=experimental)
-    made = export(job, to)
+    made = exported(fit, to, urdf=original, tip=tip, experimental=experimental)
     options.notify(made.notices, quiet=quiet)
     if output:
         write_whole(output, made.content)

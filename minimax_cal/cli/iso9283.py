@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -11,8 +10,7 @@ import click
 from minimax_cal.cli.options import JSON, QUIET, deliver, notify, output, show, writable
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
-from minimax_cal.judging.iso9283 import iso9283
-from minimax_cal.judging.saved import open_fit
+from minimax_cal.judging.standard import iso9283
 
 
 def point_of(text: str) -> str | Sequence[float]:
@@ -58,10 +56,7 @@ def iso9283_command(
     poses stand apart from training poses.  Poses that were visited again give repeatability.
     """
     writable(output)
-    point = point_of(tcp)
-    saved = open_fit(fit, data or "", nominal)
-    found = iso9283(saved.cells, saved.data, saved.held, point)
-    found = replace(found, notices=(*saved.notices, *found.notices))
+    found = iso9283(fit, data, nominal=nominal, tcp=point_of(tcp))
     notify(found.notices, quiet=quiet)
     if deliver(json_text(found.to_dict()), output, as_json=as_json):
         show(*found.tables(poses=poses))

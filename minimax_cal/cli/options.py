@@ -89,8 +89,14 @@ def stages(*, quiet: bool) -> Iterator[Callable[[str], None]]:
 
 def notify(notices: Iterable[str], *, quiet: bool) -> None:
     """Print notices on stderr, one a line."""
-    for notice in () if quiet else notices:
-        click.echo(f"notice: {notice}", err=True)
+    for text in notices:
+        notice(text, quiet=quiet)
+
+
+def notice(text: str, *, quiet: bool) -> None:
+    """Print one notice on stderr."""
+    if not quiet:
+        click.echo(f"notice: {text}", err=True)
 
 
 def deliver(text: str, output: Path | None, *, as_json: bool) -> bool:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
 
 from minimax_cal.cli import options
+from minimax_cal.cli.plan_options import keywords_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.planning.options import EFFORTS, Wishes
+from minimax_cal.planning.options import EFFORTS, PlanOptions
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import MEANINGS
@@ -21,63 +20,10 @@ from minimax_cal.planning.task import CRITERIA
 from minimax_cal.planning.visibility import NORMALS
 from minimax_cal.reporting.plots.figures import PICTURES
 from minimax_cal.reporting.plots.plan import save_plan
-from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.robot import load_robot
 
-DEFAULTS, NOISE = Wishes(), Instrument()
+DEFAULTS, NOISE = PlanOptions(), Instrument()
 PATH = click.Path(path_type=Path)
-JOINT = re.compile(r"[Jj]?(\d+)=(.+)")
-
-
-def triple(text: str, option: str) -> tuple[float, ...]:
-    """Three lengths in millimetres, in metres.  Raises OptionError."""
-    parts = [number(part) for part in text.split(",")]
-    if len(parts) != 3 or not np.isfinite(parts).all():
-        raise OptionError(f"{option} {text!r}: give x,y,z in mm, as 3000,0,500")
-    return tuple(1e-3 * part for part in parts)
-
-
-def number(text: str) -> float:
-    """A number, NaN if it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
-
-
-def pair(text: str, option: str, scale: float) -> tuple[float, float]:
-    """LOW:HIGH in SI.  Raises OptionError."""
-    parts = [scale * number(part) for part in text.split(":")]
-    if len(parts) != 2 or np.isnan(parts).any():
-        raise OptionError(f"{option} {text!r}: give low:high, as 0.5:20")
-    if not parts[0] < parts[1]:
-        raise OptionError(f"{option} {text!r}: the limits are reversed; give low:high")
-    return parts[0], parts[1]
-
-
-def joint(text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
-    """J2=LOW:HIGH in degrees, slides in millimetres.  Raises OptionError."""
-    match = JOINT.fullmatch(text)
-    if not match:
-        raise OptionError(f"--joint {text!r}: write J2=-30:60, in degrees (slides: mm)")
-    index = int(match[1]) - 1
-    if not 0 <= index < robot.joints:
-        raise OptionError(f"--joint {text!r}: {robot.name} has joints 1 to {robot.joints}")
-    scale = 1e-3 if robot.prismatic[index] else float(np.radians(1.0))
-    return index, pair(match[2], f"--joint {text.partition('=')[0]}", scale)
-
-
-def box(text: str) -> tuple[tuple[float, ...], ...]:
-    """LOW:HIGH of x, y and z in millimetres, as corners in metres.  Raises OptionError."""
-    axes = text.split(",")
-    if len(axes) != 3:
-        raise OptionError(f"--volume {text!r}: give x, y and z, as 700:1700,-500:500,300:1300")
-    limits = [pair(axis, "--volume", 1e-3) for axis in axes]
-    return tuple(low for low, _ in limits), tuple(high for _, high in limits)
-
-
-def scaled(value: float | None, scale: float) -> float:
-    """An option in SI, NaN where it was not given."""
-    return float("nan") if value is None else scale * value
 
 
 @click.command(name="plan")
@@ -186,6 +132,7 @@ def scaled(value: float | None, scale: float) -> float:
 )
 @click.option(
     "--noise-per-metre",
+    "per_metre",
     type=float,
     metavar="UM/M",
     help=f"Its growth with range [default: {1e6 * NOISE.per_metre:g}].",
@@ -224,36 +171,12 @@ def scaled(value: float | None, scale: float) -> float:
 @options.QUIET
 def plan_command(
     robot: str,
-    poses: int,
-    fit: Path | None,
-    data: Path | None,
-    criterion: str,
-    effects: Sequence[str],
-    separate: Sequence[str] | None,
-    tracker: str | None,
-    targets: int,
-    spots: Sequence[str],
-    normals: str,
-    acceptance: float,
-    whole: bool,
-    reach: str,
-    elevation: str,
-    joints: Sequence[str],
-    volume: str | None,
-    floor: float,
-    body: float | None,
-    noise: float | None,
-    noise_per_metre: float | None,
-    jitter: float | None,
-    revisit: int,
-    approach: str,
-    candidates: int,
-    seed: int,
     unit: str,
     figure: Path | None,
     as_json: bool,
     output: Path | None,
     quiet: bool,
+    **given: Any,
 ) -> int:
     """Which poses of ROBOT to measure next, in which order, and how accurate they will make it."""
     options.writable(output)
@@ -261,37 +184,8 @@ def plan_command(
     if unit not in ANGLES:
         raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")
     arm = load_robot(robot)
-    degree = float(np.radians(1.0))
     with options.stages(quiet=quiet) as progress:
-        found = plan(
-            arm,
-            poses,
-            fit=fit or "",
-            data=data or "",
-            progress=progress,
-            criterion=criterion,
-            effects=options.names_of(effects),
-            separate=tuple(separate or ()),
-            tracker=triple(tracker, "--tracker") if tracker else (),
-            targets=targets,
-            spots=tuple(triple(spot, "--target") for spot in spots),
-            normals=normals,
-            acceptance=acceptance * degree,
-            whole=whole,
-            reach=pair(reach, "--range", 1.0),
-            elevation=pair(elevation, "--elevation", degree),
-            joints=dict(joint(text, arm) for text in joints),
-            volume=box(volume) if volume else (),
-            floor=1e-3 * floor,
-            body=scaled(body, 1e-3),
-            noise=scaled(noise, 1e-6),
-            per_metre=scaled(noise_per_metre, 1e-6),
-            jitter=scaled(jitter, 1e-6),
-            revisit=revisit,
-            approach=approach,
-            candidates=candidates,
-            seed=seed,
-        )
+        found = plan(arm, progress=progress, **keywords_of(given, arm))
     options.notify(found.notices, quiet=quiet)
     if output:
         write_whole(output, found.csv(unit))

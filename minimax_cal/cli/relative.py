@@ -82,7 +82,7 @@ def relative_command(
             free=options.names_of(free),
             offset=offset,
             known_distances=tuple(map(known_of, known_distance)),
-            lever=float("nan") if lever is None else lever * 1e-3,
+            lever=None if lever is None else lever * 1e-3,
             method=method,
         )
     options.notify(fit.notices, quiet=quiet)

@@ -2,41 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from datetime import UTC, date, datetime
+from functools import partial
 from pathlib import Path
 
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import write_whole
-from minimax_cal.reporting.html import (
-    Wording,
-    compose,
-    find_browser,
-    print_pdf,
-    read_sources,
-    render,
-)
-
-PAGES, PAPERS = (".html", ".htm"), (".pdf",)
-
-
-def date_of(given: str) -> str:
-    """The date of a report: as given, else of SOURCE_DATE_EPOCH, else today (UTC)."""
-    try:
-        if given:
-            return date.fromisoformat(given).isoformat()
-    except ValueError:
-        raise OptionError(f"--date {given!r}: write it as 2026-01-31") from None
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    try:
-        now = datetime.fromtimestamp(int(epoch), UTC) if epoch else datetime.now(UTC)
-    except (ValueError, OverflowError, OSError):
-        raise OptionError(f"SOURCE_DATE_EPOCH={epoch!r}: is not a number of seconds") from None
-    return now.date().isoformat()
+from minimax_cal.reporting.report import report
 
 
 @click.command(name="report")
@@ -71,14 +44,14 @@ def report_command(
 
     RESULTS are files that `calibrate -o` and `diagnose -o` wrote.  The page needs no network.
     """
-    options.writable(output, kinds=PAGES)
-    options.writable(pdf, kinds=PAPERS)
-    browser = find_browser() if pdf else ""
-    sources = read_sources(results)
-    report = compose(sources, Wording(date_of(day), title, customer, author))
-    page = render(report)
-    write_whole(output, page)
-    if pdf:
-        print_pdf(render(report, paper=True), pdf, browser)
-    options.notify(sources.notices, quiet=quiet)
+    report(
+        results,
+        output,
+        title=title,
+        customer=customer,
+        author=author,
+        date=day,
+        pdf=pdf,
+        notify=partial(options.notice, quiet=quiet),
+    )
     return 0

@@ -212,6 +212,8 @@ def compensate(
     lever: what a radian counts as [m], NaN for the targets' own.  clock: moment of the
     calibration's session, 0 to 1, that effects of time are taken at.  Raises CalibrationError for
     wrong input.
+
+    >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     if frame not in FRAMES:
         raise OptionError(f"no frame {frame!r}; choose {', '.join(FRAMES)}")

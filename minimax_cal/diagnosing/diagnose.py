@@ -102,8 +102,12 @@ def diagnose(
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
-    robot, data: loaded, or a name or path.  seed, holdout: as of `calibrate`.  exclude: effects
-    that are not to be considered.  Raises CalibrationError for wrong input.
+    robot, data: loaded, or a name or path.  seed, holdout: of the poses kept out of the fit, and
+    their share.  exclude: effects that are not to be considered.  progress: called with a word on
+    each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
+    CalibrationError for wrong input.
+
+    >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
     """
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)

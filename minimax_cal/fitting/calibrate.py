@@ -205,7 +205,7 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
             f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
             "measurements, with their joint signs, zero positions and units"
         )
-    names = solved.estimator.model.names
+    names = solved.names
     change = links_of(solved.state.mdh - solved.nominal.mdh)
     length = names.linear[: len(change)]
     wild = np.abs(change) > np.where(length, WILD_LENGTH * reach, WILD_ANGLE)
@@ -223,7 +223,7 @@ def parameter_table(robot: Robot, solved: Solved) -> Parameters:
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
     """
-    names, n = solved.estimator.model.names, robot.joints
+    names, n = solved.names, robot.joints
     known = solved.identification.active
     sigma = solved.uncertainty.sigma
     axes = solved.nominal.rotation

@@ -34,7 +34,7 @@ from minimax_cal.modelling.model import (
     pose_weights,
     with_poses,
 )
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
@@ -82,6 +82,11 @@ class Solved:
     effects: Fitted
     units: tuple[str, ...]
     robust: Robust
+
+    @property
+    def names(self) -> Names:
+        """Of all parameters."""
+        return self.estimator.model.names
 
     @cached_property
     def widening(self) -> float:

@@ -95,7 +95,9 @@ def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
     """Measurements from arrays.
 
     q: (m, n) [rad, m].  y: (m, 3) or (m, k, 3), NaN where not measured [m].  columns: optional
-    columns by their file name without the unit (`order`, `u95`), in SI.
+    columns by their file name without the unit (`order`, `u95`), in SI.  Raises DataError.
+
+    >>> data = mc.measurements(q, y, order=range(len(q)))
     """
     q, y = np.array(q, dtype=float), np.array(y, dtype=float)
     y = y[:, None, :] if y.ndim == 2 else y
@@ -165,7 +167,14 @@ def check_u95(data: Measurements) -> Measurements:
 
 
 def read_measurements(path: Path | str) -> Measurements:
-    """Read a CSV file of measurements as the contract describes it.  Raises DataError."""
+    """Measurements of a CSV file whose columns tell their units.
+
+    path: with joints q1_deg ... or q1_rad ... (slides q3_mm), points smr1_x_mm ... or smr1_x_m ...,
+    and what else is known (order, temperature_C ...).  The measurements have metres and radians.
+    Raises DataError.
+
+    >>> data = mc.read_measurements("poses.csv")
+    """
     file = read_rows(path)
     header = file.header
     header_check(path, header)
@@ -209,7 +218,12 @@ def read_measurements(path: Path | str) -> Measurements:
 
 
 def write_measurements(path: Path | str, data: Measurements) -> None:
-    """Write CSV as the contract describes it: radians (mm for slides) and millimetres."""
+    """Write CSV that `read_measurements` reads.
+
+    path: of the file.  data: joints are written in radians (slides in mm), points in mm.
+
+    >>> mc.write_measurements("poses.csv", data)
+    """
     joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import torques
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, load_robot
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
 MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
@@ -27,6 +28,7 @@ class Truth:
     compliance: turn of every joint per gravity torque [rad/(N m)].  noise, noise_per_metre:
     standard deviation of each coordinate, and its growth with range [m, -].  distance: of the
     instrument from the robot [m].  circle: radius on which the targets sit on the flange [m].
+    span: most that a joint turns from 0, within its limits [rad].
     """
 
     length: float = 0.5e-3
@@ -48,7 +50,7 @@ class Simulation:
 
 
 def simulate(
-    robot: Robot,
+    robot: Robot | str | Path,
     poses: int = 100,
     targets: int = 3,
     seed: int = 0,
@@ -56,8 +58,13 @@ def simulate(
 ) -> Simulation:
     """Measure an imperfect copy of a robot at random poses, from a random place.
 
+    robot: loaded, or a name or path.  poses, targets: how many.  seed: of all that is random.
+    truth: how far the arm is from its drawing, and how well it is measured [m, rad].
     Raises OptionError for counts that make no sense.
+
+    >>> data = mc.simulate("irb2600", 60, truth=mc.Truth(noise=20e-6)).data
     """
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
     if not (1 <= poses <= MOST_POSES and 1 <= targets <= MOST_TARGETS):
         raise OptionError(
             f"simulate needs at least one pose and one target, at most {MOST_POSES} and "

@@ -15,7 +15,7 @@ MOST_POSES, MOST_CANDIDATES, MOST_TARGETS = 1000, 50_000, 20
 
 
 @dataclass(frozen=True)
-class Wishes:
+class PlanOptions:
     """What a plan is to be like.
 
     criterion: of `planning.CRITERIA`.  candidates: how many to draw.  seed: of all that is random.
@@ -23,8 +23,8 @@ class Wishes:
     100 mm; spots: (k, 3) instead [m].  normals: of `visibility.NORMALS`.  acceptance: [rad].
     reach, elevation: limits of the instrument [m, rad].  joints: limits by joint index that
     narrow the robot's.  volume: (2, 3) box for the flange [m], empty for none.  floor: its height
-    [m].  body: radius of the arm [m], NaN for a share of its reach.  whole: every target seen.
-    noise, per_metre, jitter: as `Instrument`, NaN for what data show or its defaults.
+    [m].  body: radius of the arm [m], None for a share of its reach.  whole: every target seen.
+    noise, per_metre, jitter: as `Instrument`, None for what data show or its defaults.
     effects: to be fitted along with the geometry, beside those of a fit, as joint_compliance:all.
     separate: two effects that the poses are to tell apart, or none.
     approach: both for revisits from the other side.  revisit: how many.
@@ -43,66 +43,81 @@ class Wishes:
     joints: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     volume: Sequence[Sequence[float]] = ()
     floor: float = 0.0
-    body: float = np.nan
+    body: float | None = None
     whole: bool = False
-    noise: float = np.nan
-    per_metre: float = np.nan
-    jitter: float = np.nan
+    noise: float | None = None
+    per_metre: float | None = None
+    jitter: float | None = None
     effects: Sequence[str] = ()
     separate: Sequence[str] = ()
     approach: str = "none"
     revisit: int = 0
 
 
-def check_wishes(wish: Wishes, poses: int, robot: Robot) -> None:
-    """Raise OptionError for wishes that make no sense."""
+@dataclass(frozen=True)
+class Wishes(PlanOptions):
+    """The options as `setting` reads them: NaN for what is not given."""
+
+    body: float = np.nan
+    noise: float = np.nan
+    per_metre: float = np.nan
+    jitter: float = np.nan
+
+
+def wishes_of(options: PlanOptions) -> Wishes:
+    """The options for `setting`."""
+    return Wishes(**{name: value for name, value in vars(options).items() if value is not None})
+
+
+def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
+    """Raise OptionError for options that make no sense."""
     if not 1 <= poses <= MOST_POSES:
         raise OptionError(f"--poses {poses}: give 1 to {MOST_POSES}")
-    if not poses <= wish.candidates <= MOST_CANDIDATES:
+    if not poses <= options.candidates <= MOST_CANDIDATES:
         raise OptionError(
-            f"--candidates {wish.candidates}: give at least as many as poses, at most "
+            f"--candidates {options.candidates}: give at least as many as poses, at most "
             f"{MOST_CANDIDATES}"
         )
-    if wish.seed < 0:
-        raise OptionError(f"seed {wish.seed}: give a whole number, 0 or more")
-    if not 0 <= wish.revisit <= poses:
-        raise OptionError(f"--revisit {wish.revisit}: give 0 to {poses}, the number of poses")
-    if wish.approach not in EFFORTS:
-        raise OptionError(f"--approach {wish.approach!r}: choose {' or '.join(EFFORTS)}")
-    if wish.approach == "both" and not wish.revisit:
+    if options.seed < 0:
+        raise OptionError(f"seed {options.seed}: give a whole number, 0 or more")
+    if not 0 <= options.revisit <= poses:
+        raise OptionError(f"--revisit {options.revisit}: give 0 to {poses}, the number of poses")
+    if options.approach not in EFFORTS:
+        raise OptionError(f"--approach {options.approach!r}: choose {' or '.join(EFFORTS)}")
+    if options.approach == "both" and not options.revisit:
         raise OptionError("--approach both is about revisits: give their number with --revisit")
-    if not 1 <= wish.targets <= MOST_TARGETS:
-        raise OptionError(f"--targets {wish.targets}: give 1 to {MOST_TARGETS}")
-    if not wish.acceptance > 0.0:
+    if not 1 <= options.targets <= MOST_TARGETS:
+        raise OptionError(f"--targets {options.targets}: give 1 to {MOST_TARGETS}")
+    if not options.acceptance > 0.0:
         raise OptionError(
             "--acceptance: give an angle above 0, 180 for a target seen from anywhere"
         )
-    for name, (low, high) in (("range", wish.reach), ("elevation", wish.elevation)):
+    for name, (low, high) in (("range", options.reach), ("elevation", options.elevation)):
         if not low < high:
             raise OptionError(f"--{name}: the limits are reversed; give low:high")
-    for low, high in zip(*wish.volume, strict=True) if len(wish.volume) else ():
+    for low, high in zip(*options.volume, strict=True) if len(options.volume) else ():
         if not low < high:
             raise OptionError("--volume: the limits of an axis are reversed; give low:high")
     for name in ("noise", "per_metre", "jitter", "body"):
-        value = getattr(wish, name)
-        if not (np.isnan(value) or 0.0 <= value < np.inf):
+        value = getattr(options, name)
+        if value is not None and not 0.0 <= value < np.inf:
             raise OptionError(f"{name} {value:g} must be a finite number, 0 or more")
-    strange = [joint for joint in wish.joints if not 0 <= joint < robot.joints]
+    strange = [joint for joint in options.joints if not 0 <= joint < robot.joints]
     if strange:
         raise OptionError(f"--joint: {robot.name} has no joint {strange[0] + 1}")
-    if len(wish.separate) not in (0, 2):
+    if len(options.separate) not in (0, 2):
         raise OptionError("--separate: name two effects, as joint_compliance:J2 link_bending:L2")
 
 
-def settings_of(wish: Wishes, poses: int) -> dict[str, object]:
-    """The wishes for the record."""
+def settings_of(options: PlanOptions, poses: int) -> dict[str, object]:
+    """The options for the record."""
     out: dict[str, object] = {"poses": poses}
-    for name, value in vars(wish).items():
+    for name, value in vars(options).items():
         if isinstance(value, float):
             out[name] = None if np.isnan(value) else value
         elif isinstance(value, Mapping):
             out[name] = {str(key): list(pair) for key, pair in value.items()}
-        elif isinstance(value, str | int):
+        elif value is None or isinstance(value, str | int):
             out[name] = value
         else:
             out[name] = [list(v) if not isinstance(v, str | float | int) else v for v in value]

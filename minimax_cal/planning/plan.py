@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from minimax_cal.planning.designs.criteria import Criterion, inverse
 from minimax_cal.planning.designs.exchange import Menu, exchange, polar
 from minimax_cal.planning.designs.relaxation import highest
 from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
-from minimax_cal.planning.options import Wishes, check_wishes, settings_of
+from minimax_cal.planning.options import PlanOptions, check_options, settings_of, wishes_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import shortest, travel, visits
@@ -36,34 +36,106 @@ def plan(
     robot: Robot | str | Path,
     poses: int,
     *,
-    fit: Fit | Cell | str | Path = "",
-    data: Measurements | str | Path = "",
+    fit: Fit | Cell | str | Path | None = None,
+    data: Measurements | str | Path | None = None,
+    criterion: str = "I",
+    effects: Sequence[str] = (),
+    separate: Sequence[str] = (),
+    tracker: Sequence[float] = (),
+    targets: int = 3,
+    spots: Sequence[Sequence[float]] = (),
+    normals: str = "flange",
+    acceptance: float = np.radians(30.0),
+    whole: bool = False,
+    reach: tuple[float, float] = (0.5, 50.0),
+    elevation: tuple[float, float] = (np.radians(-50.0), np.radians(75.0)),
+    joints: Mapping[int, tuple[float, float]] | None = None,
+    volume: Sequence[Sequence[float]] = (),
+    floor: float = 0.0,
+    body: float | None = None,
+    noise: float | None = None,
+    per_metre: float | None = None,
+    jitter: float | None = None,
+    revisit: int = 0,
+    approach: str = "none",
+    candidates: int = 2000,
+    seed: int = 0,
     progress: Progress = silent,
-    **options: object,
 ) -> Plan:
-    """Which poses of a robot to measure next.
+    """Which poses of a robot to measure next, in which order, and how accurate they will make it.
 
-    fit: a calibration whose robot, base, targets and poses are the start.  data: poses measured
-    already; without a fit they are calibrated first.  options: the fields of `Wishes`.
-    Raises CalibrationError for wrong input.
+    robot: loaded, or a name or path.  poses: how many.  fit: a calibration whose robot, base,
+    targets and poses are the start.  data: poses measured already; without a fit they are
+    calibrated first.  criterion: D, A, E, G or I.  effects: fitted along with the geometry, as
+    joint_compliance:all.  separate: two effects that the poses are to tell apart instead.
+    tracker: (3,) in base axes [m], 3 m before the arm unless given.  targets: number on a circle of
+    100 mm; spots: (k, 3) in the flange instead [m].  normals: where reflectors look.  acceptance:
+    half angle of a reflector's cone [rad].  whole: every target seen at each pose.  reach,
+    elevation: limits of the instrument [m, rad].  joints: limits by joint index that narrow the
+    robot's [rad, m].  volume: (2, 3) corners of a box for the flange in base axes [m].  floor: its
+    height [m].  body: radius of the arm [m], a share of its reach unless given.  noise, per_metre:
+    of a coordinate and its growth with range [m, -]; jitter: of a joint [rad]; as the data show
+    them, else typical ones, unless given.  revisit: poses to go back to.  approach: both for
+    revisits from the other side.  candidates: how many poses to choose from.  seed: of all that is
+    random.  progress: called with a word on each stage.  Raises CalibrationError for wrong input.
+
+    >>> print(mc.plan("irb2600", 40, tracker=(3.0, 0.0, 0.5)).headline())
     """
-    began = time.perf_counter()
-    wish = Wishes(**options)  # type: ignore[arg-type]
+    options = PlanOptions(
+        criterion=criterion,
+        candidates=candidates,
+        seed=seed,
+        tracker=tracker,
+        targets=targets,
+        spots=spots,
+        normals=normals,
+        acceptance=acceptance,
+        reach=reach,
+        elevation=elevation,
+        joints=joints or {},
+        volume=volume,
+        floor=floor,
+        body=body,
+        whole=whole,
+        noise=noise,
+        per_metre=per_metre,
+        jitter=jitter,
+        effects=effects,
+        separate=separate,
+        approach=approach,
+        revisit=revisit,
+    )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    if wish.criterion not in CRITERIA:
-        raise OptionError(f"no criterion {wish.criterion!r}; choose {', '.join(CRITERIA)}")
-    check_wishes(wish, poses, robot)
+    return planned(
+        robot, poses, options, "" if fit is None else fit, "" if data is None else data, progress
+    )
+
+
+def planned(
+    robot: Robot,
+    poses: int,
+    options: PlanOptions,
+    fit: Fit | Cell | str | Path,
+    data: Measurements | str | Path,
+    progress: Progress,
+) -> Plan:
+    """As `plan`.  fit, data: "" where there is none."""
+    began = time.perf_counter()
+    if options.criterion not in CRITERIA:
+        raise OptionError(f"no criterion {options.criterion!r}; choose {', '.join(CRITERIA)}")
+    check_options(options, poses, robot)
     progress("start")
-    ground = ground_of(robot, fit, data, wish)
-    room, sight, said = surroundings(ground.cell, wish)
+    wishes = wishes_of(options)
+    ground = ground_of(robot, fit, data, wishes)
+    room, sight, said = surroundings(ground.cell, wishes)
     progress("candidate poses")
-    found = candidates(room, sight, wish.candidates, wish.seed)
+    found = candidates(room, sight, options.candidates, options.seed)
     if len(found.q) < poses:
         raise OptionError(
             f"only {len(found.q)} of {found.tested} poses can be taken and seen, but {poses} are "
             f"asked for; {rarest(found.rejected)}"
         )
-    task = task_of(robot, ground, room, sight, found, wish)
+    task = task_of(robot, ground, room, sight, found, options)
     found, first = refined(task, found, poses, progress)
     aim = task.aim(found)
     best = best_design(*aim, first, progress)
@@ -80,8 +152,8 @@ def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[P
     """
     progress("first poses")
     menu, criterion = task.aim(found)
-    chosen = first_design(menu, criterion, poses, task.wish.seed)
-    rng = np.random.default_rng(task.wish.seed)
+    chosen = first_design(menu, criterion, poses, task.options.seed)
+    rng = np.random.default_rng(task.options.seed)
     for step in STEPS:
         progress(f"poses within {100.0 * step:g} % around them")
         each = -(-AROUND // poses)
@@ -107,7 +179,7 @@ def assembled(
     began: float,
 ) -> Plan:
     """The plan, in a short order, compared with random poses.  began: by `time.perf_counter`."""
-    cell, wish = task.ground.cell, task.wish
+    cell, options = task.ground.cell, task.options
     robot, poses = cell.robot, len(best.design.chosen)
     menu = task.menu(found)
     chosen = ordered(best.design.chosen, found.q, robot)
@@ -119,19 +191,19 @@ def assembled(
         robot.prismatic,
         task.room.lower,
         task.room.upper,
-        wish.revisit,
-        aside=wish.approach == "both",
+        options.revisit,
+        aside=options.approach == "both",
     )
     separation = tuple(
         separated(one, contest, stops, seen[:, task.named(one)])
         for one, contest in zip(task.asked, task.contests(found), strict=True)
     )
     some = np.arange(found.drawn)
-    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, wish.seed)
+    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, options.seed)
 
     return Plan(
         cell=cell,
-        criterion=POWER if task.asked else wish.criterion,
+        criterion=POWER if task.asked else options.criterion,
         q=q,
         seen=seen,
         expected=np.where(seen[..., None], cell.predict(q), np.nan),
@@ -142,7 +214,7 @@ def assembled(
         equal=equal,
         names=task.ahead.names,
         sigma=np.sqrt(np.diag(inverse(menu.of(chosen)))) / task.ahead.scale,
-        indices=indices(task.ahead, found, chosen, wish.seed),
+        indices=indices(task.ahead, found, chosen, options.seed),
         growth=growth,
         separation=separation,
         candidates=found,
@@ -154,7 +226,7 @@ def assembled(
         ),
         at_hand=sum(one.poses for one in task.ground.measured),
         solver=best.relaxed.solver,
-        settings=settings_of(wish, poses),
+        settings=settings_of(options, poses),
         notices=notices,
         seconds=time.perf_counter() - began,
     )

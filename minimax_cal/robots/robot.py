@@ -216,7 +216,11 @@ def explain(error: ValidationError) -> str:
 
 
 def builtin_robots() -> tuple[str, ...]:
-    """Names of the robots that come with the package."""
+    """Names of the robots that come with the package.
+
+    >>> "irb2600" in mc.builtin_robots()
+    True
+    """
     folder = resources.files("minimax_cal.robots") / "builtin"
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
 
@@ -232,7 +236,10 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 def load_robot(source: Path | str) -> Robot:
     """A built-in robot by name, or a robot file (.json, .toml, .yaml, .urdf).
 
-    ``robot.urdf#link`` names the last link of a chain.  Raises RobotError.
+    source: name or path; ``robot.urdf#link`` names the last link of a chain.  The file says its
+    units; the robot has metres and radians.  Raises RobotError.
+
+    >>> robot = mc.load_robot("irb2600")
     """
     path = Path(source)
     if str(source) in builtin_robots():

@@ -50,12 +50,17 @@ def minimize_max(
     bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint.
     qp: name of a QP backend, or a function from Problem to a verified Solution.
     args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
-    the larger of one and the largest gradient.  callback: called with fun, nit, kkt after each QP.
+    the larger of one and the largest gradient.  maxiter: QPs at most.  callback: called with fun,
+    nit, kkt after each QP.
 
     Returns x, fun (the largest), values (m,), success, status, message, nit, nfev, njev,
     multipliers (m,) that sum to one, constraint_multipliers (one row a bound or constraint, > 0
     at the upper side and < 0 at the lower), kkt, violation, notes.
     Raises OptionError for arguments that do not fit together.
+
+    >>> r = mc.minimize_max(lambda x: np.array([x[0] ** 2, (x[0] - 1.0) ** 2]), [3.0])
+    >>> round(float(r.x[0]), 6)
+    0.5
     """
     x = np.array(x0, dtype=float).reshape(-1)
     if not np.all(np.isfinite(x)):

@@ -106,12 +106,13 @@ def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Pat
 
 
 def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path, folder: Path) -> None:
-    """With no nominal cell in the file, or with the nominal robot named, the same comes out."""
+    """Without a nominal cell the table of parameters tells it; a robot that is named is placed."""
     told = values(fit)["parts"]["holdout"]["cells"]["before"]["AP_mm"]
     older = without(fit, folder, "nominal_cell")
     for arguments in ((older,), (fit, "--nominal", "irb2600")):
         found = values(*arguments)
-        assert any("is placed where it fits 48 poses best" in n for n in found["notices"])
+        placed = any("is placed where it fits 48 poses best" in n for n in found["notices"])
+        assert placed == ("--nominal" in arguments)
         assert found["parts"]["holdout"]["cells"]["before"]["AP_mm"] == pytest.approx(told)
 
 

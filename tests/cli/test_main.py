@@ -164,13 +164,10 @@ def test_wrong_input_is_one_line_and_exit_2(
 def test_numbers_that_do_not_work_out_are_exit_1(
     csv: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from minimax_cal.solvers import minimax
+    from minimax_cal.fitting import solve
+    from minimax_cal.solvers.minimax import Sqp
 
-    monkeypatch.setattr(minimax, "Sqp", minimax.Sqp)
-    import minimax_cal.fitting.calibrate as module  # noqa: F401
-
-    monkeypatch.setattr(sys.modules["minimax_cal.fitting.calibrate"], "Sqp",
-                        lambda hessian: minimax.Sqp(iterations=1, hessian=hessian))  # fmt: skip
+    monkeypatch.setattr(solve, "Sqp", lambda hessian: Sqp(iterations=1, hessian=hessian))
     assert run("calibrate", "irb2600", csv) == 1
     assert "iteration limit" in capsys.readouterr().err
 

@@ -37,12 +37,12 @@ def sim(robot: mc.Robot) -> Simulation:
 
 
 @pytest.fixture(scope="module")
-def fit(robot: mc.Robot, sim: Simulation) -> mc.Calibration:
+def fit(robot: mc.Robot, sim: Simulation) -> mc.Fit:
     return mc.calibrate(robot, sim.data, effects=["joint_compliance:all"])
 
 
 @pytest.fixture(scope="module")
-def saved(fit: mc.Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def saved(fit: mc.Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fit") / "fit.json"
     fit.save(path)
     return path
@@ -94,7 +94,7 @@ def test_the_true_robot_comes_to_the_nominal_targets(robot: mc.Robot, seed: int)
 
 @pytest.mark.parametrize("frame", ["flange", "own"])
 def test_frames_lay_the_flange_where_they_say(
-    robot: mc.Robot, sim: Simulation, fit: mc.Calibration, frame: str
+    robot: mc.Robot, sim: Simulation, fit: mc.Fit, frame: str
 ) -> None:
     q = regular(robot, random_poses(robot, 100, np.random.default_rng(3)))
     found = compensate(fit, q, frame=frame)
@@ -287,7 +287,7 @@ def test_motion_is_rigid_and_the_least(rng: np.random.Generator) -> None:
     assert_allclose(alone, np.block([[np.eye(3), shift[:, None]], [np.zeros(3), 1.0]]), atol=1e-15)
 
 
-def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Calibration, saved: Path) -> None:
+def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Fit, saved: Path) -> None:
     q = regular(robot, random_poses(robot, 50, np.random.default_rng(8)))
     for frame in FRAMES:
         here, there = compensate(fit, q, frame=frame), compensate(saved, q, frame=frame)
@@ -300,7 +300,7 @@ def test_the_saved_fit_gives_the_same(robot: mc.Robot, fit: mc.Calibration, save
     assert np.abs(bare.q - given.q).max() < 5e-3
 
 
-def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Calibration) -> None:
+def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Fit) -> None:
     q = np.zeros((1, 6))
     for wrong in (
         lambda: compensate(fit, q, frame="moon"),

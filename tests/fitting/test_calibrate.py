@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 
@@ -25,15 +26,16 @@ def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> N
     assert max(worst.accuracy["train"].sse_mm2) < max(total.accuracy["train"].sse_mm2)
     assert sum(worst.accuracy["train"].sse_mm2) > sum(total.accuracy["train"].sse_mm2)
     # measured by the public errors, not by the solver's own account
-    (best,) = worst.worst
+    solved = fit_cell(robot, worst.train, worst.options)
     f = np.array(worst.accuracy["train"].sse_mm2) / np.array(worst.accuracy["train"].counts)
-    assert_allclose(f / f.max(), best.f / best.f.max(), rtol=1e-9)
+    assert_allclose(f / f.max(), solved.optimum.f / solved.optimum.f.max(), rtol=1e-9)
+    assert_allclose(worst.minimax.size, worst.accuracy["train"].sse_mm2)
 
 
 def test_pose_objective_trades_position_for_orientation(robot: mc.Robot, noisy: Simulation) -> None:
     from experiments.poses import orientation_error, poses_of, triangle
 
-    def turn(fit: mc.Calibration) -> float:
+    def turn(fit: mc.Fit) -> float:
         measured = noisy.data.y
         shape = triangle(measured)
         pose = [poses_of(shape, y) for y in (measured, fit.predict(noisy.data.q))]
@@ -59,13 +61,12 @@ def test_worst_point_is_lowered(robot: mc.Robot, noisy: Simulation) -> None:
     point = mc.calibrate(robot, noisy.data, "point")
     assert point.status == "converged"
     assert point.accuracy["train"].max_mm < 0.8 * total.accuracy["train"].max_mm
-    table = point.minimax_table()
+    table = point.minimax.table()
     assert "line" in str(table.rows[0][0])
     assert table.rows[0][1] == pytest.approx(point.accuracy["train"].max_mm, rel=1e-6)
     # a certificate: no direction lowers all active points, since the multipliers balance them
-    (best,) = point.worst
-    assert best.kkt.residual < 1e-6
-    assert best.mu.sum() == pytest.approx(1.0)
+    assert point.minimax.kkt.residual < 1e-6
+    assert point.minimax.multiplier.sum() == pytest.approx(1.0)
 
 
 def test_single_target_objective_fits_that_target_alone(robot: mc.Robot, noisy: Simulation) -> None:
@@ -86,9 +87,9 @@ def test_targets_measured_at_different_poses(robot: mc.Robot) -> None:
     fit = mc.calibrate(robot, made.data.with_y(y), "minimax")
     a = fit.accuracy["train"]
     assert len(set(a.counts)) == 3
-    (best,) = fit.worst
+    optimum = fit_cell(robot, fit.train, fit.options).optimum
     ratio = np.array(a.sse_mm2) / np.array(a.counts)
-    assert_allclose(ratio / ratio.max(), best.f / best.f.max(), rtol=1e-9)
+    assert_allclose(ratio / ratio.max(), optimum.f / optimum.f.max(), rtol=1e-9)
     assert len(fit.distances.mean) == 0
     assert fit.accuracy["holdout"].rms_mm < 0.6 * fit.accuracy["nominal"].rms_mm
 

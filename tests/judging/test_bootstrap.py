@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.options import Options, silent
-from minimax_cal.fitting.solve import Solved, fit_cell
+from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.bootstrap import (
@@ -19,7 +19,6 @@ from minimax_cal.judging.bootstrap import (
     bootstrap,
     determined,
     draw,
-    options_of,
     solved_again,
     stepped,
 )
@@ -34,17 +33,19 @@ SAME = 2e-3  # of a sigma: what two Gauss-Newton steps leave [60 poses, errors o
 
 
 @pytest.fixture(scope="module")
-def fit(robot: mc.Robot, noisy: Simulation) -> mc.Calibration:
+def fit(robot: mc.Robot, noisy: Simulation) -> mc.Fit:
     return mc.calibrate(robot, noisy.data, "sum")
 
 
 @pytest.fixture(scope="module")
-def found(fit: mc.Calibration) -> Bootstrap:
+def found(fit: mc.Fit) -> Bootstrap:
     return bootstrap(fit, 120, seed=3)
 
 
-def inner(robot: mc.Robot, data: mc.Measurements, options: Options) -> tuple[Solved, Draws]:
-    one = fit_cell(robot, data, options, silent)
+def inner(
+    robot: mc.Robot, data: mc.Measurements, objective: str, **options: object
+) -> tuple[mc.Fit, Draws]:
+    one = mc.calibrate(robot, data, objective, holdout=0.0, **options)  # type: ignore[arg-type]
     return one, draw(one.group, 4, np.random.default_rng(7))
 
 
@@ -60,31 +61,33 @@ def refitted(estimator: Estimator, state: State) -> State:
 @pytest.mark.parametrize("objective", ["sum", "smr:2", "pose"])
 def test_replicates_are_true_refits(objective: str, robot: mc.Robot, noisy: Simulation) -> None:
     """Rows repeated as drawn, and the fit solved from the same start."""
-    options = Options(objective=objective)
-    one, draws = inner(robot, noisy.data, options)
-    change, good = stepped(one, noisy.data, options, draws, silent)
+    one, draws = inner(robot, noisy.data, objective)
+    change, good = stepped(one, draws, silent)
     assert good.all()
     active = one.identification.active
-    sigma = one.uncertainty.sigma[active]
+    sigma = one.known.sigma[active]
     for number in range(4):
         rows = np.repeat(np.arange(noisy.data.poses), draws.rows(number))
         assert len(rows) == noisy.data.poses
-        end = refitted(one.estimator.at(rows), one.state)
-        assert_allclose(change[number] / sigma, between(one.state, end)[active] / sigma, atol=SAME)
+        end = refitted(one.estimator.at(rows), one.cell.state)
+        assert_allclose(
+            change[number] / sigma, between(one.cell.state, end)[active] / sigma, atol=SAME
+        )
 
 
 def test_replicates_heed_priors_and_weights(robot: mc.Robot, noisy: Simulation) -> None:
     u95 = 1e-5 * np.random.default_rng(0).uniform(1.0, 3.0, noisy.data.poses)
     data = replace(noisy.data, columns={**noisy.data.columns, "u95": u95})
-    options = Options(objective="sum", priors={"a*": 1e-4})
-    one, draws = inner(robot, data, options)
-    change, _ = stepped(one, data, options, draws, silent)
+    one, draws = inner(robot, data, "sum", priors={"a*": 1e-4})
+    change, _ = stepped(one, draws, silent)
     active = one.identification.active
-    sigma = one.uncertainty.sigma[active]
+    sigma = one.known.sigma[active]
     for number in range(3):
         rows = np.repeat(np.arange(data.poses), draws.rows(number))
-        end = refitted(one.estimator.at(rows), one.state)
-        assert_allclose(change[number] / sigma, between(one.state, end)[active] / sigma, atol=SAME)
+        end = refitted(one.estimator.at(rows), one.cell.state)
+        assert_allclose(
+            change[number] / sigma, between(one.cell.state, end)[active] / sigma, atol=SAME
+        )
 
 
 def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: Simulation) -> None:
@@ -100,11 +103,11 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: 
     draws = draw(groups(data), 8, np.random.default_rng(1))
     cell = fit.cell
     state = cell.state
-    sigma = fit.uncertainty.sigma[found.place]
+    sigma = fit.known.sigma[found.place]
     ours, theirs = found.change / sigma, np.zeros(found.change.shape)
     for number in range(8):
         rows = np.repeat(np.arange(data.poses), draws.rows(number))
-        fresh = fit_cell(robot, data.take(rows), options_of(fit), silent)
+        fresh = fit_cell(robot, data.take(rows), fit.options, silent)
         theirs[number] = between(state, fresh.state)[found.place] / sigma
     assert (theirs * ours).sum() / (ours**2).sum() == pytest.approx(1.0, abs=0.15)
     assert np.corrcoef(theirs.ravel(), ours.ravel())[0, 1] > 0.9
@@ -112,24 +115,23 @@ def test_replicates_of_a_robust_fit_give_way_as_it_does(robot: mc.Robot, noisy: 
 
 def test_replicates_of_a_minimax_are_minimax_fits(robot: mc.Robot, noisy: Simulation) -> None:
     """Fitted from scratch on the rows drawn: no worse a worst target, to 1e-6."""
-    options = Options(objective="minimax")
-    one, draws = inner(robot, noisy.data, options)
-    change, good = solved_again(one, noisy.data, options, draws, silent)
+    one, draws = inner(robot, noisy.data, "minimax")
+    change, good = solved_again(one, draws, silent)
     assert good.all()
     for number in range(2):
         rows = np.repeat(np.arange(noisy.data.poses), draws.rows(number))
-        fresh = fit_cell(robot, noisy.data.take(rows), options, silent)
-        step = np.zeros(one.names.count)
+        fresh = fit_cell(robot, noisy.data.take(rows), one.options, silent)
+        step = np.zeros(one.estimator.model.names.count)
         step[one.identification.active] = change[number]
         model = one.estimator.at(rows).model
         ours, theirs = (
             float((model.cost(state) / model.counts).max())
-            for state in (one.state.step(step), fresh.state)
+            for state in (one.cell.state.step(step), fresh.state)
         )
         assert ours == pytest.approx(theirs, rel=1e-6)
 
 
-def test_the_scatter_is_the_sigma(found: Bootstrap, fit: mc.Calibration) -> None:
+def test_the_scatter_is_the_sigma(found: Bootstrap, fit: mc.Fit) -> None:
     """By the same poses: both ask them.  120 replicates know a sigma to 6.5 %, five times that."""
     sigma = {p.name: p.sigma for p in fit.parameters}
     ratio = found.sigma / [sigma[name] for name in found.names]
@@ -137,7 +139,7 @@ def test_the_scatter_is_the_sigma(found: Bootstrap, fit: mc.Calibration) -> None
     assert abs(np.median(ratio) - 1.0) < 0.15
 
 
-def test_percentiles_lie_about_the_value(found: Bootstrap, fit: mc.Calibration) -> None:
+def test_percentiles_lie_about_the_value(found: Bootstrap, fit: mc.Fit) -> None:
     value = {p.name: p.value for p in fit.parameters}
     assert_allclose(found.value, [value[name] for name in found.names], rtol=0, atol=0)
     low, high = found.interval(0.95).T
@@ -148,7 +150,7 @@ def test_percentiles_lie_about_the_value(found: Bootstrap, fit: mc.Calibration) 
     assert np.all(np.ptp(narrow, axis=1) < high - low)
 
 
-def test_the_same_seed_draws_the_same_poses(fit: mc.Calibration) -> None:
+def test_the_same_seed_draws_the_same_poses(fit: mc.Fit) -> None:
     one, same, other = (bootstrap(fit, 5, seed=seed).change for seed in (1, 1, 2))
     assert np.array_equal(one, same)
     assert not np.allclose(one, other)
@@ -167,7 +169,7 @@ def test_rows_of_a_pose_are_drawn_together(rng: np.random.Generator) -> None:
 
 
 def test_positions_are_those_of_the_replicates(
-    robot: mc.Robot, found: Bootstrap, fit: mc.Calibration
+    robot: mc.Robot, found: Bootstrap, fit: mc.Fit
 ) -> None:
     """The whole prediction with the replicate's parameters: to second order in changes of 1e-4."""
     q = np.random.default_rng(5).uniform(-1.5, 1.5, (7, 6))
@@ -190,7 +192,7 @@ def whole(robot: mc.Robot, found: Bootstrap, number: int) -> Cell:
 
 
 def test_poses_left_out_judge_a_replicate(
-    robot: mc.Robot, noisy: Simulation, found: Bootstrap, fit: mc.Calibration
+    robot: mc.Robot, noisy: Simulation, found: Bootstrap, fit: mc.Fit
 ) -> None:
     train = fit.data.take(~fit.held)
     draws = draw(groups(train), 120, np.random.default_rng(3))
@@ -236,13 +238,13 @@ def test_options_are_those_of_the_fit(robot: mc.Robot, noisy: Simulation) -> Non
     fit = mc.calibrate(
         robot, noisy.data, "minimax", fix=["beta2"], priors={"a*": 1e-3}, distance="off", seed=4
     )
-    again = options_of(fit)
+    again = fit.options
     assert again.objective == "minimax"
     assert list(again.fix) == ["beta2"]
     assert again.priors == {"a*": 1e-3}
     assert again.distance == "off"
-    assert np.isnan(again.distance_tolerance)
-    assert np.isnan(again.lever)
+    assert again.distance_tolerance is None
+    assert again.lever is None
 
 
 def test_table_and_json(found: Bootstrap) -> None:
@@ -258,7 +260,7 @@ def test_table_and_json(found: Bootstrap) -> None:
     assert first["interval"][0] < 1e3 * found.value[0] < first["interval"][1]
 
 
-def test_progress_is_told(fit: mc.Calibration) -> None:
+def test_progress_is_told(fit: mc.Fit) -> None:
     said: list[str] = []
     bootstrap(fit, 30, progress=said.append)
     assert said == ["replicate 1 of 30", "replicate 26 of 30"]
@@ -281,7 +283,7 @@ def test_wrong_choices_are_refused(
     assert "\n" not in str(caught.value)
 
 
-def test_between_undoes_a_step(rng: np.random.Generator, fit: mc.Calibration) -> None:
+def test_between_undoes_a_step(rng: np.random.Generator, fit: mc.Fit) -> None:
     cell = fit.cell
     state = cell.state
     step: Array = 1e-3 * rng.normal(size=len(fit.uncertainty.names.all))

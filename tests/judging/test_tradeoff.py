@@ -1,5 +1,4 @@
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli import main
+from minimax_cal.fitting import solve
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.certificate import PointCones
 from minimax_cal.fitting.minimax_problem import MinimaxProblem
@@ -18,7 +18,6 @@ from minimax_cal.judging.tradeoff import (
     Blend,
     Tradeoff,
     problem_of,
-    state_of,
     tradeoff,
 )
 from minimax_cal.modelling.cell import cell_from_dict
@@ -93,7 +92,7 @@ def cvxpy_blend(worst: MinimaxProblem, x: State, share: float) -> float:
 @pytest.mark.parametrize("share", [0.9, 0.3])
 def test_a_compromise_is_cvxpys(share: float, robot: mc.Robot) -> None:
     fit = calibrate(robot, small(robot, 0.2), "sum", holdout=0.0)
-    worst, x = problem_of(fit), state_of(fit)
+    worst, x = problem_of(fit), fit.cell.state
     qp = partial(solve_qp, name="daqp", tolerance=1e-9)
     best = minimax.solve(Blend(worst, share), x, qp)
     assert best.status is Status.CONVERGED
@@ -227,6 +226,6 @@ def test_numbers_that_do_not_work_out_are_exit_1(
     csv: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = partial(minimax.Sqp, iterations=1)
-    monkeypatch.setattr(sys.modules["minimax_cal.fitting.calibrate"], "Sqp", few)
+    monkeypatch.setattr(solve, "Sqp", few)
     assert run("tradeoff", "irb2600", csv, "--steps", 0) == 1
     assert "iteration limit" in capsys.readouterr().err

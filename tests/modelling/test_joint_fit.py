@@ -82,13 +82,13 @@ def measured(cell: mc.Cell, data: mc.Measurements, seed: int = 3) -> mc.Measurem
     return data.with_y(y + np.random.default_rng(seed).normal(scale=NOISE, size=y.shape))
 
 
-def values(fit: mc.Calibration, text: str) -> list[tuple[float, float]]:
+def values(fit: mc.Fit, text: str) -> list[tuple[float, float]]:
     """Value and sigma of each parameter of an effect."""
     stem = ":".join(text.split(":")[:2])
     return [(p.value, p.sigma) for p in fit.parameters if p.name.startswith(f"{stem}.")]
 
 
-def check_found(fit: mc.Calibration, put: dict[str, list[float]], sigmas: float = 4.0) -> None:
+def check_found(fit: mc.Fit, put: dict[str, list[float]], sigmas: float = 4.0) -> None:
     """Every parameter within four of its sigmas, and one seen at ten or more."""
     for text, truth in put.items():
         found = values(fit, text)
@@ -221,7 +221,7 @@ MANY = {
 
 
 @pytest.fixture(scope="module")
-def many() -> tuple[mc.Cell, mc.Measurements, mc.Calibration]:
+def many() -> tuple[mc.Cell, mc.Measurements, mc.Fit]:
     """True cell, data and fit with several effects."""
     data = visited()
     cell = with_effects(true_cell(), data, MANY)
@@ -229,7 +229,7 @@ def many() -> tuple[mc.Cell, mc.Measurements, mc.Calibration]:
     return cell, data, mc.calibrate(ROBOT, data, objective="sum", effects=list(MANY))
 
 
-Many = tuple[mc.Cell, mc.Measurements, mc.Calibration]
+Many = tuple[mc.Cell, mc.Measurements, mc.Fit]
 
 
 def test_several_effects_are_found_at_once(many: Many) -> None:

@@ -27,7 +27,10 @@ from plotly.offline import get_plotlyjs
 
 import minimax_cal as mc
 from minimax_cal.cli.report import report_command
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.html import (
     Figure,
@@ -46,7 +49,6 @@ from minimax_cal.reporting.html.fit_tables import correlations
 from minimax_cal.reporting.html.page import script_json
 from minimax_cal.reporting.html.projection import flat
 from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of
-from minimax_cal.reporting.html.schema import Covariance
 from minimax_cal.reporting.html.sources import Sources, visible
 
 SECTIONS = [
@@ -378,9 +380,13 @@ def test_trend_is_a_running_median() -> None:
 
 
 def test_correlations_of_a_known_covariance() -> None:
-    known = Covariance(names=["a", "b", "c"], units=["mm"] * 3,
-                       rows=[[4, 3, 0], [3, 9, 0], [0, 0, 0]])  # fmt: skip
-    found = correlations(known)
+    names = Names(1, (), ())
+    covariance = np.full((names.count,) * 2, np.nan)
+    covariance[:3, :3] = [[4, 3, 0], [3, 9, 0], [0, 0, 0]]
+    noise = Noise(0.0, 1.0, 0.0)
+    known = Uncertainty(names, ("m",) * names.count, covariance, noise, 9.0, "poses")
+    told, found = correlations(known)
+    assert told == names.all[:3]
     assert_allclose(found[:2, :2], [[1.0, 0.5], [0.5, 1.0]])
     assert np.isnan(found[2]).all()  # what does not vary goes with nothing
 

@@ -54,8 +54,13 @@ class Export:
         return Export(text.encode("utf-8"), notices)
 
 
-def read_job(source: Path | str) -> Job:
-    """A saved calibration, or any robot that `load_robot` takes.  Raises CalibrationError."""
+def read_job(source: Fit | Cell | Robot | Path | str) -> Job:
+    """A calibration, its file, or any robot that `load_robot` takes.  Raises CalibrationError."""
+    if isinstance(source, Fit | Cell):
+        cell = source if isinstance(source, Cell) else source.cell
+        return job_of(source, cell.robot.name)
+    if isinstance(source, Robot):
+        return Job(source, source, source.name, (), np.full(source.joints, np.nan))
     path = Path(source)
     if path.suffix.lower() == ".json" and path.is_file():
         with suppress(NotSaved):  # load_robot says what is wrong with it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.fit import (
@@ -21,6 +23,7 @@ from minimax_cal.fitting.instruments.fit import (
 )
 from minimax_cal.fitting.instruments.identify import position_sigma
 from minimax_cal.fitting.instruments.options import (
+    Known,
     Progress,
     RelativeOptions,
     check_options,
@@ -58,24 +61,53 @@ def relative(
     robot: Robot | str | Path,
     data: RelativeData | str | Path,
     progress: Progress = silent,
-    **options: object,
+    *,
+    holdout: float = 0.2,
+    seed: int = 0,
+    fix: str | Sequence[str] = (),
+    free: str | Sequence[str] = (),
+    offset: bool = False,
+    known_distances: Sequence[Known] = (),
+    lever: float | None = None,
+    method: str = "snllm",
+    resolution: float = RESOLUTION,
 ) -> RelativeCalibration:
     """Calibrate a robot from lengths, closures or poses.
 
-    robot, data: loaded, or a name or path.  options: the fields of `RelativeOptions`.  progress:
-    called with a word on each stage.  Raises CalibrationError for wrong input; how the numbers
-    ended is in the result's `status`.
+    robot, data: loaded, or a name or path.  progress: called with a word on each stage.  holdout:
+    share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    offset: of lengths, fit a constant one of each wire.  known_distances: of closures, sockets A, B
+    and the distance of their centres [m].  lever: of poses, what a radian counts as [m]; the
+    file's own unless given.  method: of the least squares.  resolution: relative singular value
+    that counts as not measured.  Raises CalibrationError for wrong input; how the numbers ended is
+    in the result's `status`.
+
+    >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
     """
-    for name in ("fix", "free"):
-        if isinstance(options.get(name), str):
-            options[name] = tuple(filter(None, str(options[name]).replace(" ", "").split(",")))
-    chosen = RelativeOptions(**options)  # type: ignore[arg-type]
+    chosen = RelativeOptions(
+        holdout=holdout,
+        seed=seed,
+        fix=listed(fix),
+        free=listed(free),
+        offset=offset,
+        known_distances=known_distances,
+        lever=lever,
+        method=method,
+        resolution=resolution,
+    )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = data if isinstance(data, RelativeData) else read_relative(data)
     check_options(data, chosen)
     checks.check_joints(robot, data.at)
     begin = from_poses if data.kind == "poses" else from_instrument
     return begin(robot, data, chosen, progress)
+
+
+def listed(names: str | Sequence[str]) -> Sequence[str]:
+    """Names one by one, also where they are a text with commas."""
+    if isinstance(names, str):
+        return tuple(filter(None, names.replace(" ", "").split(",")))
+    return names
 
 
 def from_instrument(

@@ -30,7 +30,7 @@ class RelativeOptions:
 
     holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
     ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
-    distance of their centres [m].  lever: of poses, metres that a radian counts as; NaN for the
+    distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
     file's own.  method: of the least squares.  resolution: relative singular value that counts as
     not measured.
     """
@@ -41,7 +41,7 @@ class RelativeOptions:
     free: Sequence[str] = ()
     offset: bool = False
     known_distances: Sequence[Known] = ()
-    lever: float = np.nan
+    lever: float | None = None
     method: str = "snllm"
     resolution: float = RESOLUTION
 
@@ -71,7 +71,7 @@ def check_options(data: RelativeData, options: RelativeOptions) -> None:
     for kind, option, chosen in (
         ("distances", "--offset", options.offset),
         ("closures", "--known-distance", bool(options.known_distances)),
-        ("poses", "--lever", not np.isnan(options.lever)),
+        ("poses", "--lever", options.lever is not None),
     ):
         if chosen and data.kind != kind:
             raise OptionError(

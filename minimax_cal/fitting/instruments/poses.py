@@ -55,9 +55,9 @@ def poses_as_targets(data: RelativeData, lever: float = LEVER, count: int = 4) -
     return replace(data.at, y=turned + data.pose[:, None, :3, 3], target_names=names)
 
 
-def lever_of(data: RelativeData, lever: float) -> tuple[float, str]:
-    """The lever and where it comes from.  lever: asked for [m], NaN where not."""
-    if not np.isnan(lever):
+def lever_of(data: RelativeData, lever: float | None) -> tuple[float, str]:
+    """The lever and where it comes from.  lever: asked for [m], None where not."""
+    if lever is not None:
         return lever, "as given"
     columns = data.at.columns
     if {"u95", "rotation_u95"} <= set(columns):

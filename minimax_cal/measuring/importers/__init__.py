@@ -153,8 +153,11 @@ def import_files(
 ) -> Imported:
     """Measurements from files as trackers and controllers write them.
 
-    joints: a file of joint values, where the points stand alone.  columns, units, layout, decimal:
-    what the files do not tell (the error asks for it).  Raises DataError, OptionError.
+    files: their paths.  joints: a file of joint values, where the points stand alone.  columns,
+    units, layout, decimal: what the files do not tell (the error asks for it), as q=deg or smr=mm.
+    The measurements have metres and radians.  Raises DataError, OptionError.
+
+    >>> data = mc.import_files(["points.txt"], "joints.txt", units="q=deg,smr=mm").data
     """
     if not files:
         raise OptionError("name a file to import")

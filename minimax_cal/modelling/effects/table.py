@@ -52,7 +52,12 @@ EFFECTS: dict[str, Effect] = {
 
 
 def register(effect: Effect) -> Effect:
-    """Add an effect of one's own to the library of this process."""
+    """Add an effect of one's own to the library of this process.
+
+    effect: its law gives metres and radians per unit of each parameter.  Returns it.
+
+    >>> mc.register(effect)
+    """
     EFFECTS[effect.name] = effect
     return effect
 

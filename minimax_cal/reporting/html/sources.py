@@ -24,6 +24,8 @@ HIDDEN = ("Cc", "Cs", "LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "P
 REPLACED = "\N{REPLACEMENT CHARACTER}"
 AGAIN = "write it again with minimax-cal"
 
+Result = Fit | Diagnosis | Path | str
+
 
 @dataclass(frozen=True, eq=False)
 class Poses:
@@ -105,42 +107,46 @@ class Sources:
         return self.gap.cells[-1] if self.gap and self.gap.cells else None
 
 
-def read_sources(paths: Sequence[Path | str]) -> Sources:
-    """Read one or two result files.  Raises CalibrationError."""
-    if not 1 <= len(paths) <= 2:
-        raise CalibrationError(f"a report takes one or two files, not {len(paths)}")
+def read_sources(results: Sequence[Result]) -> Sources:
+    """One or two results, each itself or its file.  Raises CalibrationError."""
+    if not 1 <= len(results) <= 2:
+        raise CalibrationError(f"a report takes one or two files, not {len(results)}")
     fits: list[Fit] = []
     gaps: list[Diagnosis] = []
     files = []
-    for path in paths:
-        content, digest = read_json(path)
+    for result in results:
+        content, path, digest = content_of(result)
         kind = content.get("kind", "calibration" if "parameters" in content else "")
         if kind == "calibration" and "parameters" in content:
-            fits.append(Fit.from_dict(content, str(path)))
+            fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
-            gaps.append(Diagnosis.from_dict(content, str(path)))
+            gaps.append(Diagnosis.from_dict(content, path))
         else:
             raise CalibrationError(
                 f"{path}: is neither a calibration nor a diagnosis; {AGAIN} calibrate -o or "
                 "diagnose -o"
             )
-        files.append(File(kind, str(path), digest))
+        files.append(File(kind, path, digest))
     for kind, other, count in (
         ("calibration", "diagnosis", len(fits)),
         ("diagnosis", "calibration", len(gaps)),
     ):
         if count > 1:
-            raise CalibrationError(f"{paths[1]}: is a second {kind}; give one and one {other}")
+            raise CalibrationError(f"{path}: is a second {kind}; give one and one {other}")
     files.sort(key=lambda file: file.kind)
     fit, gap = fits[0] if fits else None, gaps[0] if gaps else None
     return Sources(fit, gap, tuple(files), together(fit, gap, files))
 
 
-def sources_of(fit: Fit | None, gap: Diagnosis | None) -> Sources:
-    """Results that were never saved, every text visible."""
-    shown = Fit.from_dict(clean(fit.to_dict())) if fit else None
-    told = Diagnosis.from_dict(clean(gap.to_dict())) if gap else None
-    return Sources(shown, told, (), together(shown, told, ()))
+def content_of(result: Result) -> tuple[dict[str, Any], str, str]:
+    """JSON, name and SHA-256 of a result, every text visible."""
+    if not isinstance(result, Fit | Diagnosis):
+        content, digest = read_json(result)
+        return content, str(result), digest
+    text = result.json()
+    kind = "calibration" if isinstance(result, Fit) else "diagnosis"
+    digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
+    return clean(json.loads(text)), f"{kind}, not saved", digest
 
 
 def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> tuple[str, ...]:

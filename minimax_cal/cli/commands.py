@@ -1,0 +1,120 @@
+"""The commands in the order of the work, each imported when it is used."""
+
+from __future__ import annotations
+
+from collections import UserDict
+from importlib import import_module
+from typing import Any
+
+import click
+
+Entry = tuple[str, str]  # module in this folder, the first sentence of the command's help
+
+COMMANDS: dict[str, dict[str, Entry]] = {
+    "Calibrate": {
+        "import": (
+            "import_",
+            "Read FILEs of a tracker or controller as they are, show what was understood, write "
+            "CSV.",
+        ),
+        "calibrate": (
+            "calibrate",
+            "Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.",
+        ),
+        "relative": (
+            "relative",
+            "Calibrate ROBOT without coordinates, from the lengths, closures or poses in DATA.",
+        ),
+    },
+    "Judge": {
+        "evaluate": (
+            "evaluate",
+            "Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.",
+        ),
+        "iso9283": (
+            "iso9283",
+            "Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.",
+        ),
+        "map": (
+            "map",
+            "Where FIT is sure of a position, and where the arm missed, over the workspace.",
+        ),
+        "tradeoff": (
+            "tradeoff",
+            "Small RMS or small largest error: what ROBOT could have, by the measurements in DATA.",
+        ),
+    },
+    "Diagnose": {
+        "diagnose": (
+            "diagnose",
+            "Say why ROBOT still misses once calibrated, as far as the measurements in DATA can "
+            "tell.",
+        ),
+    },
+    "Plan": {
+        "plan": (
+            "plan",
+            "Which poses of ROBOT to measure next, in which order, and how accurate they will make "
+            "it.",
+        ),
+        "simulate": (
+            "simulate",
+            "Measurements of an imperfect copy of ROBOT, from a tracker at a random place.",
+        ),
+    },
+    "Correct": {
+        "compensate": (
+            "compensate",
+            "Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to "
+            "go.",
+        ),
+        "export": (
+            "export",
+            "Write the robot of FIT (a saved calibration or a robot) as a file others can load.",
+        ),
+    },
+    "Report": {
+        "report": (
+            "report",
+            "One HTML page of RESULTS: a calibration, a diagnosis, or both of the same "
+            "measurements.",
+        ),
+    },
+    "Look up": {
+        "robots": ("robots", "The robots that come with the package."),
+        "effects": (
+            "diagnose",
+            "The library of effects; with ROBOT and DATA, where these measurements can test them.",
+        ),
+        "backends": ("backends", "The QP backends that are installed, with their versions."),
+    },
+}
+ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
+
+
+class Commands(UserDict[str, Any]):
+    """Commands by name, each imported when it is asked for."""
+
+    def __getitem__(self, name: str) -> click.Command:
+        """The command; KeyError for a name that is none."""
+        found = self.data[name]
+        if isinstance(found, click.Command):
+            return found
+        module = import_module(f"minimax_cal.cli.{found[0]}")
+        command: click.Command = getattr(module, f"{name}_command")
+        self.data[name] = command
+        return command
+
+
+class Workflow(click.Group):
+    """A group that lists its commands in the order of the work, without importing them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the work."""
+        return list(self.commands)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands, part by part."""
+        for part, entries in COMMANDS.items():
+            with formatter.section(part):
+                formatter.write_dl([(name, said) for name, (_, said) in entries.items()])

@@ -1,0 +1,25 @@
+"""The command `minimax-cal robots`."""
+
+from __future__ import annotations
+
+import click
+
+from minimax_cal.cli import options
+from minimax_cal.ground.files import json_text
+from minimax_cal.ground.tables import Table
+from minimax_cal.robots.robot import builtin_robots, load_robot
+
+
+@click.command(name="robots")
+@options.JSON
+def robots_command(as_json: bool) -> int:
+    """The robots that come with the package."""
+    names = {name: load_robot(name) for name in builtin_robots()}
+    if as_json:
+        content = {name: robot.to_dict() for name, robot in names.items()}
+        click.echo(json_text({"schema": 1, "robots": content}), nl=False)
+        return 0
+    rows = tuple((name, robot.name, robot.joints, robot.reach()) for name, robot in names.items())
+    header = ("name", "robot", "joints", "reach m")
+    options.show(Table("built-in robots", header, rows, ("", "", "d", ".2f")))
+    return 0

@@ -1,0 +1,33 @@
+"""A calibration by the formulas of ISO 9283, before and after, on poses it has and has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.judging.iso9283 import Iso9283
+from minimax_cal.judging.iso9283.result import iso9283 as characteristics
+from minimax_cal.judging.saved import open_fit
+
+
+def iso9283(
+    fit: Fit | Path | str,
+    data: Path | str | None = None,
+    *,
+    nominal: str = "",
+    tcp: str | Sequence[float] = "centroid",
+) -> Iso9283:
+    """Pose and distance accuracy of a calibration by the formulas of ISO 9283, before and after.
+
+    fit: a calibration, or its file.  data: file of the measurements; the fit's own unless
+    given.  nominal: robot before the calibration, file
+    or name; that of the fit unless given.  tcp: centroid of the targets, one target (smr1), or a
+    point (3,) in the last frame [m].  Raises CalibrationError for wrong input.
+
+    >>> print(mc.iso9283("fit.json").summary())
+    """
+    saved = open_fit(fit, data or "", nominal)
+    found = characteristics(saved.cells, saved.data, saved.held, tcp)
+    return replace(found, notices=(*saved.notices, *found.notices))

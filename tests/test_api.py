@@ -1,0 +1,211 @@
+"""The public names: whole, quick to import, never shadowed, and each function explains itself."""
+
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import click
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.cli import cli
+from minimax_cal.cli.commands import COMMANDS, ENTRIES
+from minimax_cal.fitting.instruments import RelativeOptions
+from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.planning.options import PlanOptions
+
+FUNCTIONS = [name for name in mc.__all__ if inspect.isfunction(getattr(mc, name))]
+TERSE = {"bootstrap", "calibrate", "evaluate", "load_cell", "tradeoff"}  # no example yet
+
+
+def after(code: str, *modules: str) -> dict[str, bool]:
+    """Which modules a fresh interpreter has imported once it ran some code."""
+    told = f"\nimport sys\nprint([name in sys.modules for name in {modules!r}])"
+    made = subprocess.run(
+        [sys.executable, "-c", code + told], capture_output=True, text=True, check=True
+    )
+    line = made.stdout.splitlines()[-1]
+    return dict(zip(modules, (word == "True" for word in re.findall(r"\w+", line)), strict=True))
+
+
+# ---- the package -------------------------------------------------------------------------------
+
+
+def test_every_name_is_there() -> None:
+    assert set(mc.MODULES) == set(mc.__all__)
+    for name in mc.__all__:
+        assert getattr(mc, name) is not None
+        assert name in dir(mc)
+    assert mc.__version__ == version("minimax-cal")
+    with pytest.raises(AttributeError, match="'calibrat'"):
+        mc.calibrat  # type: ignore[attr-defined] # noqa: B018
+
+
+def test_type_checkers_see_the_same_names() -> None:
+    """The imports under TYPE_CHECKING are those of the table."""
+    text = Path(mc.__file__).read_text()
+    block = text.partition("if TYPE_CHECKING:")[2].partition("\n__all__")[0]
+    found = {}
+    for module, names in re.findall(r"from minimax_cal\.([\w.]+) import (\([^)]*\)|.*)", block):
+        for name in re.findall(r"\w+", names):
+            found[name] = f"{module}.{name}" if name == "datasets" else module
+    assert found == mc.MODULES
+
+
+def test_importing_is_quick_work() -> None:
+    code = "import minimax_cal"
+    assert not any(after(code, "numpy", "scipy", "pydantic", "click").values())
+    assert after("import minimax_cal\nminimax_cal.Robot", "numpy")["numpy"]
+
+
+def test_no_module_shadows_a_public_name() -> None:
+    for found in pkgutil.walk_packages(mc.__path__, "minimax_cal."):
+        importlib.import_module(found.name)
+    modules = {name for name in mc.__all__ if inspect.ismodule(getattr(mc, name))}
+    assert modules == {"datasets"}
+    assert {"calibrate", "diagnose", "export", "iso9283", "plan", "report"} <= set(FUNCTIONS)
+    code = (
+        "import minimax_cal.judging.iso9283, minimax_cal.reporting.report"
+        "\nimport minimax_cal.cli.plan, minimax_cal as mc, inspect"
+        "\nassert all(map(inspect.isfunction, (mc.iso9283, mc.plan, mc.report, mc.simulate)))"
+    )
+    assert after(code, "numpy")["numpy"]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_help_explains_the_arguments_and_shows_an_example(name: str) -> None:
+    function = getattr(mc, name)
+    text = inspect.getdoc(function) or ""
+    if name in TERSE:
+        pytest.skip("the docstring is being rewritten with its module")
+    assert re.search(rf"^>>> .*\bmc\.{name}\(", text, re.M)
+    told = text.partition(">>>")[0]
+    for argument in inspect.signature(function).parameters:
+        if argument not in ("fun", "x0", "jac"):
+            assert re.search(rf"\b{argument}\b", told), f"{name}: {argument}"
+
+
+@pytest.mark.parametrize(
+    ("function", "given"),
+    [
+        (mc.plan, ("irb2600", 10)),
+        (mc.relative, ("irb2600", "wires.csv")),
+        (mc.calibrate, ("irb2600", "poses.csv")),
+        (mc.diagnose, ("irb2600", "poses.csv")),
+        (mc.simulate, ("irb2600",)),
+        (mc.export, ("irb2600", "urdf")),
+        (mc.report, ("fit.json",)),
+        (mc.iso9283, ("fit.json",)),
+    ],
+)
+def test_a_typo_is_told_by_its_name(function, given) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(TypeError, match="holdot"):
+        function(*given, holdot=0.1)
+
+
+@pytest.mark.parametrize(
+    ("function", "options"), [(mc.plan, PlanOptions), (mc.relative, RelativeOptions)]
+)
+def test_keywords_are_those_of_the_options(function, options) -> None:  # type: ignore[no-untyped-def]
+    said = inspect.signature(function).parameters
+    for name, default in vars(options()).items():
+        assert said[name].default == (default if default != {} else None), name
+
+
+# ---- functions beside the commands -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fit(noisy: Simulation) -> mc.Fit:
+    return mc.calibrate("irb2600", noisy.data, "sum")
+
+
+def test_simulate_takes_a_name(robot: mc.Robot) -> None:
+    one, other = (mc.simulate(arm, 5, seed=3).data for arm in (robot, "irb2600"))
+    assert (one.y == other.y).all()
+
+
+def test_export_takes_what_there_is(fit: mc.Fit, tmp_path: Path) -> None:
+    fit.save(tmp_path / "fit.json")
+    saved = mc.export(tmp_path / "fit.json", "json", tmp_path / "arm.json")
+    assert (tmp_path / "arm.json").read_text() == saved
+    assert mc.export(fit, "json") == mc.export(fit.cell, "json") == mc.export(fit.robot, "json")
+    assert_allclose(mc.load_robot(tmp_path / "arm.json").mdh, fit.robot.mdh, rtol=0, atol=1e-12)
+    said: list[str] = []
+    assert mc.export(fit, "moc", experimental=True, notify=said.append)
+    assert said
+    with pytest.warns(UserWarning, match="placeholders"):
+        assert mc.export("irb2600", to="urdf").startswith("<?xml")
+    with pytest.raises(mc.OptionError, match="no such format"):
+        mc.export(fit, "step")
+
+
+def test_iso9283_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> None:
+    path = tmp_path / "fit.json"
+    fit.save(path)
+    one, other = (mc.iso9283(given, tcp="smr1").parts for given in (fit, path))
+    for key, part in one.items():
+        for name, values in part.values.items():
+            found = other[key].values[name]
+            assert_allclose(found.position, values.position, rtol=0, atol=1e-9)  # the file's digits
+    with pytest.raises(mc.OptionError, match="save it first"):
+        mc.iso9283(fit, "poses.csv")
+
+
+def test_report_of_a_fit_is_that_of_its_file(fit: mc.Fit, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="a report needs pip install minimax-cal[report]")
+    path = tmp_path / "fit.json"
+    fit.save(path)
+    pages = [
+        mc.report(given, tmp_path / name, date="2026-01-31").read_text()
+        for given, name in ((fit, "a.html"), (path, "b.html"))
+    ]
+    assert pages[0].replace("calibration, not saved", str(path)) == pages[1]
+
+
+# ---- the command line --------------------------------------------------------------------------
+
+
+def test_version_and_help_import_no_command() -> None:
+    heavy = ("numpy", "scipy", "pydantic", "rich", "minimax_cal.cli.calibrate")
+    for option in ("--version", "--help"):
+        code = (
+            "from minimax_cal.cli import main\n"
+            f"try:\n    main([{option!r}])\nexcept SystemExit as ended:\n    assert not ended.code"
+        )
+        assert not any(after(code, *heavy).values()), option
+
+
+def test_the_list_says_what_the_commands_say() -> None:
+    context = click.Context(cli)
+    assert cli.list_commands(context) == list(cli.commands) == list(ENTRIES)
+    for entries in COMMANDS.values():
+        for name, (module, said) in entries.items():
+            command = cli.get_command(context, name)
+            assert command is not None
+            assert command.name == name
+            first = " ".join((command.help or "").partition("\n\n")[0].split())
+            assert first == said, f"minimax_cal.cli.{module}"
+    assert cli.get_command(context, "callibrate") is None
+
+
+def test_an_interrupted_import_is_one_line() -> None:
+    code = (
+        "import sys\n"
+        "class Stopped:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'numpy': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Stopped())\n"
+        "from minimax_cal.cli import main\n"
+        "main(['robots'])"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 130
+    assert "Traceback" not in ended.stderr
+    assert ended.stderr.strip().endswith("error: interrupted")
