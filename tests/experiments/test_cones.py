@@ -7,8 +7,10 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from minimax_cal.solvers import cones, minimax
-from minimax_cal.solvers.cones import Multipliers, Rows, Settings, lower_bound
+from experiments import cones
+from experiments.cones import Settings, ahead
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.dual_bound import Multipliers, Rows, aligned, lower_bound, of_squares
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
 
@@ -125,7 +127,7 @@ def test_a_program_of_few_points_answers_for_all() -> None:
     empty = cones.Program.empty(problem.lower, problem.upper)
     answer, program = empty.answer(rows, 100.0, 1e3)
     assert 20 < program.count < 400
-    assert_allclose(rows.ahead(answer.d)[0].max(), best, rtol=1e-8)
+    assert_allclose(ahead(rows, answer.d)[0].max(), best, rtol=1e-8)
     assert answer.error < 1e-8
 
 
@@ -137,7 +139,7 @@ def test_a_program_takes_other_values() -> None:
     answer, same = program.answer(two.rows, 100.0, 1e3)
     assert same.solver is program.solver
     best = reference(two.rows, two.lower, two.upper)
-    assert_allclose(two.rows.ahead(answer.d)[0].max(), best, rtol=1e-8)
+    assert_allclose(ahead(two.rows, answer.d)[0].max(), best, rtol=1e-8)
 
 
 def test_a_trust_region_is_kept() -> None:
@@ -148,7 +150,7 @@ def test_a_trust_region_is_kept() -> None:
     norms = [cp.norm(r + J @ d) for r, J in zip(problem.rows.r, problem.rows.J, strict=True)]
     reference = cp.Problem(cp.Minimize(cp.max(cp.hstack(norms))), [cp.norm(d) <= 0.05])
     assert np.linalg.norm(answer.d) <= 0.05 * (1 + 1e-9)
-    ours = problem.rows.ahead(answer.d)[0].max()
+    ours = ahead(problem.rows, answer.d)[0].max()
     assert_allclose(ours, reference.solve(solver="CLARABEL"), rtol=1e-7)
     assert answer.error < 1e-8  # proven within the region, by its own multipliers
 
@@ -223,7 +225,7 @@ def test_curved_problems_end_where_the_sqp_does(bounds: tuple[np.ndarray, np.nda
     assert found.gap < 1e-8
     # the multipliers of the squares are the norms' ones but for the lengths of the gradients
     rows = problem.linearise(qp.x)
-    given = cones.of_squares(rows, qp.mu, qp.lam)
+    given = of_squares(rows, qp.mu, qp.lam)
     assert_allclose(lower_bound(rows, *bounds, given), found.value, rtol=1e-7)
     assert_allclose(
         np.linalg.norm(given.y, axis=1), np.linalg.norm(found.multipliers.y, axis=1), atol=1e-4
@@ -262,7 +264,7 @@ def test_a_solver_that_lies_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> 
     problem = random_problem(5, 20, 3, 0)
 
     def lying(self, rows, radius, penalty):  # type: ignore[no-untyped-def]
-        return np.zeros(3), cones.aligned(rows, np.ones(len(rows.r)), np.zeros(0)), self
+        return np.zeros(3), aligned(rows, np.ones(len(rows.r)), np.zeros(0)), self
 
     monkeypatch.setattr(cones.Program, "solved", lying)
     assert cones.solve(problem, np.zeros(3)).status is Status.FAILED
