@@ -39,7 +39,7 @@ from minimax_cal.planning.candidates import Poses, candidates, free_poses
 from minimax_cal.planning.designs.criteria import Largest, Trace, size_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import best_design, first_design, worth
-from minimax_cal.planning.options import Wishes
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.outlook import sigmas
 from minimax_cal.planning.plan import refined
 from minimax_cal.planning.prospect import Instrument, prospect, with_effects
@@ -59,9 +59,9 @@ COUNTS = (40, 60, 80, 100, 120)  # of random poses
 FRESH, DRAWS = 1000, 60  # workspace poses that judge; random sets of which the median is told
 BOX = ((0.7, -0.5, 0.3), (1.7, 0.5, 1.3))  # corners [m]
 SETTINGS = {
-    "anywhere": Wishes(acceptance=np.pi),
-    "30 deg cone": Wishes(),
-    "cone, 1 m box": Wishes(volume=BOX),
+    "anywhere": PlanOptions(acceptance=np.pi),
+    "30 deg cone": PlanOptions(),
+    "cone, 1 m box": PlanOptions(volume=BOX),
 }
 CLOSE, MANY = ("cone, 1 m box", "I"), 120  # a few percent decide there: more arms are simulated
 TRUTH = Truth()
@@ -120,7 +120,7 @@ class Result:
 def task_for(job: Job) -> tuple[Task, Poses]:
     """The task and its candidates."""
     robot = load_robot(ROBOT)
-    wish = replace(
+    options = replace(
         SETTINGS[job.setting],
         criterion=job.criterion,
         effects=job.effects,
@@ -128,10 +128,10 @@ def task_for(job: Job) -> tuple[Task, Poses]:
         candidates=job.candidates,
         seed=job.seed,
     )
-    ground = ground_of(robot, "", "", wish)
-    room, sight, _ = surroundings(ground.cell, wish)
+    ground = ground_of(robot, "", "", options)
+    room, sight, _ = surroundings(ground.cell, options)
     found = candidates(room, sight, job.candidates, job.seed)
-    return task_of(robot, ground, room, sight, found, wish), found
+    return task_of(robot, ground, room, sight, found, options), found
 
 
 def run(job: Job) -> Result:
@@ -185,7 +185,7 @@ def trial(
 ) -> list[tuple[float, float]]:
     """RMS and largest error at fresh poses of one true arm, calibrated from three sets [m]."""
     compliance, effects, _ = ARMS[arm]
-    rng = np.random.default_rng([task.wish.seed, number])
+    rng = np.random.default_rng([task.options.seed, number])
     cell = task.ground.cell
     n = cell.robot.joints
     off = rng.normal(size=(n, 5)) * ([TRUTH.length] * 2 + [TRUTH.angle] * 3)

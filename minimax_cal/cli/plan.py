@@ -12,7 +12,7 @@ import numpy as np
 from minimax_cal.cli import options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.planning.options import EFFORTS, Wishes
+from minimax_cal.planning.options import EFFORTS, PlanOptions
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import MEANINGS
@@ -23,7 +23,7 @@ from minimax_cal.reporting.plots.figures import PICTURES
 from minimax_cal.reporting.plots.plan import save_plan
 from minimax_cal.robots.robot import Robot, load_robot
 
-DEFAULTS, NOISE = Wishes(), Instrument()
+DEFAULTS, NOISE = PlanOptions(), Instrument()
 PATH = click.Path(path_type=Path)
 JOINT = re.compile(r"[Jj]?(\d+)=(.+)")
 

@@ -268,13 +268,20 @@ def more(scene: Scene, like: Measurements, rng: np.random.Generator) -> Measurem
     off = np.maximum(floor - robot.up @ flange, 0.0) + np.abs(
         away - np.clip(away, seen.min(), seen.max())
     )
-    q = q[np.argsort(off, kind="stable")[:count]]
+    return visited_after(scene, like, q[np.argsort(off, kind="stable")[:count]])
+
+
+def visited_after(scene: Scene, like: Measurements, q: Array) -> Measurements:
+    """Poses (m, n) measured one after another once the data at hand are.
+
+    like: m rows with the columns that the way there does not tell.
+    """
     last = scene.data.q[int(np.argmax(scene.column("clock")))]
     move = np.diff(q, axis=0, prepend=last[None])
     history = {f"move{j + 1}": move[:, j] for j in range(scene.joints)}
     history |= {f"approach{j + 1}": np.sign(move[:, j]) for j in range(scene.joints)}
-    clock = 1.0 + (np.arange(count) + 1.0) / scene.poses
-    moved = replace(then(like, **history, clock=clock, followed=np.ones(count)), q=q)
+    clock = 1.0 + (np.arange(len(q)) + 1.0) / scene.poses
+    moved = replace(then(like, **history, clock=clock, followed=np.ones(len(q))), q=q)
     return then(moved, **predicted(scene, moved))
 
 

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from minimax_cal.ground.errors import CalibrationError
 
@@ -62,6 +67,17 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
 def json_text(content: object) -> str:
     """JSON as this project writes it; NaN, which JSON does not know, raises ValueError."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def plain(content: Any) -> Any:
+    """Data as JSON holds them: arrays are lists, null where there is no finite number."""
+    if isinstance(content, Mapping):
+        return {key: plain(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray | np.generic):
+        content = content.tolist()
+    if isinstance(content, list | tuple):
+        return [plain(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:

@@ -28,11 +28,11 @@ from minimax_cal.fitting.calibration import Calibration
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.robust import flatness
-from minimax_cal.fitting.uncertainty import model_at
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.solvers import minimax

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.robots.robot import Robot
 
 EFFORTS = ("none", "both")  # what is done about the side a pose is approached from
@@ -15,7 +16,7 @@ MOST_POSES, MOST_CANDIDATES, MOST_TARGETS = 1000, 50_000, 20
 
 
 @dataclass(frozen=True)
-class Wishes:
+class PlanOptions:
     """What a plan is to be like.
 
     criterion: of `planning.CRITERIA`.  candidates: how many to draw.  seed: of all that is random.
@@ -54,56 +55,47 @@ class Wishes:
     revisit: int = 0
 
 
-def check_wishes(wish: Wishes, poses: int, robot: Robot) -> None:
-    """Raise OptionError for wishes that make no sense."""
+def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
+    """Raise OptionError for options that make no sense."""
     if not 1 <= poses <= MOST_POSES:
         raise OptionError(f"--poses {poses}: give 1 to {MOST_POSES}")
-    if not poses <= wish.candidates <= MOST_CANDIDATES:
+    if not poses <= options.candidates <= MOST_CANDIDATES:
         raise OptionError(
-            f"--candidates {wish.candidates}: give at least as many as poses, at most "
+            f"--candidates {options.candidates}: give at least as many as poses, at most "
             f"{MOST_CANDIDATES}"
         )
-    if wish.seed < 0:
-        raise OptionError(f"seed {wish.seed}: give a whole number, 0 or more")
-    if not 0 <= wish.revisit <= poses:
-        raise OptionError(f"--revisit {wish.revisit}: give 0 to {poses}, the number of poses")
-    if wish.approach not in EFFORTS:
-        raise OptionError(f"--approach {wish.approach!r}: choose {' or '.join(EFFORTS)}")
-    if wish.approach == "both" and not wish.revisit:
+    if options.seed < 0:
+        raise OptionError(f"seed {options.seed}: give a whole number, 0 or more")
+    if not 0 <= options.revisit <= poses:
+        raise OptionError(f"--revisit {options.revisit}: give 0 to {poses}, the number of poses")
+    if options.approach not in EFFORTS:
+        raise OptionError(f"--approach {options.approach!r}: choose {' or '.join(EFFORTS)}")
+    if options.approach == "both" and not options.revisit:
         raise OptionError("--approach both is about revisits: give their number with --revisit")
-    if not 1 <= wish.targets <= MOST_TARGETS:
-        raise OptionError(f"--targets {wish.targets}: give 1 to {MOST_TARGETS}")
-    if not wish.acceptance > 0.0:
+    if not 1 <= options.targets <= MOST_TARGETS:
+        raise OptionError(f"--targets {options.targets}: give 1 to {MOST_TARGETS}")
+    if not options.acceptance > 0.0:
         raise OptionError(
             "--acceptance: give an angle above 0, 180 for a target seen from anywhere"
         )
-    for name, (low, high) in (("range", wish.reach), ("elevation", wish.elevation)):
+    for name, (low, high) in (("range", options.reach), ("elevation", options.elevation)):
         if not low < high:
             raise OptionError(f"--{name}: the limits are reversed; give low:high")
-    for low, high in zip(*wish.volume, strict=True) if len(wish.volume) else ():
+    for low, high in zip(*options.volume, strict=True) if len(options.volume) else ():
         if not low < high:
             raise OptionError("--volume: the limits of an axis are reversed; give low:high")
     for name in ("noise", "per_metre", "jitter", "body"):
-        value = getattr(wish, name)
+        value = getattr(options, name)
         if not (np.isnan(value) or 0.0 <= value < np.inf):
             raise OptionError(f"{name} {value:g} must be a finite number, 0 or more")
-    strange = [joint for joint in wish.joints if not 0 <= joint < robot.joints]
+    strange = [joint for joint in options.joints if not 0 <= joint < robot.joints]
     if strange:
         raise OptionError(f"--joint: {robot.name} has no joint {strange[0] + 1}")
-    if len(wish.separate) not in (0, 2):
+    if len(options.separate) not in (0, 2):
         raise OptionError("--separate: name two effects, as joint_compliance:J2 link_bending:L2")
 
 
-def settings_of(wish: Wishes, poses: int) -> dict[str, object]:
-    """The wishes for the record."""
-    out: dict[str, object] = {"poses": poses}
-    for name, value in vars(wish).items():
-        if isinstance(value, float):
-            out[name] = None if np.isnan(value) else value
-        elif isinstance(value, Mapping):
-            out[name] = {str(key): list(pair) for key, pair in value.items()}
-        elif isinstance(value, str | int):
-            out[name] = value
-        else:
-            out[name] = [list(v) if not isinstance(v, str | float | int) else v for v in value]
-    return out
+def settings_of(options: PlanOptions, poses: int) -> dict[str, object]:
+    """The options for the record."""
+    joints = {str(joint): limits for joint, limits in options.joints.items()}
+    return {"poses": poses, **plain({**vars(options), "joints": joints})}

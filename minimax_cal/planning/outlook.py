@@ -41,7 +41,7 @@ def grown(
     task: Task, menu: Menu, aim: tuple[Menu, Criterion], best: Found, drawn: int
 ) -> tuple[Growth, ...]:
     """What other numbers of poses would tell, planned and random ones of the first `drawn`."""
-    rng, b = np.random.default_rng(task.wish.seed), task.predictions
+    rng, b = np.random.default_rng(task.options.seed), task.predictions
     squares = (np.swapaxes(b, 1, 2) @ b).reshape(len(b), -1)
     poses, out = len(best.design.chosen), []
     for count in sorted({max(1, round(poses * part)) for part in GROWTH}):
@@ -109,9 +109,9 @@ def remarks(task: Task, found: Poses, best: Found) -> list[str]:
             f"{', '.join(silent_ones)}: taken as known, not planned for, since the way to a pose "
             "and the time are not known yet"
         )
-    if found.drawn < task.wish.candidates:
+    if found.drawn < task.options.candidates:
         out.append(
-            f"{found.drawn} candidates, not {task.wish.candidates}: poses that can be taken and "
+            f"{found.drawn} candidates, not {task.options.candidates}: poses that can be taken and "
             f"seen are rare ({found.tested} were drawn); {rarest(found.rejected)}"
         )
     if not best.relaxed.solver and best.bound < LOOSE * best.design.size:

@@ -19,7 +19,7 @@ from minimax_cal.planning.designs.criteria import Criterion, inverse
 from minimax_cal.planning.designs.exchange import Menu, exchange, polar
 from minimax_cal.planning.designs.relaxation import highest
 from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
-from minimax_cal.planning.options import Wishes, check_wishes, settings_of
+from minimax_cal.planning.options import PlanOptions, check_options, settings_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import shortest, travel, visits
@@ -44,26 +44,26 @@ def plan(
     """Which poses of a robot to measure next.
 
     fit: a calibration whose robot, base, targets and poses are the start.  data: poses measured
-    already; without a fit they are calibrated first.  options: the fields of `Wishes`.
+    already; without a fit they are calibrated first.  options: the fields of `PlanOptions`.
     Raises CalibrationError for wrong input.
     """
     began = time.perf_counter()
-    wish = Wishes(**options)  # type: ignore[arg-type]
+    given = PlanOptions(**options)  # type: ignore[arg-type]
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    if wish.criterion not in CRITERIA:
-        raise OptionError(f"no criterion {wish.criterion!r}; choose {', '.join(CRITERIA)}")
-    check_wishes(wish, poses, robot)
+    if given.criterion not in CRITERIA:
+        raise OptionError(f"no criterion {given.criterion!r}; choose {', '.join(CRITERIA)}")
+    check_options(given, poses, robot)
     progress("start")
-    ground = ground_of(robot, fit, data, wish)
-    room, sight, said = surroundings(ground.cell, wish)
+    ground = ground_of(robot, fit, data, given)
+    room, sight, said = surroundings(ground.cell, given)
     progress("candidate poses")
-    found = candidates(room, sight, wish.candidates, wish.seed)
+    found = candidates(room, sight, given.candidates, given.seed)
     if len(found.q) < poses:
         raise OptionError(
             f"only {len(found.q)} of {found.tested} poses can be taken and seen, but {poses} are "
             f"asked for; {rarest(found.rejected)}"
         )
-    task = task_of(robot, ground, room, sight, found, wish)
+    task = task_of(robot, ground, room, sight, found, given)
     found, first = refined(task, found, poses, progress)
     aim = task.aim(found)
     best = best_design(*aim, first, progress)
@@ -80,8 +80,8 @@ def refined(task: Task, found: Poses, poses: int, progress: Progress) -> tuple[P
     """
     progress("first poses")
     menu, criterion = task.aim(found)
-    chosen = first_design(menu, criterion, poses, task.wish.seed)
-    rng = np.random.default_rng(task.wish.seed)
+    chosen = first_design(menu, criterion, poses, task.options.seed)
+    rng = np.random.default_rng(task.options.seed)
     for step in STEPS:
         progress(f"poses within {100.0 * step:g} % around them")
         each = -(-AROUND // poses)
@@ -107,7 +107,7 @@ def assembled(
     began: float,
 ) -> Plan:
     """The plan, in a short order, compared with random poses.  began: by `time.perf_counter`."""
-    cell, wish = task.ground.cell, task.wish
+    cell, options = task.ground.cell, task.options
     robot, poses = cell.robot, len(best.design.chosen)
     menu = task.menu(found)
     chosen = ordered(best.design.chosen, found.q, robot)
@@ -119,19 +119,19 @@ def assembled(
         robot.prismatic,
         task.room.lower,
         task.room.upper,
-        wish.revisit,
-        aside=wish.approach == "both",
+        options.revisit,
+        aside=options.approach == "both",
     )
     separation = tuple(
         separated(one, contest, stops, seen[:, task.named(one)])
         for one, contest in zip(task.asked, task.contests(found), strict=True)
     )
     some = np.arange(found.drawn)
-    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, wish.seed)
+    equal = worth(aim[0].take(some), aim[1], poses, best.design.size, options.seed)
 
     return Plan(
         cell=cell,
-        criterion=POWER if task.asked else wish.criterion,
+        criterion=POWER if task.asked else options.criterion,
         q=q,
         seen=seen,
         expected=np.where(seen[..., None], cell.predict(q), np.nan),
@@ -142,7 +142,7 @@ def assembled(
         equal=equal,
         names=task.ahead.names,
         sigma=np.sqrt(np.diag(inverse(menu.of(chosen)))) / task.ahead.scale,
-        indices=indices(task.ahead, found, chosen, wish.seed),
+        indices=indices(task.ahead, found, chosen, options.seed),
         growth=growth,
         separation=separation,
         candidates=found,
@@ -154,7 +154,7 @@ def assembled(
         ),
         at_hand=sum(one.poses for one in task.ground.measured),
         solver=best.relaxed.solver,
-        settings=settings_of(wish, poses),
+        settings=settings_of(options, poses),
         notices=notices,
         seconds=time.perf_counter() - began,
     )

@@ -10,7 +10,7 @@ unknown (c-optimal); for two linear models that is the T-optimal design [Atkinso
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
@@ -106,15 +106,7 @@ def further(scene: Scene, q: Array) -> Measurements:
     """Poses (m, n) measured one after another once the data at hand are."""
     last = int(np.argmax(scene.column("clock")))
     old = next_measurement.with_columns(scene.data, scene)
-    like = old.take(np.full(len(q), last))
-    move = np.diff(q, axis=0, prepend=scene.data.q[last][None])
-    history = {f"move{j + 1}": move[:, j] for j in range(scene.joints)}
-    history |= {f"approach{j + 1}": np.sign(move[:, j]) for j in range(scene.joints)}
-    clock = 1.0 + (np.arange(len(q)) + 1.0) / scene.poses
-    moved = replace(
-        next_measurement.then(like, **history, clock=clock, followed=np.ones(len(q))), q=np.array(q)
-    )
-    return next_measurement.then(moved, **next_measurement.predicted(scene, moved))
+    return next_measurement.visited_after(scene, old.take(np.full(len(q), last)), np.array(q))
 
 
 def with_poses(site: Site, q: Array, seen: Array, via: Array) -> Ahead:

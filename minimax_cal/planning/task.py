@@ -14,7 +14,7 @@ from minimax_cal.planning import separating
 from minimax_cal.planning.candidates import Poses, free_poses
 from minimax_cal.planning.designs.criteria import Criterion, Determinant, Eigenvalue, Largest, Trace
 from minimax_cal.planning.designs.exchange import Menu
-from minimax_cal.planning.options import Wishes
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.prospect import Prospect, prospect, with_effects
 from minimax_cal.planning.separating import Contest, Question
 from minimax_cal.planning.setting import Ground
@@ -41,7 +41,7 @@ class Task:
     asked: two effects to tell apart, or nothing.
     """
 
-    wish: Wishes
+    options: PlanOptions
     ground: Ground
     room: Room
     sight: Sight
@@ -71,7 +71,7 @@ class Task:
         """What is to be chosen from, and by what."""
         for contest in self.contests(found):
             return contest.menu, contest.criterion
-        return self.menu(found), CRITERIA[self.wish.criterion](self.ahead, self.predictions)
+        return self.menu(found), CRITERIA[self.options.criterion](self.ahead, self.predictions)
 
     def named(self, asked: Question) -> list[int]:
         """Which targets of the cell the measurements behind a question have."""
@@ -80,26 +80,28 @@ class Task:
 
 
 def task_of(
-    robot: Robot, ground: Ground, room: Room, sight: Sight, found: Poses, wish: Wishes
+    robot: Robot, ground: Ground, room: Room, sight: Sight, found: Poses, options: PlanOptions
 ) -> Task:
     """The task once the candidates are known.  robot: nominal."""
-    cell = with_effects(ground.cell, wish.effects, found.q)
+    cell = with_effects(ground.cell, options.effects, found.q)
     ahead = prospect(cell, ground.instrument, found.q, found.seen)
     known = np.zeros((len(ahead.scale),) * 2)
     for one in ground.measured:
         known = known + ahead.known(one)
-    work = free_poses(room, WORK, wish.seed + 1)
-    asked = asked_of(robot, ground, wish)
-    return Task(wish, ground, room, sight, ahead, work, known, asked)
+    work = free_poses(room, WORK, options.seed + 1)
+    asked = asked_of(robot, ground, options)
+    return Task(options, ground, room, sight, ahead, work, known, asked)
 
 
-def asked_of(robot: Robot, ground: Ground, wish: Wishes) -> tuple[Question, ...]:
+def asked_of(robot: Robot, ground: Ground, options: PlanOptions) -> tuple[Question, ...]:
     """The effects that the poses are to tell apart, if any.  Raises OptionError."""
-    if not len(wish.separate):
+    if not len(options.separate):
         return ()
     if not ground.measured:
         raise OptionError(
             "--separate: how large the effects are is not known; give measurements with --data, "
             "or a --fit that holds its poses"
         )
-    return (separating.question(robot, ground.measured[0], ground.cell, wish.separate, wish.seed),)
+    return (
+        separating.question(robot, ground.measured[0], ground.cell, options.separate, options.seed),
+    )
