@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.calibration import Calibration
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.files import read_text
 from minimax_cal.ground.tables import Cell as TableCell
@@ -186,11 +186,6 @@ class Compensation:
             ],
             "notices": list(self.notices),
         }
-
-
-def rms(values: Array) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def compensate(

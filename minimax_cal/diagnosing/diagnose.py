@@ -128,61 +128,50 @@ def examined(
     """The diagnosis of checked measurements.  began: when the work did [s]."""
     progress("data faults")
     raw = with_history(given)
-    sound, faults, remarks, fits = cleaned(robot, raw, seed, holdout, progress)
-    train, held, notices = split(sound, holdout, seed)
+    clean = cleaned(robot, raw, seed, holdout, progress)
+    train, held, notices = split(clean.data, holdout, seed)
     if not held.poses:
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
-    study = studied(robot, train, fits or fit_cell(robot, train, SUM, progress))
-    progress("effects")
-    library, choice = chosen(study, exclude)
-    read_back = read_back_fault(study, choice)
-    if read_back:  # what is left of a move looks like play in the gears
-        library, choice = chosen(study, (*exclude, "backlash"))
-    progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known)
-    if choice.noise.variance < selection.EXACT**2:
-        traces = (Trace("rounding", 1.0, 0.0),)
-    order = by_weight(study, choice)
-    effects = merged([finding(study, choice, i) for i in order])
+    study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
+    causes = causes_of(study, clean.faults, exclude, progress)
     progress("gap ladder")
-    wrong = [*faults, *read_back]
-    steps, cells, raw_error = ladder(robot, raw, study, held, wrong, effects, seed, holdout)
-    floor, source = noise_floor(study.rows, choice.noise, sound, cells[-1], steps[-1].train)
-    findings = with_shares([*fault_findings(wrong), *effects], steps, floor)
-    closed, interval = closed_share(raw_error, cells[-1].error(held), floor, seed)
-    verdict, rest = judged(findings, traces, explained(study, choice))
-    noise = float(np.sqrt(choice.noise.variance))
-    if verdict == "none" and source == REPEATS and shaky(floor, noise, steps[-1].holdout.rms_mm):
+    gap = gap_of(study, raw, clean.data, held, causes, seed, holdout)
+    findings = with_shares([*fault_findings(causes.faults), *causes.effects], gap.steps, gap.floor)
+    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    noise = causes.choice.noise
+    if verdict == "none" and gap.shaky(noise):
         verdict = "not_repeatable"
     lies = located(study)
-    notices = (*given.notices, *notices, *remarks, *study.fit.notices)
     settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
+    told = reasons(
+        verdict, gap.steps, gap.floor, findings, gap.closed, gap.closed_ci, structure_left
+    )
     return Diagnosis(
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=reasons(verdict, steps, floor, findings, closed, interval, rest),
+        reasons=told,
         findings=tuple(findings),
-        ladder=steps,
-        floor=floor,
-        floor_from=source,
-        closed=closed,
-        closed_ci=interval,
-        blocked=blocked(study, sound, cells[-1]),
-        noise=noise,
-        jitter=choice.noise.jitter,
-        structure=rest[1],
-        structure_in=rest[0],
+        ladder=gap.steps,
+        floor=gap.floor,
+        floor_from=gap.floor_from,
+        closed=gap.closed,
+        closed_ci=gap.closed_ci,
+        blocked=blocked(study, clean.data, gap.cells[-1]),
+        noise=float(np.sqrt(noise.variance)),
+        jitter=noise.jitter,
+        structure=structure_left[1],
+        structure_in=structure_left[0],
         where=lies.to_dict(),
-        not_testable=library.untestable,
-        notices=notices,
+        not_testable=causes.untestable,
+        notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices),
         provenance=Provenance.of(robot, given, settings),
         seconds=time.perf_counter() - began,
-        data=sound,
-        held=np.isin(sound.line, held.line),
-        cells=tuple(cells),
+        data=clean.data,
+        held=np.isin(clean.data.line, held.line),
+        cells=gap.cells,
         maps=lies.turn,
     )
 
@@ -206,41 +195,91 @@ def located(study: Study) -> Where:
 # ---- data faults -------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class Clean:
+    """Measurements with rows and points put right or left out.
+
+    faults: their rows as lines of the file.  remarks: on them, for people.  fit: the geometric fit
+    of the training poses, where it is that of the clean data.
+    """
+
+    data: Measurements
+    faults: tuple[Fault, ...]
+    remarks: tuple[str, ...]
+    fit: Fit | None
+
+
 def cleaned(
     robot: Robot, data: Measurements, seed: int, holdout: float, progress: Progress
-) -> tuple[Measurements, list[Fault], tuple[str, ...], Fit | None]:
-    """The data with rows and points put right or left out, the faults, and remarks.
-
-    Rows of the faults are lines of the file.  Also the geometric fit of the training poses, where
-    it is that of the clean data.
-    """
-    rows, source = misplaced(robot, data)
-    faults: list[Fault] = []
-    if len(rows):
-        lines = ", ".join(str(data.line[row]) for row in rows[:8])
-        text = f"{data.source}: rows hold each other's points: lines {lines}"
-        none = np.zeros(0, dtype=int)
-        faults.append(Fault("swapped_rows", "all", data.line[rows], none, (), text))
-        data = put_right(data, rows, source)
+) -> Clean:
+    """The data without the faults that can be mended."""
+    data, exchanged = in_order(robot, data)
     found = find_faults(data)
-    faults += in_lines(data, found, "swapped_rows", "outliers")
-    data = mended(data, found)
-    check_sense(robot, data)
-    train, _, _ = split(data, holdout, seed)
+    sound = mended(data, found)
+    check_sense(robot, sound)
+    train, _, _ = split(sound, holdout, seed)
     progress("geometry")
     fit = fit_cell(robot, train, SUM, progress)
-    error = Cell.of(robot, fit.state, data.target_names).error(data)
-    more = tuple(fault for fault in find_faults(data, error) if fault.effect == "outliers")
-    faults += in_lines(data, more, "outliers")
-    data = mended(data, more)
-    data = data.take(np.asarray(data.seen.any(axis=1)))
+    error = Cell.of(robot, fit.state, sound.target_names).error(sound)
+    more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
+    faults = (
+        *exchanged,
+        *in_lines(data, found, "swapped_rows", "outliers"),
+        *in_lines(sound, more, "outliers"),
+    )
+    sound = mended(sound, more)
+    sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
-    return data, faults, remarks, None if more else fit
+    return Clean(sound, faults, remarks, None if more else fit)
+
+
+def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:
+    """The data with points that stand in each other's rows put back, and the fault if any did."""
+    rows, source = misplaced(robot, data)
+    if not len(rows):
+        return data, ()
+    lines = ", ".join(str(data.line[row]) for row in rows[:8])
+    text = f"{data.source}: rows hold each other's points: lines {lines}"
+    none = np.zeros(0, dtype=int)
+    fault = Fault("swapped_rows", "all", data.line[rows], none, (), text)
+    return put_right(data, rows, source), (fault,)
 
 
 def in_lines(data: Measurements, faults: Sequence[Fault], *effects: str) -> list[Fault]:
     """Faults of some kinds, their rows as lines of the file."""
     return [replace(f, rows=data.line[f.rows]) for f in faults if f.effect in effects]
+
+
+@dataclass(frozen=True, eq=False)
+class Causes:
+    """What may be wrong.
+
+    faults: of the data.  choice: the effects selected, effects: as findings, the weightiest first.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.
+    """
+
+    faults: tuple[Fault, ...]
+    choice: Choice
+    effects: tuple[Finding, ...]
+    traces: tuple[Trace, ...]
+    untestable: tuple[tuple[str, str], ...]
+
+
+def causes_of(
+    study: Study, faults: Sequence[Fault], exclude: Sequence[str], progress: Progress
+) -> Causes:
+    """The effects that explain a study's errors, beside faults that are known."""
+    progress("effects")
+    library, choice = chosen(study, exclude)
+    read_back = read_back_fault(study, choice)
+    if read_back:  # what is left of a move looks like play in the gears
+        library, choice = chosen(study, (*exclude, "backlash"))
+    progress("what remains")
+    traces = structure(study.scene, study.rows, choice.noise, choice.known)
+    if choice.noise.variance < selection.EXACT**2:
+        traces = (Trace("rounding", 1.0, 0.0),)
+    effects = merged([finding(study, choice, i) for i in by_weight(study, choice)])
+    return Causes((*faults, *read_back), choice, tuple(effects), traces, library.untestable)
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
@@ -396,15 +435,6 @@ def judged(
     return ("one_of" if several else "named"), (worst.name, p)
 
 
-def shaky(floor: float, noise: float, error: float) -> bool:
-    """Whether what is left is mostly that the arm does not come back to the same place.
-
-    floor: RMS between repeated poses [mm].  noise: of the instrument per coordinate [m].
-    error: held-out RMS [mm].
-    """
-    return floor > SHAKY * 1e3 * np.sqrt(3.0) * noise and floor > error / SHAKY
-
-
 def explained(study: Study, choice: Choice) -> float:
     """Weighed square that the effects explain."""
     none = np.zeros((len(study.rows.error), 0))
@@ -425,48 +455,87 @@ def patched(findings: Sequence[Finding]) -> bool:
 # ---- how far -----------------------------------------------------------------------------------
 
 
-def ladder(
-    robot: Robot,
-    raw: Measurements,
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """How far the errors shrink.
+
+    steps: accuracy with the nominal robot, with geometry, and with each effect.  cells: from
+    geometry on.  floor: RMS distance that noise alone leaves [mm], floor_from: how it is known.
+    closed: share of the gap that is closed on held-out poses, with its 95 % interval.
+    """
+
+    steps: tuple[Step, ...]
+    cells: tuple[Cell, ...]
+    floor: float
+    floor_from: str
+    closed: float
+    closed_ci: tuple[float, float]
+
+    def shaky(self, noise: Noise) -> bool:
+        """Whether what is left is mostly that the arm does not come back to the same place."""
+        if self.floor_from != REPEATS:
+            return False
+        instrument = 1e3 * float(np.sqrt(3.0 * noise.variance))
+        return self.floor > max(SHAKY * instrument, self.steps[-1].holdout.rms_mm / SHAKY)
+
+
+def gap_of(
     study: Study,
+    raw: Measurements,
+    sound: Measurements,
     held: Measurements,
-    faults: Sequence[Fault],
-    effects: Sequence[Finding],
+    causes: Causes,
     seed: int,
     holdout: float,
-) -> tuple[tuple[Step, ...], list[Cell], Array]:
-    """Accuracy with the nominal robot, with geometry, and with each effect.
+) -> Gap:
+    """The gap on poses that no fit has seen.  raw, sound: before and after faults were mended."""
+    steps, error = geometric_steps(study, raw, held, causes.faults, seed, holdout)
+    cells = [study.geometric]
+    terms: list[Term] = []
+    for effect in causes.effects:
+        terms += effect.terms
+        cells.append(study.cell(study.data, terms))
+        label = f"+ {effect.term.effect} {effect.term.place}"
+        steps.append(step_of(label, cells[-1], study.data, held))
+    noise = causes.choice.noise
+    floor, source = noise_floor(study.rows, noise, sound, cells[-1], steps[-1].train)
+    closed, interval = closed_share(error, cells[-1].error(held), floor, seed)
+    return Gap(tuple(steps), tuple(cells), floor, source, closed, interval)
 
-    Also the cells from geometry on, and the geometric errors of the held-out poses (k, m, 3) [m].
+
+def step_of(name: str, cell: Cell, train: Measurements, held: Measurements) -> Step:
+    """A rung: the accuracy of a cell."""
+    return Step(name, accuracy(cell.error(train)), accuracy(cell.error(held)))
+
+
+def geometric_steps(
+    study: Study,
+    raw: Measurements,
+    held: Measurements,
+    faults: Sequence[Fault],
+    seed: int,
+    holdout: float,
+) -> tuple[list[Step], Array]:
+    """The rungs up to geometry, and the geometric errors of the held-out poses (k, m, 3) [m].
+
     Faults in the data come first: what they do to a fit and to its judgement.
     """
-    steps, train = [], study.data
-    real = [fault for fault in faults if fault.effect != "readback"]
-    nominal, geometric = study.nominal, study.geometric
-    error = geometric.error(held)
-    if real:
-        first, rest, _ = split(raw, holdout, seed)
-        fit = fit_cell(robot, first, SUM, silent)
-        wrong = Cell.of(robot, fit.state, raw.target_names)
-        start = Cell.of(robot, fit.nominal, raw.target_names)
-        steps.append(Step("nominal", accuracy(start.error(first)), accuracy(start.error(rest))))
-        steps.append(Step("geometric", accuracy(wrong.error(first)), accuracy(wrong.error(rest))))
-        error = wrong.error(rest)
-        names = " and ".join(dict.fromkeys(fault.effect for fault in real))
-        name = f"without {names}"
-    else:
-        steps.append(Step("nominal", accuracy(nominal.error(train)), accuracy(nominal.error(held))))
-        name = "geometric"
-    steps.append(Step(name, accuracy(geometric.error(train)), accuracy(geometric.error(held))))
-    cells = [geometric]
-    terms: list[Term] = []
-    for found in effects:
-        terms += found.terms
-        cell = study.cell(train, terms)
-        label = f"+ {found.term.effect} {found.term.place}"
-        steps.append(Step(label, accuracy(cell.error(train)), accuracy(cell.error(held))))
-        cells.append(cell)
-    return tuple(steps), cells, error
+    train, geometric = study.data, study.geometric
+    mended_faults = dict.fromkeys(f.effect for f in faults if f.effect != "readback")
+    if not mended_faults:
+        nominal = step_of("nominal", study.nominal, train, held)
+        return [nominal, step_of("geometric", geometric, train, held)], geometric.error(held)
+    first, rest, _ = split(raw, holdout, seed)
+    fit = fit_cell(study.robot, first, SUM, silent)
+    start, wrong = (
+        Cell.of(study.robot, state, raw.target_names) for state in (fit.nominal, fit.state)
+    )
+    steps = [
+        step_of("nominal", start, first, rest),
+        step_of("geometric", wrong, first, rest),
+        step_of(f"without {' and '.join(mended_faults)}", geometric, train, held),
+    ]
+    return steps, wrong.error(rest)
 
 
 def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float) -> list[Finding]:

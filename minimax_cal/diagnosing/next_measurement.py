@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.evidence.alternatives import ENOUGH
-from minimax_cal.evidence.noise import RANK, Noise, Rows, rows_of
+from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
@@ -373,17 +373,6 @@ def stacked(parts: Sequence[Fields], poses: int) -> Fields:
         np.concatenate(still),
         np.concatenate([p.ridge for p in parts]),
     )
-
-
-def identified(gram: Array) -> Array:
-    """(p, r) combinations that turn a Gram matrix (p, p) into 1, as `noise.orthonormal`."""
-    norm = np.sqrt(np.diag(gram))
-    used = norm > 0.0
-    values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(norm[used], norm[used]))
-    kept = values > RANK**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
-    out = np.zeros((len(gram), int(kept.sum())))
-    out[used] = vectors[:, kept] / np.sqrt(values[kept]) / norm[used][:, None]
-    return out
 
 
 def left(gram: Array, fitted: int) -> Array:

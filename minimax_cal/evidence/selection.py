@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from minimax_cal.evidence.noise import Noise, Rows, restricted
-from minimax_cal.evidence.periodogram import lines
+from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -406,7 +406,7 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
     tables: dict[tuple[int, ...], Bench] = {}
     for _ in range(most):
         if ripple:
-            found = lines(lib.scene, lib.rows, noise, known_columns(lib, fits))
+            found = strongest_lines(lib.scene, lib.rows, noise, known_columns(lib, fits))
             lib, extra = lib.with_terms(found)
             lib = replace(lib, candidates=(*plain(lib), *extra))
         table = bench(lib, [one.candidate for one in fits], fits)

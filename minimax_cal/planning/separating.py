@@ -17,7 +17,7 @@ import numpy as np
 
 from minimax_cal.diagnosing import next_measurement
 from minimax_cal.diagnosing.next_measurement import PREPARE, Site
-from minimax_cal.evidence.noise import linearised, restricted
+from minimax_cal.evidence.noise import identified, linearised, restricted
 from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
@@ -184,7 +184,7 @@ def contest(asked: Question, q: Array, seen: Array, via: Array) -> Contest:
 def menu_of(rows: Array, prior: Array, old: slice, targets: int) -> Menu:
     """Rows (N, d) in a basis in which what imitates is told to the same accuracy by everything."""
     whole = rows.T @ rows + prior
-    span = next_measurement.identified(whole[:-1, :-1])
+    span = identified(whole[:-1, :-1])
     turn = np.zeros((len(whole), span.shape[1] + 1))
     turn[:-1, :-1], turn[-1, -1] = span, 1.0
     turned = rows @ turn
@@ -198,7 +198,7 @@ def alone(rows: Array, prior: Array, free: int) -> float:
     """lambda of the last column over all rows, only the first `free` columns imitating it."""
     kept = [*range(free), rows.shape[1] - 1]
     gram = (rows.T @ rows + prior)[np.ix_(kept, kept)]
-    span = next_measurement.identified(gram[:-1, :-1])
+    span = identified(gram[:-1, :-1])
     across = span.T @ gram[:-1, -1]
     return float(gram[-1, -1] - across @ across)
 

@@ -6,7 +6,6 @@ scatter between revisits and the static rest apart; a kernel test tells whether 
 """
 
 from minimax_cal.diagnosing.where.answer import Where, triage_table
-from minimax_cal.diagnosing.where.curves import Maps, maps
 from minimax_cal.diagnosing.where.gaps import (
     CANNOT_TELL,
     JointGap,
@@ -23,7 +22,6 @@ from minimax_cal.diagnosing.where.spread import noise_of
 __all__ = [
     "CANNOT_TELL",
     "JointGap",
-    "Maps",
     "Part",
     "Region",
     "TargetGap",
@@ -31,7 +29,6 @@ __all__ = [
     "Triage",
     "Where",
     "joint_equivalent",
-    "maps",
     "noise_of",
     "triage_table",
     "where",

@@ -38,7 +38,6 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
             np.zeros(0, dtype=int),
             (Amount("u95", seen, np.nan, "m"), Amount("declared", declared, np.nan, "m")),
             f"column u95_mm says {1e3 * declared:.3g} mm, {by} say {1e3 * seen:.3g} mm",
-            notice=True,
         ),
     )
 

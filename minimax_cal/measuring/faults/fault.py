@@ -30,7 +30,6 @@ class Fault:
     rows: (r,) rows of the data; of a shift all rows after it, as visited.
     targets: outliers (r,) the target of each row; swapped rows (r, k) in whose columns each
     target stands; shift: which nest it can be; else of length 0.
-    notice: whether the data may be used as they are.
     """
 
     effect: str
@@ -39,7 +38,6 @@ class Fault:
     targets: Array
     parameters: tuple[Amount, ...]
     text: str
-    notice: bool = False
 
 
 def listed(names: list[str], most: int = 8) -> str:

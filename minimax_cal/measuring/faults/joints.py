@@ -97,7 +97,6 @@ def unsettled(data: Measurements) -> tuple[Fault, ...]:
                 Amount("explained", found.explained, np.nan, ""),
             ),
             says,
-            notice=middle >= 0.0,
         ),
     )
 

@@ -96,6 +96,5 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
             "the whole robot stands elsewhere from session to session (about "
             f"{1e3 * jump:.3g} mm): was the instrument or the base moved, or is the workspace "
             "another one?",
-            notice=True,
         ),
     )
