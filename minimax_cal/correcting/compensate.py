@@ -210,15 +210,7 @@ def compensate(
     calibration's session, 0 to 1, that effects of time are taken at.  Raises CalibrationError for
     wrong input.
     """
-    if frame not in FRAMES:
-        raise OptionError(f"no frame {frame!r}; choose {', '.join(FRAMES)}")
-    for name, value in (("tolerance", tolerance), ("largest change", most_change)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise OptionError(f"{name} {value:g}: must be positive and finite")
-    if lever <= 0.0 or np.isinf(lever):
-        raise OptionError(f"lever {lever:g} m: must be positive and finite")
-    if not 0.0 <= clock <= 1.0:
-        raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
+    check_choices(frame, tolerance, most_change, lever, clock)
     cell, robots, drawn = cells_of(fit)
     if nominal is not None and not any(same(nominal, robot) for robot in robots):
         robots, drawn = (nominal,), ()
@@ -228,13 +220,7 @@ def compensate(
     arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
     base, tool, said = placed(cell, arm, robots[0], drawn, frame)
     goal = base @ robots[0].pose(data.q) @ tool
-    if np.isnan(lever):
-        own = (
-            rms(np.linalg.norm(cell.target_positions, axis=1))
-            if len(cell.target_positions)
-            else 0.0
-        )
-        lever = own if own > LEAST_LEVER else USUAL_LEVER
+    lever = lever_of(cell) if np.isnan(lever) else lever
     reach = Reach(arm, data, goal, lever, tolerance, most_change)
     q, outcome = reach.best()
     distance, angle = reach.error(q)
@@ -253,6 +239,28 @@ def compensate(
         frame=frame,
         notices=(*data.notices, *said, *remarks(cell, arm, data)),
     )
+
+
+def check_choices(
+    frame: str, tolerance: float, most_change: float, lever: float, clock: float
+) -> None:
+    """Raise OptionError for choices that `compensate` does not have."""
+    if frame not in FRAMES:
+        raise OptionError(f"no frame {frame!r}; choose {', '.join(FRAMES)}")
+    for name, value in (("tolerance", tolerance), ("largest change", most_change)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise OptionError(f"{name} {value:g}: must be positive and finite")
+    if lever <= 0.0 or np.isinf(lever):
+        raise OptionError(f"lever {lever:g} m: must be positive and finite")
+    if not 0.0 <= clock <= 1.0:
+        raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
+
+
+def lever_of(cell: Cell) -> float:
+    """What a radian counts as with the targets of a cell [m]."""
+    away = np.linalg.norm(cell.target_positions, axis=1)
+    own = rms(away) if len(away) else 0.0
+    return own if own > LEAST_LEVER else USUAL_LEVER
 
 
 def cells_of(
@@ -472,13 +480,7 @@ def bent(arm: Cell, data: Measurements) -> tuple[Array, Array]:
     if not arm.effects.terms:
         return turn, still_there
     scene = arm.scene(data)
-    shift = np.zeros(scene.points.shape)
-    for term, value in zip(arm.effects.terms, arm.effects.values, strict=True):
-        columns = term.columns(scene)
-        if columns.turn.size:
-            turn += np.einsum("d,dnm->mn", value, columns.turn)
-        if columns.shift.size:
-            shift += np.einsum("d,dkcm->kcm", value, columns.shift)
+    turn, shift = arm.effects.turn(scene), arm.effects.shift(scene)
     if not shift.any():
         return turn, still_there
     mdh, prismatic = arm.robot.mdh, arm.robot.prismatic
