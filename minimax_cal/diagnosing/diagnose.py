@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of, structure
-from minimax_cal.diagnosing.next_measurement import Site, separate_with
+from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.where import Where, where
@@ -240,8 +240,7 @@ def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Faul
         return data, ()
     lines = ", ".join(str(data.line[row]) for row in rows[:8])
     text = f"{data.source}: rows hold each other's points: lines {lines}"
-    none = np.zeros(0, dtype=int)
-    fault = Fault("swapped_rows", "all", data.line[rows], none, (), text)
+    fault = Fault("swapped_rows", "all", text, data.line[rows])
     return put_right(data, rows, source), (fault,)
 
 
@@ -360,7 +359,7 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
         others = [(f.candidate.term, f.value) for f in choice.fits if f is not one]
         for i in unclear:
             rival = found[i][0].candidate.term
-            advice[i] = separate_with(site, one.candidate.term, one.value, rival, others)
+            advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
     columns = one.candidate.term.columns(table.library.scene)
     size, _ = table.setting(one).likeness(one, one.candidate)
     return Finding(

@@ -50,6 +50,19 @@ class Advice:
 
 
 @dataclass(frozen=True, eq=False)
+class Pair:
+    """An effect and the rival that data confuse with it.
+
+    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
+    """
+
+    one: Term
+    value: Array
+    other: Term
+    known: Sequence[tuple[Term, Array]] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """The poses at hand and all that are proposed, one after another.
 
@@ -394,22 +407,13 @@ def power_of(gram: Array) -> float:
     return float(max(gram[0, 0] - across @ inverse @ across, 0.0))
 
 
-def powers(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> dict[tuple[str, int], float]:
-    """Power to tell an effect from another: now (`old`), and with each proposal that concerns them.
-
-    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
-    """
-    mine, _, _ = fields(site, one)
-    moved, foot = (np.tensordot(value, part, 1)[None] for part in (mine.points, mine.foot))
+def powers(site: Site, pair: Pair) -> dict[tuple[str, int], float]:
+    """Power to tell the two apart: now (`old`), and with each proposal that concerns them."""
+    mine, _, _ = fields(site, pair.one)
+    moved, foot = (np.tensordot(pair.value, part, 1)[None] for part in (mine.points, mine.foot))
     found = Fields(moved, foot, np.zeros(1))
-    rival = list(fields(site, other)[:2])
-    fitted = beside(site, known)
+    rival = list(fields(site, pair.other)[:2])
+    fitted = beside(site, pair.known)
     count = sum(len(part.ridge) for part in fitted)
     everything = stacked([*fitted, found, *rival], site.plan.at["foot"][1])
     p = site.geometry.shape[1]
@@ -456,18 +460,9 @@ def concerning(site: Site, everything: Fields, known: int) -> list[str]:
     return found
 
 
-def separate(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> tuple[Advice, ...]:
-    """Further measurements that may tell an effect from a rival, the cheapest first.
-
-    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
-    """
-    found = powers(site, one, value, other, known)
+def separate(site: Site, pair: Pair) -> tuple[Advice, ...]:
+    """Further measurements that may tell an effect from a rival, the cheapest first."""
+    found = powers(site, pair)
     advices = [
         Advice(words(site, kind, count), PREPARE[kind] + MINUTE * count, power)
         for (kind, count), power in found.items()
@@ -476,20 +471,14 @@ def separate(
     return tuple(sorted(advices, key=lambda advice: advice.minutes))
 
 
-def separate_with(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> str:
+def separate_with(site: Site, pair: Pair) -> str:
     """The cheapest measurement that has enough power; else the strongest, and what it lacks."""
-    advices = separate(site, one, value, other, known)
+    advices = separate(site, pair)
     for advice in advices:
         if advice.power >= ENOUGH:
             return advice.text
     best = max(advices, key=lambda advice: advice.power)
-    if one.effect == other.effect and best.power < NOTHING:
+    if pair.one.effect == pair.other.effect and best.power < NOTHING:
         return "no measurement can: one includes the other; more poses show what it has besides"
     return f"{best.text}; that raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
 

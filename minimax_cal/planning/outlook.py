@@ -88,8 +88,8 @@ def separated(asked: Question, contest: Contest, stops: Visits, seen: Array) -> 
     if contest.alike or max(planned, everything) < ENOUGH:
         other = separating.otherwise(asked)
     return Separation(
-        asked.one.label,
-        asked.other.label,
+        asked.pair.one.label,
+        asked.pair.other.label,
         contest.now,
         planned,
         everything,

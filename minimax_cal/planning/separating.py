@@ -16,7 +16,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from minimax_cal.diagnosing import next_measurement
-from minimax_cal.diagnosing.next_measurement import PREPARE, Site
+from minimax_cal.diagnosing.next_measurement import PREPARE, Pair, Site
 from minimax_cal.evidence.noise import identified, linearised, restricted
 from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting.calibrate import calibrate
@@ -26,7 +26,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term, fields_of, parse
+from minimax_cal.modelling.effects.table import fields_of, parse
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
@@ -41,17 +41,10 @@ FAINT = 1e-9  # information about anything beside the effect that is there in an
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Two effects that data confuse, and what else was fitted.
-
-    one: the effect in question, value: (d,) as fitted.  other: its rival.
-    known: further effects with their values.
-    """
+    """Two effects that data confuse, and the fitted cell that shows them."""
 
     site: Site
-    one: Term
-    value: Array
-    other: Term
-    known: tuple[tuple[Term, Array], ...]
+    pair: Pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +92,7 @@ def question(
     if not np.any(value):
         raise OptionError(f"--separate: the data show no {one.label}; name another")
     known = tuple(zip(fitted.terms[:-1], fitted.values[:-1], strict=True))
-    return Question(Site(scene, model, state, noise, seed), one, value, other, known)
+    return Question(Site(scene, model, state, noise, seed), Pair(one, value, other, known))
 
 
 def further(scene: Scene, q: Array) -> Measurements:
@@ -167,10 +160,10 @@ class Contest:
 def contest(asked: Question, q: Array, seen: Array, via: Array) -> Contest:
     """What the stops (c, n) of a way would tell.  seen: (c, k).  via: as `with_poses`."""
     site = with_poses(asked.site, q, seen, via)
-    mine, _, _ = next_measurement.fields(site, asked.one)
-    found = np.tensordot(asked.value, mine.points, 1)[None]
-    beside = next_measurement.beside(site, asked.known)
-    rival = list(next_measurement.fields(site, asked.other)[:2])
+    mine, _, _ = next_measurement.fields(site, asked.pair.one)
+    found = np.tensordot(asked.pair.value, mine.points, 1)[None]
+    beside = next_measurement.beside(site, asked.pair.known)
+    rival = list(next_measurement.fields(site, asked.pair.other)[:2])
     parts = [part.points for part in (*beside, *rival)]
     ridge = np.concatenate([part.ridge for part in (*beside, *rival)])
     columns = site.turned.of(np.concatenate([*parts, found]))
@@ -205,5 +198,4 @@ def alone(rows: Array, prior: Array, free: int) -> float:
 
 def otherwise(asked: Question) -> str:
     """What else would tell them apart, by `separate`: load, sides, time, reflectors on the foot."""
-    site, one, value = asked.site, asked.one, asked.value
-    return next_measurement.separate_with(site, one, value, asked.other, asked.known)
+    return next_measurement.separate_with(asked.site, asked.pair)

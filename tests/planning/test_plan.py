@@ -19,6 +19,7 @@ from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity, random_poses
@@ -573,7 +574,7 @@ def test_power_is_what_separate_says(
 ) -> None:
     """Its own proposal of more poses, given to us as candidates that are all measured."""
     one = asked(*pair)
-    told = next_measurement.powers(one.site, one.one, one.value, one.other)
+    told = next_measurement.powers(one.site, one.pair)
     for count in (10, 80):
         rows = one.site.plan.rows("more", count)
         seen = one.site.plan.weight[:, rows].T > 0.0
@@ -618,9 +619,9 @@ def test_effects_that_a_fit_holds_as_a_whole_are_not_asked_for_in_part(
     asked = separating.question(
         robot, narrow, fit.cell, ("joint_compliance:all", "link_bending:L2"), 0
     )
-    assert asked.known == ()
+    assert asked.pair.known == ()
     asked = separating.question(robot, narrow, fit.cell, GAIN, 0)
-    assert [term.label for term, _ in asked.known] == ["joint_compliance:all"]
+    assert [term.label for term, _ in asked.pair.known] == ["joint_compliance:all"]
 
 
 def test_revisits_from_the_other_side_show_play(
@@ -628,9 +629,8 @@ def test_revisits_from_the_other_side_show_play(
 ) -> None:
     rng = np.random.default_rng(1)
     one = asked(*GAIN)
-    played = dataclasses.replace(
-        one, one=separating.Term("backlash", "J2"), value=np.array([3e-5]), known=()
-    )
+    pair = next_measurement.Pair(Term("backlash", "J2"), np.array([3e-5]), one.pair.other)
+    played = dataclasses.replace(one, pair=pair)
     q = random_poses(robot, 12, rng)
     seen = np.ones((12, 2), dtype=bool)
     far = np.full(6, 4.0)

@@ -131,16 +131,16 @@ def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fa
     own = np.flatnonzero(apart.of(first) & np.isfinite(step.sigma))
     size = in_plane(apart, own, first, step.change[own])
     rows = order[step.at :]
-    amounts = [Amount("size", size, float(step.sigma[own].max()), "m")]
+    amounts = [Amount("size", size, "m", float(step.sigma[own].max()))]
     for pair in own:
         a, b = (data.target_names[i] for i in apart.pairs[pair])
-        amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), float(step.sigma[pair]), "m"))
+        amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), "m", float(step.sigma[pair])))
     place = " or ".join(data.target_names[i] for i in step.targets)
     text = (
         f"{place} moved by {1e3 * size:.3g} mm or more before line {data.line[rows[0]]} "
         f"(visit {step.at + 1} of {len(order)})"
     )
-    return Fault("target_shift", place, rows, step.targets, tuple(amounts), text)
+    return Fault("target_shift", place, text, rows, step.targets, tuple(amounts))
 
 
 def in_plane(apart: Between, own: Array, target: int, change: Array) -> float:
