@@ -5,7 +5,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.diagnose import Study, chosen, resemblance, studied
+from minimax_cal.diagnosing.causes import chosen
+from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.periodogram import strongest_lines
