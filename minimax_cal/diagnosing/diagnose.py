@@ -122,13 +122,11 @@ def examined(
 def located(study: Study) -> Where:
     """Where the geometric errors of the training poses lie."""
     state = study.fit.state
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = state.rotation, state.origin
     return where(
         study.data,
         study.model.error(state),
         study.scene.jacobian,
-        base,
+        study.geometric.base,
         float("nan"),
         fitted=study.model.jacobian(state)[..., study.fit.identification.active],
         up=study.robot.up,

@@ -10,7 +10,7 @@ unknown (c-optimal); for two linear models that is the T-optimal design [Atkinso
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -30,7 +30,6 @@ from minimax_cal.modelling.effects.table import fields_of, parse
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
 from minimax_cal.planning.designs.criteria import Trace, size_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.robots.robot import Robot
@@ -78,8 +77,7 @@ def question(
                 )
     data = with_history(data)
     fit = calibrate(robot, data, "sum", holdout=0.0, effects=(*beside, pair[0]))
-    base = fit.cell.base
-    state = State(fit.robot.mdh, base[:3, :3], base[:3, 3], fit.cell.target_positions)
+    state = replace(fit.cell.state, effects=np.zeros(0))
     model = model_of(robot, data)
     scene = scene_of(robot, data, model, state)
     rows = linearised(model, state, scene.jacobian)
