@@ -39,7 +39,7 @@ from minimax_cal.planning.candidates import Poses, candidates, free_poses
 from minimax_cal.planning.designs.criteria import Largest, Trace, size_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import best_design, first_design, worth
-from minimax_cal.planning.options import PlanOptions, wishes_of
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.outlook import sigmas
 from minimax_cal.planning.plan import refined
 from minimax_cal.planning.prospect import Instrument, prospect, with_effects
@@ -128,8 +128,8 @@ def task_for(job: Job) -> tuple[Task, Poses]:
         candidates=job.candidates,
         seed=job.seed,
     )
-    ground = ground_of(robot, "", "", wishes_of(options))
-    room, sight, _ = surroundings(ground.cell, wishes_of(options))
+    ground = ground_of(robot, "", "", options)
+    room, sight, _ = surroundings(ground.cell, options)
     found = candidates(room, sight, job.candidates, job.seed)
     return task_of(robot, ground, room, sight, found, options), found
 

@@ -23,7 +23,7 @@ import click
 import numpy as np
 
 import minimax_cal as mc
-from experiments import sweep
+from experiments import cones, sweep
 from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import fitted
 from experiments.sweep import Study, study_options
@@ -35,8 +35,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers import cones, minimax
-from minimax_cal.solvers.cones import Rows
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.dual_bound import Rows
 from qp_backends import solve as solve_qp
 
 if TYPE_CHECKING:

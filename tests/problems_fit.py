@@ -4,7 +4,7 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, make
-from minimax_cal.diagnosing.diagnose import Study, studied
+from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell

@@ -69,7 +69,7 @@ class Leftover:
     errors: tuple[Array, ...]
     law: tuple[Array, ...]
     points: Array
-    term: tuple[Term, ...]
+    term: Term | None
 
     @staticmethod
     def of(
@@ -81,8 +81,8 @@ class Leftover:
         cells = (first, last) if last.effects.terms else (first,)
         axes, origin = first.base[:3, :3], first.base[:3, 3]
         known = {term.label for term in last.effects.terms}
-        term = tuple(term for term in found if term.label in known)[:1]
-        law = tuple(replace(last, effects=without(last.effects, one)) for one in term)
+        term = next((term for term in found if term.label in known), None)
+        law = [replace(last, effects=without(last.effects, term))] if term else []
         return Leftover(
             data=data,
             held=held,
@@ -125,13 +125,13 @@ def guilty(left: Leftover, turn: list[Array]) -> int:
 
     Without an effect, the one that moves the targets most.
     """
-    place = left.term[0].place if left.term else ""
+    place = left.term.place if left.term else ""
     if place[:1] == "J":
         return int(place[1:]) - 1
     lever = np.sqrt(np.nanmean((left.scene.jacobian**2).sum(axis=2), axis=(1, 2)))
     fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
     size = fell * lever**2
-    effect = left.term[0].effect if left.term else ""
+    effect = left.term.effect if left.term else ""
     if effect in BY_WEIGHT:
         torque = left.scene.gravity
         size = np.where(np.ptp(torque, axis=1) > FLAT * np.abs(torque).max(), size, -np.inf)
@@ -210,19 +210,17 @@ def motion_of(left: Leftover, term: Term) -> Array:
 
 def residual_curve(left: Leftover) -> Curve:
     """The errors as turns of the guilty joint, against what its effect depends on."""
-    if left.term and left.term[0].effect in ("target_offset", *BY_TIME):
-        return along_motion(left, left.term[0])
+    if left.term and left.term.effect in ("target_offset", *BY_TIME):
+        return along_motion(left, left.term)
     turn = turns(left)
     joint = guilty(left, turn)
-    xlabel, x = (
-        against(left.scene, left.term[0], joint) if left.term else value_of(left.scene, joint)
-    )
+    xlabel, x = against(left.scene, left.term, joint) if left.term else value_of(left.scene, joint)
     unit = "mm" if left.scene.robot.prismatic[joint] else "mrad"
     what = "travel" if unit == "mm" else "turn"
     title = f"errors as a {what} of joint {joint + 1}"
     if left.term:
-        title += f", for {left.term[0].effect} {left.term[0].place}"
-    if left.term and left.term[0].effect in LINEAR:  # a constant turn is geometry: leave it out
+        title += f", for {left.term.effect} {left.term.place}"
+    if left.term and left.term.effect in LINEAR:  # a constant turn is geometry: leave it out
         turn[-1] = turn[-1] - turn[-1].mean(axis=0)
     return Curve(
         title,

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.evidence.alternatives import ENOUGH
-from minimax_cal.evidence.noise import RANK, Noise, Rows, rows_of
+from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
@@ -47,6 +47,19 @@ class Advice:
     text: str
     minutes: float
     power: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """An effect and the rival that data confuse with it.
+
+    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
+    """
+
+    one: Term
+    value: Array
+    other: Term
+    known: Sequence[tuple[Term, Array]] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,13 +281,20 @@ def more(scene: Scene, like: Measurements, rng: np.random.Generator) -> Measurem
     off = np.maximum(floor - robot.up @ flange, 0.0) + np.abs(
         away - np.clip(away, seen.min(), seen.max())
     )
-    q = q[np.argsort(off, kind="stable")[:count]]
+    return visited_after(scene, like, q[np.argsort(off, kind="stable")[:count]])
+
+
+def visited_after(scene: Scene, like: Measurements, q: Array) -> Measurements:
+    """Poses (m, n) measured one after another once the data at hand are.
+
+    like: m rows with the columns that the way there does not tell.
+    """
     last = scene.data.q[int(np.argmax(scene.column("clock")))]
     move = np.diff(q, axis=0, prepend=last[None])
     history = {f"move{j + 1}": move[:, j] for j in range(scene.joints)}
     history |= {f"approach{j + 1}": np.sign(move[:, j]) for j in range(scene.joints)}
-    clock = 1.0 + (np.arange(count) + 1.0) / scene.poses
-    moved = replace(then(like, **history, clock=clock, followed=np.ones(count)), q=q)
+    clock = 1.0 + (np.arange(len(q)) + 1.0) / scene.poses
+    moved = replace(then(like, **history, clock=clock, followed=np.ones(len(q))), q=q)
     return then(moved, **predicted(scene, moved))
 
 
@@ -368,17 +388,6 @@ def stacked(parts: Sequence[Fields], poses: int) -> Fields:
     )
 
 
-def identified(gram: Array) -> Array:
-    """(p, r) combinations that turn a Gram matrix (p, p) into 1, as `noise.orthonormal`."""
-    norm = np.sqrt(np.diag(gram))
-    used = norm > 0.0
-    values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(norm[used], norm[used]))
-    kept = values > RANK**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
-    out = np.zeros((len(gram), int(kept.sum())))
-    out[used] = vectors[:, kept] / np.sqrt(values[kept]) / norm[used][:, None]
-    return out
-
-
 def left(gram: Array, fitted: int) -> Array:
     """A Gram matrix with its first columns projected out."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -398,22 +407,13 @@ def power_of(gram: Array) -> float:
     return float(max(gram[0, 0] - across @ inverse @ across, 0.0))
 
 
-def powers(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> dict[tuple[str, int], float]:
-    """Power to tell an effect from another: now (`old`), and with each proposal that concerns them.
-
-    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
-    """
-    mine, _, _ = fields(site, one)
-    moved, foot = (np.tensordot(value, part, 1)[None] for part in (mine.points, mine.foot))
+def powers(site: Site, pair: Pair) -> dict[tuple[str, int], float]:
+    """Power to tell the two apart: now (`old`), and with each proposal that concerns them."""
+    mine, _, _ = fields(site, pair.one)
+    moved, foot = (np.tensordot(pair.value, part, 1)[None] for part in (mine.points, mine.foot))
     found = Fields(moved, foot, np.zeros(1))
-    rival = list(fields(site, other)[:2])
-    fitted = beside(site, known)
+    rival = list(fields(site, pair.other)[:2])
+    fitted = beside(site, pair.known)
     count = sum(len(part.ridge) for part in fitted)
     everything = stacked([*fitted, found, *rival], site.plan.at["foot"][1])
     p = site.geometry.shape[1]
@@ -460,18 +460,9 @@ def concerning(site: Site, everything: Fields, known: int) -> list[str]:
     return found
 
 
-def separate(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> tuple[Advice, ...]:
-    """Further measurements that may tell an effect from a rival, the cheapest first.
-
-    value: (d,) what was fitted of the one.  known: other effects that were found, with values.
-    """
-    found = powers(site, one, value, other, known)
+def separate(site: Site, pair: Pair) -> tuple[Advice, ...]:
+    """Further measurements that may tell an effect from a rival, the cheapest first."""
+    found = powers(site, pair)
     advices = [
         Advice(words(site, kind, count), PREPARE[kind] + MINUTE * count, power)
         for (kind, count), power in found.items()
@@ -480,20 +471,14 @@ def separate(
     return tuple(sorted(advices, key=lambda advice: advice.minutes))
 
 
-def separate_with(
-    site: Site,
-    one: Term,
-    value: Array,
-    other: Term,
-    known: Sequence[tuple[Term, Array]] = (),
-) -> str:
+def separate_with(site: Site, pair: Pair) -> str:
     """The cheapest measurement that has enough power; else the strongest, and what it lacks."""
-    advices = separate(site, one, value, other, known)
+    advices = separate(site, pair)
     for advice in advices:
         if advice.power >= ENOUGH:
             return advice.text
     best = max(advices, key=lambda advice: advice.power)
-    if one.effect == other.effect and best.power < NOTHING:
+    if pair.one.effect == pair.other.effect and best.power < NOTHING:
         return "no measurement can: one includes the other; more poses show what it has besides"
     return f"{best.text}; that raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
 

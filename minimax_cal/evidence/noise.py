@@ -81,14 +81,28 @@ def linearised(model: Model, state: State, joint_jacobian: Array) -> Rows:
     return rows_of(error, jacobian, joint_jacobian, model.weight)
 
 
-def orthonormal(matrix: Array, rank: float = RANK) -> Array:
+def orthonormal(matrix: Array) -> Array:
     """Orthonormal columns with the span of a matrix (N, p) whose columns are first scaled."""
     norm = np.linalg.norm(matrix, axis=0)
     scaled = matrix[:, norm > 0] / norm[norm > 0]
-    values, vectors = np.linalg.eigh(scaled.T @ scaled)
-    kept = values > rank**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
-    rough = scaled @ (vectors[:, kept] / np.sqrt(values[kept]))
-    return np.asarray(np.linalg.qr(rough)[0])
+    return np.asarray(np.linalg.qr(scaled @ told_apart(scaled.T @ scaled))[0])
+
+
+def identified(gram: Array) -> Array:
+    """(p, r) combinations of parameters that turn a Gram matrix (p, p) into 1."""
+    norm = np.sqrt(np.diag(gram))
+    used = norm > 0.0
+    whole = told_apart(gram[np.ix_(used, used)] / np.outer(norm[used], norm[used]))
+    out = np.zeros((len(gram), whole.shape[1]))
+    out[used] = whole / norm[used][:, None]
+    return out
+
+
+def told_apart(gram: Array) -> Array:
+    """(p, r) combinations that turn a Gram matrix (p, p) of unit columns into 1."""
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > RANK**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
 
 @dataclass(frozen=True)

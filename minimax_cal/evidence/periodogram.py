@@ -25,7 +25,7 @@ def leftover(rows: Rows, noise: Noise, known: Array) -> Array:
     return np.asarray(weight * (rows.error - columns @ value))
 
 
-def lines(
+def strongest_lines(
     scene: Scene, rows: Rows, noise: Noise, known: Array, *, most: int = 1
 ) -> list[tuple[Term, float]]:
     """The strongest line of each joint, with the number of independent frequencies tried.

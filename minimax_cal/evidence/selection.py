@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from minimax_cal.evidence.noise import Noise, Rows, restricted
-from minimax_cal.evidence.periodogram import lines
+from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -181,15 +181,19 @@ class Setting:
         own, part = self.columns[:, index], self.part[:, index]
         return np.asarray(own.T @ own - part.T @ part)
 
+    def blocks(self, index: Array) -> Array:
+        """(c, d, d) products, projected, of c sets of columns (c, d)."""
+        own = self.columns[:, index.reshape(-1)].T.reshape(*index.shape, -1)
+        part = self.part[:, index.reshape(-1)].T.reshape(*index.shape, -1)
+        return np.asarray(own @ np.swapaxes(own, 1, 2) - part @ np.swapaxes(part, 1, 2))
+
     def solve(self, index: Array, ridge: Array) -> tuple[Array, Array, Array]:
         """Values (c, d), diagonals of the inverse (c, d), and decreases of the square (c,).
 
         index: (c, d) columns.  ridge: (c, d).
         """
-        c, d = index.shape
-        own = self.columns[:, index.reshape(-1)].T.reshape(c, d, -1)
-        part = self.part[:, index.reshape(-1)].T.reshape(c, d, -1)
-        block = own @ np.swapaxes(own, 1, 2) - part @ np.swapaxes(part, 1, 2)
+        d = index.shape[1]
+        block = self.blocks(index)
         block[:, np.arange(d), np.arange(d)] += ridge
         pull = self.pull[index]
         diagonal = np.einsum("cdd->cd", block)
@@ -221,10 +225,7 @@ class Setting:
         size = np.maximum(np.abs(np.take_along_axis(value, owner, axis=1)), 1e-30)
         ridge = np.concatenate([np.zeros(index.shape), variance / size**2], axis=1)
         value, inverse, gain = self.solve(np.concatenate([index, doubt], axis=1), ridge)
-        own = self.columns[:, doubt.reshape(-1)].T.reshape(*doubt.shape, -1)
-        part = self.part[:, doubt.reshape(-1)].T.reshape(*doubt.shape, -1)
-        loose = own @ np.swapaxes(own, 1, 2) - part @ np.swapaxes(part, 1, 2)
-        loose = loose * size[:, :, None] * size[:, None, :] / variance[..., None]
+        loose = self.blocks(doubt) * size[:, :, None] * size[:, None, :] / variance[..., None]
         volume = np.linalg.slogdet(np.eye(doubt.shape[1]) + loose)[1]
         return gain, value[:, :d], inverse[:, :d], volume
 
@@ -406,7 +407,7 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
     tables: dict[tuple[int, ...], Bench] = {}
     for _ in range(most):
         if ripple:
-            found = lines(lib.scene, lib.rows, noise, known_columns(lib, fits))
+            found = strongest_lines(lib.scene, lib.rows, noise, known_columns(lib, fits))
             lib, extra = lib.with_terms(found)
             lib = replace(lib, candidates=(*plain(lib), *extra))
         table = bench(lib, [one.candidate for one in fits], fits)

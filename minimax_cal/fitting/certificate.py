@@ -17,8 +17,7 @@ from minimax_cal.fitting.minimax_problem import MinimaxProblem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers import cones
-from minimax_cal.solvers.cones import Rows, gap_of
+from minimax_cal.solvers.dual_bound import Rows, gap_of, lower_bound, of_squares
 from minimax_cal.solvers.minimax import Kkt, Linear, Optimum, optimality
 
 RIDGE = 1e-12  # of the mean curvature, about one: directions without any stay finite
@@ -27,7 +26,7 @@ ACTIVE = 1e-6  # relative: nearer to the largest than this counts as equal to it
 
 @dataclass(frozen=True, eq=False)
 class PointCones:
-    """The problem `worst` (of points) as `solvers.cones` wants it.
+    """The problem `worst` (of points) in the norms themselves.
 
     white: (free, free) from a whitened step to one scaled as in `worst`.
     """
@@ -146,7 +145,7 @@ def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certi
     rows = PointCones.of(problem).linearise(best.x)
     model, norms, size = problem.model, rows.norms, np.sqrt(problem.size)
     same = float(norms.max()) ** 2 / best.value  # the answer's own scaling may be another
-    given = cones.of_squares(rows, best.mu, best.lam * same)
+    given = of_squares(rows, best.mu, best.lam * same)
     mu = np.linalg.norm(given.y, axis=1)
     chosen = np.flatnonzero((norms >= norms.max() * (1.0 - ACTIVE)) | (mu > ACTIVE))
     chosen = chosen[np.argsort(-mu[chosen], kind="stable")]
@@ -159,7 +158,7 @@ def certify(problem: MinimaxProblem, best: Optimum[State], line: Array) -> Certi
         distance=distance[target, pose],
         kkt=optimality(gradients(rows), mu, given.lam, problem.lower, problem.upper),
         value=float(size * norms.max()),
-        bound=float(size * cones.lower_bound(rows, problem.lower, problem.upper, given)),
+        bound=float(size * lower_bound(rows, problem.lower, problem.upper, given)),
     )
 
 

@@ -21,7 +21,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
-from minimax_cal.modelling.joint_fit import extended
+from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots import kinematics
@@ -386,26 +386,6 @@ def position_factor(
         return np.asarray(factor)
     joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
     return np.concatenate([factor, known.noise.jitter * jacobian[..., joints]], axis=-1)
-
-
-def model_at(cell: Cell, q: Array) -> tuple[Model, State]:
-    """The model of a cell at poses (m, n) where nothing was measured, and its state."""
-    data = still(np.atleast_2d(np.asarray(q, dtype=float)), cell.target_names, cell.robot)
-    names = Names(cell.robot.joints, cell.target_names)
-    m, k, nothing = data.poses, len(cell.target_names), np.zeros(names.count)
-    model = Model(
-        q=data.q * cell.robot.sign,
-        prismatic=cell.robot.prismatic,
-        y=np.zeros((k, 3, m)),
-        weight=np.ones((k, m)),
-        names=names,
-        active=np.ones(names.count, dtype=bool),
-        prior=Prior(nothing, nothing),
-    )
-    state = cell.state
-    if not cell.effects.terms:
-        return model, state
-    return extended(model, cell.robot, data, state, cell.effects.terms)
 
 
 def holding_radius(covariance: Array, level: float = 0.95) -> Array:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,17 @@ def json_text(content: object) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
+def plain(content: Any) -> Any:
+    """Data as JSON holds them: arrays are lists, null where there is no finite number."""
+    if isinstance(content, Mapping):
+        return {key: plain(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray | np.generic):
+        content = content.tolist()
+    if isinstance(content, list | tuple):
+        return [plain(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:
     """The text of a UTF-8 file, without a leading byte order mark; errors are of the kind given."""
     try:
@@ -82,13 +94,6 @@ def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationErr
 def finite(value: float) -> float | None:
     """For JSON: null where there is no finite number."""
     return value if math.isfinite(value) else None
-
-
-def plain(values: Array) -> Any:
-    """Nested lists for JSON, null where there is no number."""
-    out = values.astype(object)
-    out[~np.isfinite(values)] = None
-    return out.tolist()
 
 
 def numbers(values: Any) -> Array:

@@ -20,10 +20,10 @@ from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.fitting.options import Progress, silent, usable
 from minimax_cal.fitting.solve import QP_TOLERANCE
-from minimax_cal.fitting.uncertainty import model_at
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.solvers import minimax

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 
 
@@ -50,12 +51,15 @@ class Accuracy:
 
     def to_dict(self) -> dict[str, object]:
         """For JSON: NaN, which JSON does not know, is null."""
-        numbers = {"rms_mm": self.rms_mm, "max_mm": self.max_mm, "mean_mm": self.mean_mm}
-        return {key: None if math.isnan(value) else value for key, value in numbers.items()} | {
+        whole = {
+            "rms_mm": self.rms_mm,
+            "max_mm": self.max_mm,
+            "mean_mm": self.mean_mm,
             "poses": self.poses,
-            "sse_mm2": list(self.sse_mm2),
-            "points": list(self.counts),
+            "sse_mm2": self.sse_mm2,
+            "points": self.counts,
         }
+        return dict(plain(whole))
 
 
 def accuracy(error: Array) -> Accuracy:
@@ -69,7 +73,7 @@ def accuracy(error: Array) -> Accuracy:
     target, pose = np.unravel_index(int(np.nanargmax(distance)), distance.shape)
     found = distance[seen]
     return Accuracy(
-        rms_mm=float(np.sqrt(np.mean(found**2))),
+        rms_mm=rms(found),
         max_mm=float(found.max()),
         mean_mm=float(found.mean()),
         poses=int(seen.any(axis=0).sum()),

@@ -24,25 +24,25 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
     """
     place = np.empty(data.poses, dtype=int)
     place[visits(data)] = np.arange(1, data.poses + 1)
-    kept = {name: column for name, column in data.columns.items() if name not in TOLD}
-    return {
-        "source": data.source,
-        "line": data.line.tolist(),
-        "split": np.where(held, "holdout", "train").tolist(),
-        "visit": place.tolist(),
-        "visits_told": numbered(data),
-        "q": plain(data.q),
-        "q_units": ["m" if sliding else "rad" for sliding in data.sliding],
-        "targets": list(data.target_names),
-        "measured_mm": plain(1e3 * data.y),
-        "errors_mm": {
-            name: plain(1e3 * np.moveaxis(error, 0, 1)) for name, error in errors.items()
-        },
-        "columns": {
-            name: column.tolist() if name in LABELS else plain(column.astype(float))
-            for name, column in kept.items()
-        },
+    columns = {
+        name: column if name in LABELS else column.astype(float)
+        for name, column in data.columns.items()
+        if name not in TOLD
     }
+    whole = {
+        "source": data.source,
+        "line": data.line,
+        "split": np.where(held, "holdout", "train"),
+        "visit": place,
+        "visits_told": numbered(data),
+        "q": data.q,
+        "q_units": ["m" if sliding else "rad" for sliding in data.sliding],
+        "targets": data.target_names,
+        "measured_mm": 1e3 * data.y,
+        "errors_mm": {name: 1e3 * np.moveaxis(error, 0, 1) for name, error in errors.items()},
+        "columns": columns,
+    }
+    return dict(plain(whole))
 
 
 def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, Array]:

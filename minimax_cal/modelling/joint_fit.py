@@ -9,10 +9,11 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of
 from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 
@@ -56,6 +57,31 @@ def extended(
         prior=Prior(*(np.concatenate([part[:count], np.zeros(more)])
                       for part in (prior.mean, prior.weight))),
     ), replace(state, effects=values)  # fmt: skip
+
+
+def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
+    """The model of a cell, effects included, where nothing was measured, and its state.
+
+    poses: (m, n) joint values [rad, m], or measurements, whose columns (order, payload ...) count.
+    """
+    if not isinstance(poses, Measurements):
+        q = np.atleast_2d(np.asarray(poses, dtype=float))
+        poses = still(q, cell.target_names, cell.robot)
+    names = Names(cell.robot.joints, cell.target_names)
+    nothing = np.zeros(names.count)
+    model = Model(
+        q=poses.q * cell.robot.sign,
+        prismatic=cell.robot.prismatic,
+        y=np.zeros((len(names.target_names), 3, poses.poses)),
+        weight=np.ones((len(names.target_names), poses.poses)),
+        names=names,
+        active=np.ones(names.count, dtype=bool),
+        prior=Prior(nothing, nothing),
+    )
+    if not cell.effects.terms:
+        return model, cell.state
+    hidden = replace(poses, target_names=cell.target_names)
+    return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 
 def refitted(

@@ -316,11 +316,6 @@ class SumOfSquares:
         nothing = np.zeros((*gradient.shape[:-1], free.sum(), (~free).sum()))
         return x, *found, model.coupling_on(x, blocks) if full else nothing
 
-    def cost(self, x: State) -> Array:
-        """The sum alone: (...)."""
-        off = self.model.prior.mean - self.model.values(x)
-        return np.asarray(self.model.cost(x).sum(-1) + (self.model.prior.weight * off**2).sum(-1))
-
     def step(self, x: State, dx: Array) -> State:
         """The states moved by a step in the free parameters."""
         full = np.zeros((*dx.shape[:-1], self.model.names.count))

@@ -51,42 +51,28 @@ class State:
             effects=self.effects + more,
         )
 
+    @property
+    def geometry(self) -> tuple[Array, Array, Array, Array]:
+        """All but the effects, in the order of the fields."""
+        return self.mdh, self.rotation, self.origin, self.target_positions
+
     def take(self, rows: Array) -> State:
         """Some members of a batch."""
         some = self.effects[rows] if self.effects.ndim > 1 else self.effects
-        return State(
-            self.mdh[rows],
-            self.rotation[rows],
-            self.origin[rows],
-            self.target_positions[rows],
-            some,
-        )
+        return replace(State(*(part[rows] for part in self.geometry)), effects=some)
 
     def put(self, rows: Array, other: State) -> State:
         """The batch with some members replaced."""
-        out = replace(
-            self,
-            mdh=self.mdh.copy(),
-            rotation=self.rotation.copy(),
-            origin=self.origin.copy(),
-            target_positions=self.target_positions.copy(),
-            effects=self.effects.copy(),
-        )
-        out.mdh[rows], out.rotation[rows] = other.mdh, other.rotation
-        out.origin[rows], out.target_positions[rows] = other.origin, other.target_positions
+        out = replace(State(*map(np.copy, self.geometry)), effects=self.effects.copy())
+        for mine, new in zip(out.geometry, other.geometry, strict=True):
+            mine[rows] = new
         if self.effects.ndim > 1:
             out.effects[rows] = other.effects
         return out
 
     def batch(self) -> State:
         """A single state as a batch of one."""
-        return State(
-            self.mdh[None],
-            self.rotation[None],
-            self.origin[None],
-            self.target_positions[None],
-            self.effects[None],
-        )
+        return replace(State(*(part[None] for part in self.geometry)), effects=self.effects[None])
 
     def repeat(self, count: int) -> State:
         """A single state, count times."""

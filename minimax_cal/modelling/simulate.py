@@ -13,11 +13,10 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import torques
+from minimax_cal.robots.gravity import MASS_PER_METRE, torques
 from minimax_cal.robots.robot import Robot, load_robot
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
-MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -41,6 +42,10 @@ class Poses:
         if len(self.q) > self.drawn:
             title += f", and {len(self.q) - self.drawn} near those that told most"
         return Table(title, ("condition", "rejects alone %"), rows, ("", ".1f"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"count": len(self.q), "tested": self.tested, "rejected": self.rejected}
 
     def join(self, q: Array, seen: Array) -> Poses:
         """With further candidates."""

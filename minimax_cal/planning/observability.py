@@ -39,8 +39,3 @@ def observability(singular: Array, poses: int) -> dict[str, float]:
         "O4": least**2 / largest,
         "O5": 1.0 / float((1.0 / singular).sum()),
     }
-
-
-def singular_values(jacobian: Array) -> Array:
-    """(f,) largest first.  jacobian: (N, f), N >= f."""
-    return np.asarray(np.linalg.svd(jacobian, compute_uv=False))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.robots.robot import Robot
 
 EFFORTS = ("none", "both")  # what is done about the side a pose is approached from
@@ -54,21 +55,6 @@ class PlanOptions:
     revisit: int = 0
 
 
-@dataclass(frozen=True)
-class Wishes(PlanOptions):
-    """The options as `setting` reads them: NaN for what is not given."""
-
-    body: float = np.nan
-    noise: float = np.nan
-    per_metre: float = np.nan
-    jitter: float = np.nan
-
-
-def wishes_of(options: PlanOptions) -> Wishes:
-    """The options for `setting`."""
-    return Wishes(**{name: value for name, value in vars(options).items() if value is not None})
-
-
 def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
     """Raise OptionError for options that make no sense."""
     if not 1 <= poses <= MOST_POSES:
@@ -111,14 +97,5 @@ def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
 
 def settings_of(options: PlanOptions, poses: int) -> dict[str, object]:
     """The options for the record."""
-    out: dict[str, object] = {"poses": poses}
-    for name, value in vars(options).items():
-        if isinstance(value, float):
-            out[name] = None if np.isnan(value) else value
-        elif isinstance(value, Mapping):
-            out[name] = {str(key): list(pair) for key, pair in value.items()}
-        elif value is None or isinstance(value, str | int):
-            out[name] = value
-        else:
-            out[name] = [list(v) if not isinstance(v, str | float | int) else v for v in value]
-    return out
+    joints = {str(joint): limits for joint, limits in options.joints.items()}
+    return {"poses": poses, **plain({**vars(options), "joints": joints})}

@@ -13,7 +13,7 @@ from minimax_cal.planning.candidates import Poses, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse, sizes_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.designs.search import DRAWS, Found, quick_design
-from minimax_cal.planning.observability import INDICES, observability, singular_values
+from minimax_cal.planning.observability import INDICES, observability
 from minimax_cal.planning.promise import Growth, Separation
 from minimax_cal.planning.prospect import Prospect
 from minimax_cal.planning.route import Visits
@@ -68,7 +68,8 @@ def indices(
     rng = np.random.default_rng(seed)
 
     def of(some: Array) -> list[float]:
-        values = singular_values(ahead.jacobian(found.q[some], found.seen[some]))
+        jacobian = ahead.jacobian(found.q[some], found.seen[some])
+        values = np.linalg.svd(jacobian, compute_uv=False)
         whole = np.zeros(len(ahead.scale))  # fewer coordinates than parameters: the rest is 0
         whole[: len(values)] = values
         return list(observability(whole, len(some)).values())
@@ -88,8 +89,8 @@ def separated(asked: Question, contest: Contest, stops: Visits, seen: Array) -> 
     if contest.alike or max(planned, everything) < ENOUGH:
         other = separating.otherwise(asked)
     return Separation(
-        asked.one.label,
-        asked.other.label,
+        asked.pair.one.label,
+        asked.pair.other.label,
         contest.now,
         planned,
         everything,

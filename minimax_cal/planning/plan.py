@@ -19,7 +19,7 @@ from minimax_cal.planning.designs.criteria import Criterion, inverse
 from minimax_cal.planning.designs.exchange import Menu, exchange, polar
 from minimax_cal.planning.designs.relaxation import highest
 from minimax_cal.planning.designs.search import ROUGH, Found, best_design, first_design, worth
-from minimax_cal.planning.options import PlanOptions, check_options, settings_of, wishes_of
+from minimax_cal.planning.options import PlanOptions, check_options, settings_of
 from minimax_cal.planning.outlook import grown, indices, remarks, separated
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import shortest, travel, visits
@@ -125,9 +125,8 @@ def planned(
         raise OptionError(f"no criterion {options.criterion!r}; choose {', '.join(CRITERIA)}")
     check_options(options, poses, robot)
     progress("start")
-    wishes = wishes_of(options)
-    ground = ground_of(robot, fit, data, wishes)
-    room, sight, said = surroundings(ground.cell, wishes)
+    ground = ground_of(robot, fit, data, options)
+    room, sight, said = surroundings(ground.cell, options)
     progress("candidate poses")
     found = candidates(room, sight, options.candidates, options.seed)
     if len(found.q) < poses:

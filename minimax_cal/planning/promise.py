@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from minimax_cal.ground.files import finite
-
 
 @dataclass(frozen=True)
 class Growth:
@@ -20,6 +18,15 @@ class Growth:
     mean: tuple[float, float]
     worst: tuple[float, float]
     size: tuple[float, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, in micrometres."""
+        sigmas = {"mean_um": self.mean, "worst_um": self.worst}
+        both = {
+            name: {"planned": 1e6 * planned, "random": 1e6 * random}
+            for name, (planned, random) in sigmas.items()
+        }
+        return {"poses": self.poses, **both}
 
 
 @dataclass(frozen=True)
@@ -67,9 +74,9 @@ class Separation:
             "effect": self.one,
             "rival": self.other,
             "power": {
-                "now": finite(self.now),
-                "planned": finite(self.planned),
-                "all_candidates": finite(self.everything),
+                "now": self.now,
+                "planned": self.planned,
+                "all_candidates": self.everything,
                 "needed": self.needed,
             },
             "alike_at_every_pose": self.alike,

@@ -19,13 +19,11 @@ from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.effects.table import terms as terms_of
-from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import Model, model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.joint_fit import model_at
+from minimax_cal.modelling.model import model_of
 
 SAMPLE = 1000  # poses that tell which parameters are identifiable
 CHUNK = 2048  # poses whose Jacobian of all parameters is kept at a time
-FREEDOMS = 6  # of a rigid flange: a pose tells no more, however many targets it has
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,14 @@ class Instrument:
     noise: float = 10e-6
     per_metre: float = 2.5e-6
     jitter: float = 10e-6
+
+    def to_dict(self) -> dict[str, float]:
+        """For JSON."""
+        return {
+            "noise_um": 1e6 * self.noise,
+            "noise_um_per_m": 1e6 * self.per_metre,
+            "jitter_urad": 1e6 * self.jitter,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,20 +116,6 @@ def motions(cell: Cell, data: Measurements) -> tuple[Array, Scene]:
     return np.asarray(jacobian), cell.scene(data)
 
 
-def model_at(cell: Cell, data: Measurements) -> tuple[Model, State]:
-    """The model of a cell at some poses, effects included, and its state."""
-    robot, k = cell.robot, len(cell.target_names)
-    hidden = Measurements(
-        data.q, np.full((data.poses, k, 3), np.nan), cell.target_names, robot.prismatic, data.line,
-        data.columns,
-    )  # fmt: skip
-    state = cell.state
-    model = model_of(robot, hidden)
-    if not cell.effects.terms:
-        return model, state
-    return extended(model, robot, hidden, state, cell.effects.terms)
-
-
 def prospect(cell: Cell, instrument: Instrument, q: Array, seen: Array) -> Prospect:
     """What poses (m, n) can tell of a cell.  seen: (m, k).
 
@@ -131,17 +123,16 @@ def prospect(cell: Cell, instrument: Instrument, q: Array, seen: Array) -> Prosp
     """
     q, seen = q[:SAMPLE], seen[:SAMPLE]
     robot = cell.robot
-    model, state = model_at(cell, still(q, cell.target_names, robot))
+    model, state = model_at(cell, q)
     model = replace(model, weight=seen.T.astype(float))
     names = model.names
-    more = names.count - names.geometric
     plain = model_of(robot, still(q, cell.target_names, robot))
     order = identify.drop_order(robot, plain.names)
     found = identify.identify(
         model,
         state,
         np.concatenate([np.arange(names.geometric, names.count), order]),
-        allowed=np.ones(names.geometric + more, dtype=bool),
+        allowed=np.ones(names.count, dtype=bool),
         reference=identify.plenty_of_poses(robot, plain),
         known=np.zeros(names.count, dtype=bool),
     )

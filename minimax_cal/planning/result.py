@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import Cell
@@ -200,71 +200,43 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: sigmas of positions in micrometres."""
-        power = self.criterion == POWER
-        name = "power" if power else "sigma_um"
-        return {
+        unit = "power" if self.criterion == POWER else "sigma_um"
+        sizes = {"planned": self.size, "random": self.random, "bound": self.bound}
+        slides = self.cell.robot.prismatic
+        whole = {
             "schema": SCHEMA,
             "kind": "plan",
             "robot": self.cell.robot.name,
             "criterion": self.criterion,
             "poses": self.poses,
             "at_hand": self.at_hand,
-            "targets": list(self.cell.target_names),
-            "q": self.q.tolist(),
-            "q_units": ["m" if sliding else "rad" for sliding in self.cell.robot.prismatic],
-            "seen": self.seen.tolist(),
-            "visits": {
-                "pose": (self.visits.pose + 1).tolist(),
-                "q": self.visits.q.tolist(),
-                "via": self.visits.via.tolist(),
-                "approach": self.visits.approach.astype(int).tolist(),
-            },
-            "value": {
-                key: finite(self.shown(size))
-                for key, size in (
-                    (f"planned_{name}", self.size),
-                    (f"random_{name}", self.random),
-                    (f"bound_{name}", self.bound),
-                )
-            },
-            "efficiency_at_least": finite(self.efficiency),
-            "worth_random_poses": finite(self.equal),
-            "growth": [
-                {
-                    "poses": g.poses,
-                    "mean_um": {"planned": finite(1e6 * g.mean[0]),
-                                "random": finite(1e6 * g.mean[1])},
-                    "worst_um": {"planned": finite(1e6 * g.worst[0]),
-                                 "random": finite(1e6 * g.worst[1])},
-                }
-                for g in self.growth
-            ],
+            "targets": self.cell.target_names,
+            "q": self.q,
+            "q_units": ["m" if sliding else "rad" for sliding in slides],
+            "seen": self.seen,
+            "visits": self.visits.to_dict(),
+            "value": {f"{name}_{unit}": self.shown(size) for name, size in sizes.items()},
+            "efficiency_at_least": self.efficiency,
+            "worth_random_poses": self.equal,
+            "growth": [growth.to_dict() for growth in self.growth],
             "observability": {
-                key: {"planned": finite(one), "random": finite(other)}
-                for key, (one, other) in self.indices.items()
+                name: {"planned": planned, "random": random}
+                for name, (planned, random) in self.indices.items()
             },
             "parameters": [
-                {"name": key, "sigma": finite(float(value))}
-                for key, value in zip(self.names, self.sigma, strict=True)
+                {"name": name, "sigma": sigma}
+                for name, sigma in zip(self.names, self.sigma, strict=True)
             ],
             "separation": [separation.to_dict() for separation in self.separation],
-            "candidates": {
-                "count": len(self.candidates.q),
-                "tested": self.candidates.tested,
-                "rejected": dict(self.candidates.rejected),
-            },
-            "instrument": {
-                "place_in_base_mm": [1e3 * float(v) for v in self.place],
-                "noise_um": 1e6 * self.instrument.noise,
-                "noise_um_per_m": 1e6 * self.instrument.per_metre,
-                "jitter_urad": 1e6 * self.instrument.jitter,
-            },
+            "candidates": self.candidates.to_dict(),
+            "instrument": {"place_in_base_mm": 1e3 * self.place, **self.instrument.to_dict()},
             "travel_rad": {"ordered": self.travel[0], "as_chosen": self.travel[1]},
             "solver": self.solver,
-            "settings": dict(self.settings),
-            "notices": list(self.notices),
+            "settings": self.settings,
+            "notices": self.notices,
             "seconds": self.seconds,
-        }  # fmt: skip
+        }
+        return dict(plain(whole))
 
     def json(self) -> str:
         """`to_dict` as text."""

@@ -7,6 +7,7 @@ slide's metre counts as a turn of two radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -80,6 +81,11 @@ class Visits:
     q: Array
     via: Array
     approach: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; poses are counted from 1."""
+        approach = self.approach.astype(int)
+        return {"pose": self.pose + 1, "q": self.q, "via": self.via, "approach": approach}
 
 
 def visits(

@@ -16,8 +16,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from minimax_cal.diagnosing import next_measurement
-from minimax_cal.diagnosing.next_measurement import PREPARE, Site
-from minimax_cal.evidence.noise import linearised, restricted
+from minimax_cal.diagnosing.next_measurement import PREPARE, Pair, Site
+from minimax_cal.evidence.noise import identified, linearised, restricted
 from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
@@ -26,11 +26,10 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term, fields_of, parse
+from minimax_cal.modelling.effects.table import fields_of, parse
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
 from minimax_cal.planning.designs.criteria import Trace, size_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.robots.robot import Robot
@@ -41,17 +40,10 @@ FAINT = 1e-9  # information about anything beside the effect that is there in an
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Two effects that data confuse, and what else was fitted.
-
-    one: the effect in question, value: (d,) as fitted.  other: its rival.
-    known: further effects with their values.
-    """
+    """Two effects that data confuse, and the fitted cell that shows them."""
 
     site: Site
-    one: Term
-    value: Array
-    other: Term
-    known: tuple[tuple[Term, Array], ...]
+    pair: Pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +77,7 @@ def question(
                 )
     data = with_history(data)
     fit = calibrate(robot, data, "sum", holdout=0.0, effects=(*beside, pair[0]))
-    base = fit.cell.base
-    state = State(fit.robot.mdh, base[:3, :3], base[:3, 3], fit.cell.target_positions)
+    state = replace(fit.cell.state, effects=np.zeros(0))
     model = model_of(robot, data)
     scene = scene_of(robot, data, model, state)
     rows = linearised(model, state, scene.jacobian)
@@ -99,22 +90,14 @@ def question(
     if not np.any(value):
         raise OptionError(f"--separate: the data show no {one.label}; name another")
     known = tuple(zip(fitted.terms[:-1], fitted.values[:-1], strict=True))
-    return Question(Site(scene, model, state, noise, seed), one, value, other, known)
+    return Question(Site(scene, model, state, noise, seed), Pair(one, value, other, known))
 
 
 def further(scene: Scene, q: Array) -> Measurements:
     """Poses (m, n) measured one after another once the data at hand are."""
     last = int(np.argmax(scene.column("clock")))
     old = next_measurement.with_columns(scene.data, scene)
-    like = old.take(np.full(len(q), last))
-    move = np.diff(q, axis=0, prepend=scene.data.q[last][None])
-    history = {f"move{j + 1}": move[:, j] for j in range(scene.joints)}
-    history |= {f"approach{j + 1}": np.sign(move[:, j]) for j in range(scene.joints)}
-    clock = 1.0 + (np.arange(len(q)) + 1.0) / scene.poses
-    moved = replace(
-        next_measurement.then(like, **history, clock=clock, followed=np.ones(len(q))), q=np.array(q)
-    )
-    return next_measurement.then(moved, **next_measurement.predicted(scene, moved))
+    return next_measurement.visited_after(scene, old.take(np.full(len(q), last)), np.array(q))
 
 
 def with_poses(site: Site, q: Array, seen: Array, via: Array) -> Ahead:
@@ -175,10 +158,10 @@ class Contest:
 def contest(asked: Question, q: Array, seen: Array, via: Array) -> Contest:
     """What the stops (c, n) of a way would tell.  seen: (c, k).  via: as `with_poses`."""
     site = with_poses(asked.site, q, seen, via)
-    mine, _, _ = next_measurement.fields(site, asked.one)
-    found = np.tensordot(asked.value, mine.points, 1)[None]
-    beside = next_measurement.beside(site, asked.known)
-    rival = list(next_measurement.fields(site, asked.other)[:2])
+    mine, _, _ = next_measurement.fields(site, asked.pair.one)
+    found = np.tensordot(asked.pair.value, mine.points, 1)[None]
+    beside = next_measurement.beside(site, asked.pair.known)
+    rival = list(next_measurement.fields(site, asked.pair.other)[:2])
     parts = [part.points for part in (*beside, *rival)]
     ridge = np.concatenate([part.ridge for part in (*beside, *rival)])
     columns = site.turned.of(np.concatenate([*parts, found]))
@@ -192,7 +175,7 @@ def contest(asked: Question, q: Array, seen: Array, via: Array) -> Contest:
 def menu_of(rows: Array, prior: Array, old: slice, targets: int) -> Menu:
     """Rows (N, d) in a basis in which what imitates is told to the same accuracy by everything."""
     whole = rows.T @ rows + prior
-    span = next_measurement.identified(whole[:-1, :-1])
+    span = identified(whole[:-1, :-1])
     turn = np.zeros((len(whole), span.shape[1] + 1))
     turn[:-1, :-1], turn[-1, -1] = span, 1.0
     turned = rows @ turn
@@ -206,12 +189,11 @@ def alone(rows: Array, prior: Array, free: int) -> float:
     """lambda of the last column over all rows, only the first `free` columns imitating it."""
     kept = [*range(free), rows.shape[1] - 1]
     gram = (rows.T @ rows + prior)[np.ix_(kept, kept)]
-    span = next_measurement.identified(gram[:-1, :-1])
+    span = identified(gram[:-1, :-1])
     across = span.T @ gram[:-1, -1]
     return float(gram[-1, -1] - across @ across)
 
 
 def otherwise(asked: Question) -> str:
     """What else would tell them apart, by `separate`: load, sides, time, reflectors on the foot."""
-    site, one, value = asked.site, asked.one, asked.value
-    return next_measurement.separate_with(site, one, value, asked.other, asked.known)
+    return next_measurement.separate_with(asked.site, asked.pair)

@@ -20,7 +20,7 @@ from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.planning.candidates import limits_of
-from minimax_cal.planning.options import Wishes
+from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.prospect import Instrument, cell_ahead, front, ring
 from minimax_cal.planning.visibility import THICK, Room, Sight, normals_of
 from minimax_cal.robots.robot import Robot
@@ -43,7 +43,7 @@ def ground_of(
     robot: Robot,
     fit: Fit | Cell | str | Path,
     data: Measurements | str | Path,
-    wish: Wishes,
+    options: PlanOptions,
 ) -> Ground:
     """Cell, poses at hand and noise.  Raises CalibrationError."""
     notices: list[str] = []
@@ -67,7 +67,7 @@ def ground_of(
         cells = [calibrate(robot, own[0], "sum", holdout=0.0).cell]
         notices.append("the poses at hand were calibrated first, geometry alone: give --fit else")
     if cells:
-        if len(wish.tracker) or len(wish.spots):
+        if len(options.tracker) or len(options.spots):
             raise OptionError(
                 "the fit tells where tracker and targets are: leave --tracker and --target out"
             )
@@ -78,22 +78,22 @@ def ground_of(
                 raise OptionError(f"{one.source}: target {strange[0]} is not one of the fit's")
         if not own:
             notices.append("the fit tells no poses: none count as measured; give --data")
-        noise, text = shown_noise(cells[0], own, wish)
+        noise, text = shown_noise(cells[0], own, options)
         return Ground(cells[0], own, noise, (*notices, text))
-    cell, text = assumed(robot, wish)
+    cell, text = assumed(robot, options)
     notices += [text] if text else []
-    noise, text = shown_noise(cell, (), wish)
+    noise, text = shown_noise(cell, (), options)
     return Ground(cell, (), noise, (*notices, text))
 
 
-def assumed(robot: Robot, wish: Wishes) -> tuple[Cell, str]:
+def assumed(robot: Robot, options: PlanOptions) -> tuple[Cell, str]:
     """A nominal robot before a tracker, and a notice where nobody said where that is."""
-    spots = np.array(wish.spots, dtype=float).reshape(-1, 3)
-    spots = spots if len(spots) else ring(wish.targets)
+    spots = np.array(options.spots, dtype=float).reshape(-1, 3)
+    spots = spots if len(spots) else ring(options.targets)
     names = tuple(f"smr{i + 1}" for i in range(len(spots)))
     cell = Cell(robot, np.eye(4), names, spots)
-    if len(wish.tracker):
-        return cell_ahead(cell, np.array(wish.tracker, dtype=float)), ""
+    if len(options.tracker):
+        return cell_ahead(cell, np.array(options.tracker, dtype=float)), ""
     away = max(APART, robot.reach())
     place = front(cell, away)
     where = ", ".join(f"{1e3 * value:.0f}" for value in place)
@@ -102,10 +102,10 @@ def assumed(robot: Robot, wish: Wishes) -> tuple[Cell, str]:
 
 
 def shown_noise(
-    cell: Cell, measured: Sequence[Measurements], wish: Wishes
+    cell: Cell, measured: Sequence[Measurements], options: PlanOptions
 ) -> tuple[Instrument, str]:
     """The noise to plan with, and where it is from."""
-    given = {name: getattr(wish, name) for name in ("noise", "per_metre", "jitter")}
+    given = {name: getattr(options, name) for name in ("noise", "per_metre", "jitter")}
     told = {name: float(value) for name, value in given.items() if np.isfinite(value)}
     base, source = Instrument(), "assumed"
     if measured and not told:
@@ -135,18 +135,18 @@ def noise_of(cell: Cell, data: Measurements) -> Noise:
     return restricted(rows, rows.of(fields))
 
 
-def surroundings(cell: Cell, wish: Wishes) -> tuple[Room, Sight, tuple[str, ...]]:
+def surroundings(cell: Cell, options: PlanOptions) -> tuple[Room, Sight, tuple[str, ...]]:
     """Where the arm may go and what the instrument sees."""
     robot = cell.robot
-    lower, upper, notices = limits_of(robot, wish.joints)
-    radius = THICK * robot.reach() if np.isnan(wish.body) else wish.body
+    lower, upper, notices = limits_of(robot, options.joints)
+    radius = THICK * robot.reach() if options.body is None else options.body
     room = Room(
-        robot, cell.target_positions, normals_of(cell.target_positions, wish.normals), lower,
-        upper, radius, floor=wish.floor, whole=wish.whole,
+        robot, cell.target_positions, normals_of(cell.target_positions, options.normals), lower,
+        upper, radius, floor=options.floor, whole=options.whole,
     )  # fmt: skip
-    if len(wish.volume):
-        low, high = np.array(wish.volume, dtype=float)
+    if len(options.volume):
+        low, high = np.array(options.volume, dtype=float)
         room = replace(room, low=low, high=high)
     place = -cell.base[:3, 3] @ cell.base[:3, :3]
-    sight = Sight(place, robot.up, wish.acceptance, *wish.reach, *wish.elevation)
+    sight = Sight(place, robot.up, options.acceptance, *options.reach, *options.elevation)
     return room, sight, notices

@@ -25,7 +25,6 @@ ATTRIBUTE = re.compile(rb"""([^\s=<>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
 Edit = tuple[int, int, bytes]  # replace raw[start:end]
-# replace raw[start:end]
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,6 +87,7 @@ class Limits:
 
 
 NEAR = Limits(damping=1e-9)
+MOST_DAMPING = 1e12  # beyond it no step leads on
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,27 +132,15 @@ def solve(
         if not len(alive):
             break
         progress(iteration)
-        damp = damping[alive] if method.damped else np.zeros(len(alive))
-        short, gain = damped_step(at, damp)
-        square = np.einsum("bi,bij,bj->b", short, at.matrix, short)
-        motion = np.sqrt(np.maximum(square, 0.0) / points)
-        move = lift(problem.linear, short, at.gradient, at.gram, method)
-        trial = examine(problem, problem.step(at.x, move), method)
-        sane = np.isfinite(trial.cost) & np.isfinite(motion)
-        done = sane & (motion <= limits.step)
-        accept, ended = sane, done | ~sane
-        failure = Status.FAILED
+        trial, motion, gain = tried(problem, at, damping[alive] * method.damped, points, method)
+        accept = np.isfinite(trial.cost) & np.isfinite(motion)
+        done = accept & (motion <= limits.step)
+        ended, failure = done | ~accept, Status.FAILED
         if method.damped:
-            # below rounding of the cost a comparison says nothing: trust the model
-            tiny = gain <= 1e-13 * at.cost
-            accept = sane & ((trial.cost < at.cost) | tiny | done)
-            ratio = (at.cost - trial.cost) / np.where(gain > 0, gain, np.inf)
-            ratio = np.where(tiny | ~np.isfinite(ratio), 1.0, np.clip(ratio, 0.0, 1.0))
-            shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-            damping[alive] = np.where(accept, damp * shrink, damp * growth[alive])
-            growth[alive] = np.where(accept, 2.0, growth[alive] * 2.0)
-            ended = done | (damping[alive] > 1e12)
-            failure = Status.STALLED
+            lower, ratio = compared(at, trial, gain)
+            accept &= lower | done
+            damping[alive], growth[alive] = nielsen(damping[alive], growth[alive], accept, ratio)
+            ended, failure = done | (damping[alive] > MOST_DAMPING), Status.STALLED
         at = trial if accept.all() else at.put(np.flatnonzero(accept), trial)
         cost = cost.copy()
         cost[alive] = at.cost
@@ -166,9 +155,34 @@ def solve(
             alive, at = alive[stay], at.take(stay)
     if len(alive):
         x = x.put(alive, at.x)
-    return LeastSquares(
-        x, cost, iterations, tuple(status), np.stack(costs if trace else [*costs, cost])
-    )
+    costs = costs if trace else [*costs, cost]
+    return LeastSquares(x, cost, iterations, tuple(status), np.stack(costs))
+
+
+def tried(
+    problem: Separable[X], at: Examined[X], damping: Array, points: float, method: Method
+) -> tuple[Examined[X], Array, Array]:
+    """Iterates a step ahead, the mean motion (B,) of a point, and the decrease (B,) predicted."""
+    short, gain = damped_step(at, damping)
+    square = np.einsum("bi,bij,bj->b", short, at.matrix, short)
+    motion = np.sqrt(np.maximum(square, 0.0) / points)
+    move = lift(problem.linear, short, at.gradient, at.gram, method)
+    return examine(problem, problem.step(at.x, move), method), motion, gain
+
+
+def compared(at: Examined[X], trial: Examined[X], gain: Array) -> tuple[Array, Array]:
+    """(B,) True where a trial costs less; the decrease over the one predicted, 0 to 1."""
+    tiny = gain <= 1e-13 * at.cost  # below rounding of the cost: trust the model
+    ratio = (at.cost - trial.cost) / np.where(gain > 0, gain, np.inf)
+    ratio = np.where(tiny | ~np.isfinite(ratio), 1.0, np.clip(ratio, 0.0, 1.0))
+    return (trial.cost < at.cost) | tiny, ratio
+
+
+def nielsen(damping: Array, growth: Array, accept: Array, ratio: Array) -> tuple[Array, Array]:
+    """The next damping and its next growth, (B,) each."""
+    shrink = np.maximum(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+    next_damping = np.where(accept, damping * shrink, damping * growth)
+    return next_damping, np.where(accept, 2.0, growth * 2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,30 +204,20 @@ class Examined(Generic[X]):
     matrix: Array
     scale: Array
 
+    @property
+    def arrays(self) -> tuple[Array, ...]:
+        """All but x, in the order of the fields."""
+        return self.cost, self.gradient, self.gram, self.target, self.matrix, self.scale
+
     def take(self, rows: Array) -> Examined[X]:
         """Some members of the batch."""
-        arrays = (self.cost, self.gradient, self.gram, self.target, self.matrix, self.scale)
-        return Examined(self.x.take(rows), *(array[rows] for array in arrays))
+        return Examined(self.x.take(rows), *(array[rows] for array in self.arrays))
 
     def put(self, rows: Array, other: Examined[X]) -> Examined[X]:
         """The batch with some members taken from another one of the same size."""
-        chosen = other.take(rows)
-        out = Examined(
-            self.x.put(rows, chosen.x),
-            self.cost.copy(),
-            self.gradient.copy(),
-            self.gram.copy(),
-            self.target.copy(),
-            self.matrix.copy(),
-            self.scale.copy(),
-        )
-        out.cost[rows], out.gradient[rows], out.gram[rows] = (
-            chosen.cost,
-            chosen.gradient,
-            chosen.gram,
-        )
-        out.target[rows], out.matrix[rows] = chosen.target, chosen.matrix
-        out.scale[rows] = chosen.scale
+        out = Examined(self.x.put(rows, other.x.take(rows)), *map(np.copy, self.arrays))
+        for mine, new in zip(out.arrays, other.arrays, strict=True):
+            mine[rows] = new[rows]
         return out
 
 

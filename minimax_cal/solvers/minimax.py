@@ -13,14 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Protocol, TypeVar
+from functools import partial
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 
-Array = np.ndarray[Any, np.dtype[Any]]
 X = TypeVar("X")
 Solver = Callable[[Problem], Solution]
 
@@ -29,6 +30,7 @@ HESSIANS = ("gauss-newton", "bfgs")
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
 ROUNDING = 1e-12
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
+MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
 
@@ -154,78 +156,155 @@ def solve(
     progress: Callable[[Step], None] = lambda step: None,
 ) -> Optimum[X]:
     """Minimise max f from x.  qp: a QP solver whose answers are already verified."""
-    lower, upper = problem.lower, problem.upper
-    here = problem.linearise(x)
-    k, p = here.jacobian.shape
-    mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
-    exact = settings.hessian == "gauss-newton"
-    quasi = Bfgs(np.eye(0), fresh=True) if exact else Bfgs.start(here, p)
-    penalty, damping = 0.0, 0.0
-    status = Status.ITERATION_LIMIT
+    at = Iterate.begin(problem, x, settings)
+    status, tolerance = Status.ITERATION_LIMIT, settings.tolerance
     trace: list[Step] = []
     notes: list[str] = []
-    kkt = optimality(here, mu, lam, lower, upper)
-    best, lowest, idle = np.inf, np.inf, 0
     for iteration in range(1, settings.iterations + 1):
-        if not (np.all(np.isfinite(here.f)) and np.all(np.isfinite(here.jacobian))):
+        if not (np.all(np.isfinite(at.here.f)) and np.all(np.isfinite(at.here.jacobian))):
             status = Status.FAILED
             break
-        hessian = here.curvature(np.maximum(mu, settings.floor / k)) if exact else quasi.matrix
-        hessian = hessian + damping * np.diag(np.maximum(np.diag(hessian), 1e-8))
-
-        def resolve(f: Array, c: Array, here: Linear = here, hessian: Array = hessian) -> Plan:
-            bent = replace(here, f=f, c=c)
-            return subproblem(bent, hessian, lower, upper, qp, penalty)  # noqa: B023
-
-        plan = resolve(here.f, here.c)
+        hessian = at.hessian(settings.floor)
+        plan = at.subproblem(hessian, qp)
         notes += [note for note in plan.notes if note not in notes]
         if not plan.usable:
             status = Status.FAILED
             break
-        mu, lam = plan.mu, plan.lam
-        kkt = optimality(here, mu, lam, lower, upper)
-        if plan.relaxed:
-            penalty = max(penalty, plan.penalty)
-            if hopeless(here, plan, lower, upper, settings.tolerance):
-                if penalty > RELENTLESS * max(1.0, float(np.abs(here.jacobian).max())):
-                    status = Status.INFEASIBLE
-                    break
-                penalty *= 10.0
-        else:
-            penalty = max(penalty, 1.5 * float(np.abs(lam).max(initial=0.0)))
-        length, move, end, there = 0.0, np.zeros(p), x, here
-        if kkt.residual > settings.tolerance:
-            length, move, end, there = search(problem, x, here, plan, penalty, resolve)
-        trace.append(
-            Step(iteration, float(here.f.max()), kkt.violation, kkt.residual, length, plan.backend)
-        )
+        at = at.judged(plan.mu, plan.lam)
+        penalty = priced(at, plan, tolerance)
+        if penalty is None:
+            status = Status.INFEASIBLE
+            break
+        at = replace(at, penalty=penalty)
+        length, move, end, there = 0.0, np.zeros_like(plan.d), at.x, at.here
+        if at.kkt.residual > tolerance:
+            length, move, end, there = search(at, plan, partial(at.subproblem, hessian, qp))
+        value, kkt = float(at.here.f.max()), at.kkt
+        trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, plan.backend))
         progress(trace[-1])
-        if kkt.residual <= settings.tolerance:
-            status = Status.CONVERGED
+        at = at.counted()
+        ended = at.patience(tolerance)
+        if ended is None:
+            at = at.moved(move, end, there) if length else at.damped()
+            ended = at.arrived(tolerance)
+        if ended is not None:
+            status = ended
             break
-        if kkt.residual < 0.9 * best or here.f.max() < lowest - ROUNDING * abs(lowest):
-            best, lowest, idle = min(best, kkt.residual), float(here.f.max()), 0
+    return Optimum(
+        at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
+        tuple(notes),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate(Generic[X]):
+    """Where the iteration stands.
+
+    here: the problem at x.  mu, lam: multipliers of the latest QP, kkt: how far from optimal x is
+    with them.  quasi: the Hessian where the problem has none of its own.  penalty: price of a
+    violation.  damping: of the Hessian's diagonal.  best, lowest: least residual and value so far.
+    idle: iterations since either fell.
+    """
+
+    problem: Minimax[X]
+    x: X
+    here: Linear
+    mu: Array
+    lam: Array
+    kkt: Kkt
+    quasi: Bfgs | None
+    penalty: float = 0.0
+    damping: float = 0.0
+    best: float = np.inf
+    lowest: float = np.inf
+    idle: int = 0
+
+    @staticmethod
+    def begin(problem: Minimax[X], x: X, settings: Sqp) -> Iterate[X]:
+        """The start, all functions sharing the multipliers evenly."""
+        here = problem.linearise(x)
+        k, p = here.jacobian.shape
+        mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
+        kkt = optimality(here, mu, lam, problem.lower, problem.upper)
+        quasi = None if settings.hessian == "gauss-newton" else Bfgs.start(here, p)
+        return Iterate(problem, x, here, mu, lam, kkt, quasi)
+
+    def hessian(self, floor: float) -> Array:
+        """(p, p) of the Lagrangian, damped.  floor: as `Sqp.floor`."""
+        if self.quasi is None:
+            matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
-            idle += 1
-        if idle >= PATIENCE and kkt.violation <= settings.tolerance:
-            good = kkt.residual <= NEARLY * settings.tolerance
-            status = Status.CONVERGED if good else Status.STALLED
-            break
-        if length == 0.0:
-            damping = max(10.0 * damping, 1e-3)
-            if damping > 1e8:
-                stuck = kkt.violation > settings.tolerance
-                status = Status.INFEASIBLE if stuck else Status.STALLED
-                break
-            continue
-        damping = damping / 10.0 if damping > 1e-6 else 0.0
-        x, before, here = end, here, there
-        quasi = quasi if exact else quasi.update(move, before, here, mu, lam)
-        kkt = optimality(here, mu, lam, lower, upper)
-        if kkt.residual <= settings.tolerance:
-            status = Status.CONVERGED
-            break
-    return Optimum(x, here.f, here.c, mu, lam, kkt, len(trace), status, tuple(trace), tuple(notes))
+            matrix = self.quasi.matrix
+        return np.asarray(matrix + self.damping * np.diag(np.maximum(np.diag(matrix), 1e-8)))
+
+    def subproblem(
+        self, hessian: Array, qp: Solver, f: Array | None = None, c: Array | None = None
+    ) -> Plan:
+        """The answer of the epigraph QP here, or with other values f, c.
+
+        If its constraints contradict each other, of their elastic relaxation.
+        """
+        here = self.here if f is None or c is None else replace(self.here, f=f, c=c)
+        plain = epigraph(here, hessian, self.problem.lower, self.problem.upper)
+        solution = qp(plain)
+        if solution.solved or not len(here.c):
+            return read(solution, here, relaxed=False, penalty=0.0)
+        weight = max(self.penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
+        relaxed = qp(elastic(plain, len(here.f), weight))
+        return read(relaxed, here, relaxed=True, penalty=weight)
+
+    def judged(self, mu: Array, lam: Array) -> Iterate[X]:
+        """The same point with other multipliers."""
+        kkt = optimality(self.here, mu, lam, self.problem.lower, self.problem.upper)
+        return replace(self, mu=mu, lam=lam, kkt=kkt)
+
+    def counted(self) -> Iterate[X]:
+        """With one more iteration that made progress or not."""
+        value = float(self.here.f.max())
+        fell = value < self.lowest - ROUNDING * abs(self.lowest)
+        if self.kkt.residual < 0.9 * self.best or fell:
+            return replace(self, best=min(self.best, self.kkt.residual), lowest=value, idle=0)
+        return replace(self, idle=self.idle + 1)
+
+    def patience(self, tolerance: float) -> Status | None:
+        """How it ends here, if it is optimal or nothing has become better for long."""
+        if self.kkt.residual <= tolerance:
+            return Status.CONVERGED
+        if self.idle >= PATIENCE and self.kkt.violation <= tolerance:
+            good = self.kkt.residual <= NEARLY * tolerance
+            return Status.CONVERGED if good else Status.STALLED
+        return None
+
+    def moved(self, move: Array, x: X, there: Linear) -> Iterate[X]:
+        """At the end of a step, less damped."""
+        quasi = self.quasi and self.quasi.update(move, self.here, there, self.mu, self.lam)
+        damping = self.damping / 10.0 if self.damping > 1e-6 else 0.0
+        end = replace(self, x=x, here=there, quasi=quasi, damping=damping)
+        return end.judged(self.mu, self.lam)
+
+    def damped(self) -> Iterate[X]:
+        """The same point, more damped, since no step led on."""
+        return replace(self, damping=max(10.0 * self.damping, 1e-3))
+
+    def arrived(self, tolerance: float) -> Status | None:
+        """How it ends after a step, if the point is optimal or no damping helps any more."""
+        if self.kkt.residual <= tolerance:
+            return Status.CONVERGED
+        if self.damping > MOST_DAMPING:
+            stuck = self.kkt.violation > tolerance
+            return Status.INFEASIBLE if stuck else Status.STALLED
+        return None
+
+
+def priced(at: Iterate[X], plan: Plan, tolerance: float) -> float | None:
+    """The next price of a violation; None where no price makes the constraints agree."""
+    if not plan.relaxed:
+        return max(at.penalty, 1.5 * float(np.abs(at.lam).max(initial=0.0)))
+    penalty = max(at.penalty, plan.penalty)
+    if not hopeless(at.here, plan, at.problem.lower, at.problem.upper, tolerance):
+        return penalty
+    steepest = max(1.0, float(np.abs(at.here.jacobian).max()))
+    return None if penalty > RELENTLESS * steepest else 10.0 * penalty
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,18 +322,6 @@ class Plan:
 
 
 Resolve = Callable[[Array, Array], Plan]
-
-
-def subproblem(
-    here: Linear, hessian: Array, lower: Array, upper: Array, qp: Solver, penalty: float
-) -> Plan:
-    """Solve the epigraph QP; if its constraints contradict each other, their elastic relaxation."""
-    plain = epigraph(here, hessian, lower, upper)
-    answer = qp(plain)
-    if answer.solved or not len(here.c):
-        return read(answer, here, relaxed=False, penalty=0.0)
-    weight = max(penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
-    return read(qp(elastic(plain, len(here.f), weight)), here, relaxed=True, penalty=weight)
 
 
 def epigraph(here: Linear, hessian: Array, lower: Array, upper: Array) -> Problem:
@@ -331,18 +398,16 @@ def excess(c: Array, lower: Array, upper: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(c - upper, lower - c), 0.0))
 
 
-def search(
-    problem: Minimax[X], x: X, here: Linear, plan: Plan, penalty: float, resolve: Resolve
-) -> tuple[float, Array, X, Linear]:
+def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, X, Linear]:
     """A step that lowers max f + penalty * violation: its length (0 if none), move and end.
 
     The full step is nearly always taken, so its derivatives are computed at once.  resolve: solves
     the QP again with other values f, c, for the second-order correction.
     """
-    lower, upper = problem.lower, problem.upper
+    problem, x, here = at.problem, at.x, at.here
 
     def merit(f: Array, c: Array) -> float:
-        value = float(f.max() + penalty * excess(c, lower, upper).sum())
+        value = float(f.max() + at.penalty * excess(c, problem.lower, problem.upper).sum())
         return value if np.isfinite(value) else float("inf")
 
     start = merit(here.f, here.c)

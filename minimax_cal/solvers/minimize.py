@@ -19,7 +19,7 @@ from scipy.optimize import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Linear, Sqp, Step
+from minimax_cal.solvers.minimax import Linear, Optimum, Sqp, Step
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
@@ -71,37 +71,17 @@ def minimize_max(
         x = np.clip(x, bounds.lb, bounds.ub)
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
-    jacobian = derivative(function, jac, args, count)
-    first = function(x)
-    if first.ndim != 1 or not np.all(np.isfinite(first)):
-        raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
-    size = max(1.0, float(np.abs(jacobian(x)).max(initial=0.0)))
-    problem = MaxOfFunctions(function, jacobian, rows, size)
+    problem = MaxOfFunctions.at(x, function, derivative(function, jac, args, count), rows)
     solver = partial(solve_qp, name=qp, tolerance=QP_TOLERANCE) if isinstance(qp, str) else qp
 
     def tell(step: Step) -> None:
         if callback is not None:
-            callback(result(fun=step.value * size, nit=step.iteration, kkt=step.kkt))
+            value = step.value * problem.size
+            callback(result(fun=value, nit=step.iteration, kkt=step.kkt))
 
     settings = Sqp(tolerance=tol, iterations=maxiter, hessian="bfgs")
-    found = minimax.solve(problem, x, solver, settings, tell)
-    values = function(found.x)
-    return result(
-        x=found.x,
-        fun=float(values.max()),
-        values=values,
-        success=found.status is Status.CONVERGED,
-        status=str(found.status),
-        message=found.status.advice or "optimal to the tolerance",
-        nit=found.iterations,
-        nfev=count.function,
-        njev=count.jacobian,
-        multipliers=found.mu,
-        constraint_multipliers=found.lam * size,
-        kkt=found.kkt.residual,
-        violation=found.kkt.violation,
-        notes=found.notes,
-    )
+    best = minimax.solve(problem, x, solver, settings, tell)
+    return answer(best, function(best.x), problem.size, count)
 
 
 def result(**fields: Any) -> OptimizeResult:
@@ -109,6 +89,26 @@ def result(**fields: Any) -> OptimizeResult:
     out = OptimizeResult()
     out.update(fields)
     return out
+
+
+def answer(best: Optimum[Array], values: Array, size: float, count: Count) -> OptimizeResult:
+    """The result of a minimisation.  size: by which the functions were divided."""
+    return result(
+        x=best.x,
+        fun=float(values.max()),
+        values=values,
+        success=best.status is Status.CONVERGED,
+        status=str(best.status),
+        message=best.status.advice or "optimal to the tolerance",
+        nit=best.iterations,
+        nfev=count.function,
+        njev=count.jacobian,
+        multipliers=best.mu,
+        constraint_multipliers=best.lam * size,
+        kkt=best.kkt.residual,
+        violation=best.kkt.violation,
+        notes=best.notes,
+    )
 
 
 @dataclass
@@ -177,44 +177,26 @@ class Rows:
     @staticmethod
     def of(n: int, bounds: Bounds | None, constraints: Sequence[Constraint]) -> Rows:
         """Raises OptionError where sizes do not fit or a kind is unknown."""
-        matrices, lower, upper = [np.zeros((0, n))], [np.zeros(0)], [np.zeros(0)]
-        curved: list[tuple[Function, Function]] = []
-        curved_lower: list[Array] = []
-        curved_upper: list[Array] = []
-        if bounds is not None:
-            low, high = (np.broadcast_to(side, n).astype(float) for side in (bounds.lb, bounds.ub))
-            some = np.isfinite(low) | np.isfinite(high)
-            matrices.append(np.eye(n)[some])
-            lower.append(low[some])
-            upper.append(high[some])
+        blocks = [] if bounds is None else [bound_rows(bounds, n)]
+        curved = []
         for constraint in constraints:
             if isinstance(constraint, LinearConstraint):
-                matrix = dense(constraint.A)
-                if matrix.shape[1] != n:
-                    raise OptionError(
-                        f"minimize_max: a LinearConstraint has {matrix.shape[1]} columns, x has {n}"
-                    )
-                count = len(matrix)
-                matrices.append(matrix)
-                lower.append(np.broadcast_to(constraint.lb, count).astype(float))
-                upper.append(np.broadcast_to(constraint.ub, count).astype(float))
+                blocks.append(linear_rows(constraint, n))
             elif isinstance(constraint, NonlinearConstraint):
-                function = counted(partial(vector, constraint.fun), Count())
-                kind = constraint.jac
-                kind = kind if callable(kind) or kind == "cs" else "2-point"
-                curved.append((function, derivative(function, kind, (), Count())))
-                curved_lower.append(np.atleast_1d(np.asarray(constraint.lb, dtype=float)))
-                curved_upper.append(np.atleast_1d(np.asarray(constraint.ub, dtype=float)))
+                curved.append(constraint)
             else:
                 raise OptionError(
                     "minimize_max: constraints are scipy.optimize's LinearConstraint and "
                     f"NonlinearConstraint, not {type(constraint).__name__}"
                 )
+        nothing = np.zeros(0)
+        lower = [*(low for _, low, _ in blocks), *(one_row(c.lb) for c in curved), nothing]
+        upper = [*(high for _, _, high in blocks), *(one_row(c.ub) for c in curved), nothing]
         rows = Rows(
-            np.concatenate(matrices),
-            tuple(curved),
-            np.concatenate([*lower, *curved_lower]),
-            np.concatenate([*upper, *curved_upper]),
+            np.concatenate([np.zeros((0, n)), *(matrix for matrix, _, _ in blocks)]),
+            tuple(with_derivative(constraint) for constraint in curved),
+            np.concatenate(lower),
+            np.concatenate(upper),
         )
         if np.any(rows.lower > rows.upper):
             raise OptionError("minimize_max: a lower bound is above its upper bound")
@@ -231,9 +213,35 @@ class Rows:
         )
 
 
-def vector(function: Callable[[Array], Any], x: Array) -> Array:
-    """The function's value as a vector."""
-    return np.atleast_1d(np.asarray(function(x)))
+def bound_rows(bounds: Bounds, n: int) -> tuple[Array, Array, Array]:
+    """Matrix, lower and upper side of the bounds that are not open."""
+    low, high = (np.broadcast_to(side, n).astype(float) for side in (bounds.lb, bounds.ub))
+    some = np.isfinite(low) | np.isfinite(high)
+    return np.eye(n)[some], low[some], high[some]
+
+
+def linear_rows(constraint: LinearConstraint, n: int) -> tuple[Array, Array, Array]:
+    """Matrix, lower and upper side.  Raises OptionError where the matrix does not fit x."""
+    matrix = dense(constraint.A)
+    if matrix.shape[1] != n:
+        raise OptionError(
+            f"minimize_max: a LinearConstraint has {matrix.shape[1]} columns, x has {n}"
+        )
+    low, high = (np.broadcast_to(side, len(matrix)) for side in (constraint.lb, constraint.ub))
+    return matrix, low.astype(float), high.astype(float)
+
+
+def with_derivative(constraint: NonlinearConstraint) -> tuple[Function, Function]:
+    """The function of a constraint and its derivative."""
+    function = counted(lambda x: one_row(constraint.fun(x)), Count())
+    kind = constraint.jac
+    kind = kind if callable(kind) or kind == "cs" else "2-point"
+    return function, derivative(function, kind, (), Count())
+
+
+def one_row(values: Any) -> Array:
+    """Numbers as a vector."""
+    return np.atleast_1d(np.asarray(values))
 
 
 def unknown(weights: Array) -> Array:
@@ -249,6 +257,15 @@ class MaxOfFunctions:
     jacobian: Function
     rows: Rows
     size: float
+
+    @staticmethod
+    def at(x: Array, function: Function, jacobian: Function, rows: Rows) -> MaxOfFunctions:
+        """Divided by the largest gradient at x, if that is above one.  Raises OptionError."""
+        first = function(x)
+        if first.ndim != 1 or not np.all(np.isfinite(first)):
+            raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
+        size = max(1.0, float(np.abs(jacobian(x)).max(initial=0.0)))
+        return MaxOfFunctions(function, jacobian, rows, size)
 
     @property
     def lower(self) -> Array:

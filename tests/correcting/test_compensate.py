@@ -16,14 +16,11 @@ from minimax_cal.cli import main
 from minimax_cal.cli.compensate import ADDED, compensate_command, read_targets
 from minimax_cal.correcting.compensate import (
     FRAMES,
-    Outcome,
-    Reach,
     arm_of,
     compensate,
-    examine,
-    motion,
     path_of,
 )
+from minimax_cal.correcting.reach import Outcome, Reach, examine, motion
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, Sealed, make
-from minimax_cal.diagnosing.diagnose import closed_share
+from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
 from minimax_cal.fitting.exchanged import misplaced, put_right
 from minimax_cal.modelling.simulate import Simulation

@@ -37,7 +37,7 @@ def test_probabilities_are_right_on_noise() -> None:
 
 @pytest.mark.parametrize("law", ["outside_sum", "outside_product", "outside_waves"])
 def test_laws_outside_the_library_leave_a_trace(law: str) -> None:
-    from minimax_cal.diagnosing.diagnose import studied
+    from minimax_cal.diagnosing.study import studied
     from minimax_cal.fitting.options import Options, silent
     from minimax_cal.fitting.solve import fit_cell
     from minimax_cal.measuring.history import with_history

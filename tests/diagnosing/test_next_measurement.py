@@ -12,6 +12,7 @@ from minimax_cal.diagnosing.next_measurement import (
     AGAIN,
     MORE,
     PREPARE,
+    Pair,
     Site,
     joined,
     payload,
@@ -112,7 +113,7 @@ def by_hand(
 def test_power_is_that_of_a_dense_fit_to_all_poses(wide: Site, key: tuple[str, int]) -> None:
     for noise in (QUIET, SHAKY):
         place = dataclasses.replace(wide, noise=noise)
-        found = powers(place, GROWTH, np.array([1e-5]), DRIFT, [(GAIN, np.array([1e-4]))])
+        found = powers(place, Pair(GROWTH, np.array([1e-5]), DRIFT, [(GAIN, np.array([1e-4]))]))
         expected = by_hand(place, key, GROWTH, np.array([1e-5]), DRIFT, [GAIN])
         assert_allclose(found[key], expected, rtol=ROUNDING)
 
@@ -123,7 +124,7 @@ def test_power_is_that_of_a_dense_fit_to_all_poses(wide: Site, key: tuple[str, i
 def test_power_of_revisits_is_that_of_a_dense_fit(
     wide: Site, one: Term, value: float, key: tuple[str, int]
 ) -> None:
-    found = powers(wide, one, np.array([value]), GAIN)
+    found = powers(wide, Pair(one, np.array([value]), GAIN))
     assert_allclose(found[key], by_hand(wide, key, one, np.array([value]), GAIN, []), rtol=ROUNDING)
 
 
@@ -142,7 +143,7 @@ def test_power_now_is_what_rivals_say(
     size, rho2 = table.setting(added).likeness(added, both[1])
     jitter = np.sqrt(added.ratio * added.variance / rows.size)
     same = dataclasses.replace(wide, noise=Noise(added.ratio, added.variance, float(jitter)))
-    now = powers(same, one, np.array(value), other)["old", 70]
+    now = powers(same, Pair(one, np.array(value), other))["old", 70]
     # a rival's doubts about masses are those of all proposed poses, not of these alone
     assert_allclose(now, size * (1.0 - rho2), rtol=0.1 if other is BASE else ROUNDING)
 
@@ -153,28 +154,28 @@ def test_power_now_is_what_rivals_say(
 def test_power_for_more_poses_is_that_of_a_bigger_data_set(
     robot: mc.Robot, sim: Simulation, wide: Site, one: Term, value: list[float], other: Term
 ) -> None:
-    told = powers(wide, one, np.array(value), other)
+    told = powers(wide, Pair(one, np.array(value), other))
     data = first(wide, ("more", 40))
     bigger = dataclasses.replace(data, y=measured(sim, data.q, 7).y)
     again = site(robot, bigger, QUIET)
-    found = powers(again, one, np.array(value), other)["old", 110]
+    found = powers(again, Pair(one, np.array(value), other))["old", 110]
     assert_allclose(told["more", 40], found, rtol=REFIT)
     assert told["old", 70] < told["more", 10] < told["more", 40]
 
 
 def test_a_reflector_on_the_foot_tells_the_base_from_joint_2(narrow: Site) -> None:
     for one, value, other in ((J2, 2e-7, BASE), (BASE, 1e-7, J2)):
-        found = powers(narrow, one, np.array([value]), other)
+        found = powers(narrow, Pair(one, np.array([value]), other))
         assert found["old", 60] < ENOUGH < found["foot", 40]
         assert found["foot", 10] > 1.1 * found["old", 60]
-    assert "foot" in " ".join(a.text for a in separate(narrow, BASE, np.array([1e-7]), J2))
+    assert "foot" in " ".join(a.text for a in separate(narrow, Pair(BASE, np.array([1e-7]), J2)))
 
 
 def test_the_foot_says_what_three_points_fixed_to_the_base_do(narrow: Site) -> None:
     """The gain by the foot is bounded by, and near, the weight of its own rows where rho^2 is 1."""
     up, reach = narrow.scene.robot.up, narrow.scene.robot.reach()
     rows = narrow.plan.rows("foot", 20)
-    found = powers(narrow, BASE, np.array([1e-7]), J2)
+    found = powers(narrow, Pair(BASE, np.array([1e-7]), J2))
     still = dataclasses.replace(narrow.whole, points=np.zeros((1, 3, narrow.plan.data.poses)))
     # about points near the origin the turn of the base alone counts: take three unit offsets
     turned = BASE.columns(
@@ -192,13 +193,13 @@ def test_the_foot_says_what_three_points_fixed_to_the_base_do(narrow: Site) -> N
 
 def test_gain_and_gear_are_told_apart_by_more_range(narrow: Site, wide: Site) -> None:
     value = np.array([2e-4])
-    found = powers(narrow, GAIN, value, GEAR)
+    found = powers(narrow, Pair(GAIN, value, GEAR))
     assert found["old", 60] < 1.0
     assert found["more", 10] > ENOUGH
-    text = separate_with(narrow, GAIN, value, GEAR)
+    text = separate_with(narrow, Pair(GAIN, value, GEAR))
     assert text == "measure 10 more poses over the whole range of all joints"
     assert {kind for kind, _ in found} == {"old", "more"}  # no revisit concerns them
-    assert "all over the workspace" in separate_with(wide, GAIN, value, GEAR)
+    assert "all over the workspace" in separate_with(wide, Pair(GAIN, value, GEAR))
 
 
 def test_backlash_and_settling_are_told_apart_by_approaches(
@@ -209,17 +210,17 @@ def test_backlash_and_settling_are_told_apart_by_approaches(
     q = rng.uniform(-half, half, (50, 6))
     q[:, 4] = 0.2 + 0.4 * (np.arange(50) % 2)  # joint 5 goes to and fro, always as far
     here = site(robot, measured(sim, q, 4), QUIET)
-    found = powers(here, PLAY, np.array([5e-4]), LATE)
+    found = powers(here, Pair(PLAY, np.array([5e-4]), LATE))
     assert found["old", 50] < 1e-3
     assert found["side", 10] > ENOUGH
     assert found["more", 10] > ENOUGH  # moves of many sizes
     here = site(robot, measured(sim, q, 4), SHAKY)
-    assert "raises the power to" in separate_with(here, PLAY, np.array([3e-5]), LATE)
+    assert "raises the power to" in separate_with(here, Pair(PLAY, np.array([3e-5]), LATE))
 
 
 def test_revisits_are_proposed_where_they_concern_the_effects(wide: Site) -> None:
     kinds = {
-        pair: {kind for kind, _ in powers(wide, pair[0], value, pair[1])} - {"old"}
+        pair: {kind for kind, _ in powers(wide, Pair(pair[0], value, pair[1]))} - {"old"}
         for pair, value in {
             (GAIN, GEAR): np.array([1e-4]),
             (J2, GAIN): np.array([1e-7]),
@@ -243,7 +244,7 @@ def test_more_of_a_kind_never_tells_less(wide: Site, narrow: Site) -> None:
     for place in (wide, narrow):
         known = [(GEAR, np.array([1e-4, 1e-4]))]
         for one, value, other in ((DRIFT, CREEP, GROWTH), (J2, np.array([1e-7]), BASE)):
-            found = powers(place, one, value, other, known)
+            found = powers(place, Pair(one, value, other, known))
             now = found["old", place.scene.poses]
             for kind in PREPARE:
                 several = [power for (name, _), power in found.items() if name == kind]
@@ -251,18 +252,18 @@ def test_more_of_a_kind_never_tells_less(wide: Site, narrow: Site) -> None:
 
 
 def test_advice_is_sorted_by_cost_and_the_cheapest_that_is_enough_is_given(narrow: Site) -> None:
-    advices = separate(narrow, BASE, np.array([1e-7]), J2)
+    advices = separate(narrow, Pair(BASE, np.array([1e-7]), J2))
     minutes = [advice.minutes for advice in advices]
     assert minutes == sorted(minutes)
     enough = [a for a in advices if a.power >= ENOUGH]
-    assert separate_with(narrow, BASE, np.array([1e-7]), J2) == enough[0].text
-    weak = separate_with(narrow, BASE, np.array([1e-9]), J2)
+    assert separate_with(narrow, Pair(BASE, np.array([1e-7]), J2)) == enough[0].text
+    weak = separate_with(narrow, Pair(BASE, np.array([1e-9]), J2))
     assert weak.endswith("of the 25 needed")
 
 
 def test_what_includes_the_effect_cannot_be_told_from_it(wide: Site) -> None:
     everywhere = Term("encoder_gain", "all", {"joints": 63.0})
-    assert "no measurement can" in separate_with(wide, GAIN, np.array([1e-4]), everywhere)
+    assert "no measurement can" in separate_with(wide, Pair(GAIN, np.array([1e-4]), everywhere))
 
 
 def test_proposed_poses_can_be_reached_and_seen(narrow: Site, wide: Site) -> None:
@@ -297,17 +298,19 @@ def test_every_column_is_kept(robot: mc.Robot, sim: Simulation) -> None:
     y[::3, 0] = np.nan
     here = site(robot, data.with_y(y), QUIET)
     torque = Term("joint_compliance", "J2", {"parts": float(1 << 7)})
-    found = powers(here, torque, np.array([1e-3]), BASE)
+    found = powers(here, Pair(torque, np.array([1e-3]), BASE))
     assert all(np.isfinite(power) for power in found.values())
     assert ("load", AGAIN[-1]) in found
-    assert "kg more" in " ".join(a.text for a in separate(here, torque, np.array([1e-3]), BASE))
+    assert "kg more" in " ".join(
+        a.text for a in separate(here, Pair(torque, np.array([1e-3]), BASE))
+    )
     warm = Term("thermal_growth", "all", {"temperature": 1.0, "apart": 0.0})
-    assert ("late", 10) in powers(here, warm, np.array([1e-6]), BASE)
+    assert ("late", 10) in powers(here, Pair(warm, np.array([1e-6]), BASE))
 
 
 def test_few_poses_are_no_obstacle(robot: mc.Robot, sim: Simulation) -> None:
     here = site(robot, measured(sim, sim.data.q[:25], 6), QUIET)
-    found = powers(here, J2, np.array([1e-7]), BASE)
+    found = powers(here, Pair(J2, np.array([1e-7]), BASE))
     assert [count for kind, count in found if kind == "load"] == [10, 20, 25]
 
 
@@ -328,6 +331,6 @@ def test_a_call_is_short(robot: mc.Robot) -> None:
     for _ in range(3):
         fresh = dataclasses.replace(here)
         began = time.perf_counter()
-        separate_with(fresh, J2, np.array([1e-7]), BASE, [(GEAR, np.array([1e-4, 1e-4]))])
+        separate_with(fresh, Pair(J2, np.array([1e-7]), BASE, [(GEAR, np.array([1e-4, 1e-4]))]))
         taken.append(time.perf_counter() - began)
     assert min(taken) < 0.3  # about 0.03 s on a free core

@@ -7,7 +7,7 @@ from problems_fit import study
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, make
-from minimax_cal.diagnosing.diagnose import Study, studied
+from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.noise import Noise, Rows, restricted
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell

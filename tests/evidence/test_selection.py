@@ -5,10 +5,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.diagnose import Study, chosen, resemblance, studied
+from minimax_cal.diagnosing.causes import chosen
+from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.periodogram import lines
+from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
@@ -104,7 +106,9 @@ def test_values_are_those_of_least_squares() -> None:
 def test_a_line_is_found_by_its_frequency() -> None:
     made = opened(Cause("gear_ripple", "J4", 300.0), seed=3)
     noise = selection.restricted(made.rows, np.zeros((len(made.rows.error), 0)))
-    found = {t.place: t for t, _ in lines(made.scene, made.rows, noise, made.rows.basis[:, :0])}
+    found = {
+        t.place: t for t, _ in strongest_lines(made.scene, made.rows, noise, made.rows.basis[:, :0])
+    }
     from experiments.gap_cases import ARMS
 
     assert min(abs(found["J4"].choice["turns"] - turns) for turns in ARMS["irb2600"].ripple) < 0.1

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from problems_fit import identified, solve
 
 import minimax_cal as mc
+from experiments import cones
 from experiments.worst_point import Case, by_cones, by_cvxpy, by_sqp, linear_optimum
 from minimax_cal.fitting.certificate import PointCones, certify
 from minimax_cal.fitting.minimax_problem import (
@@ -18,7 +19,7 @@ from minimax_cal.fitting.minimax_problem import (
 from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, simulate
-from minimax_cal.solvers import cones, minimax
+from minimax_cal.solvers import minimax
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp

@@ -19,6 +19,7 @@ from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import gravity, random_poses
@@ -37,7 +38,7 @@ from minimax_cal.planning.designs.criteria import (
 from minimax_cal.planning.designs.exchange import Menu, exchange, floor, greedy, polar
 from minimax_cal.planning.designs.relaxation import capped, relax
 from minimax_cal.planning.designs.search import best_design, first_design, worth
-from minimax_cal.planning.observability import observability, singular_values
+from minimax_cal.planning.observability import observability
 from minimax_cal.planning.outlook import sigmas
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.prospect import (
@@ -158,7 +159,7 @@ def test_an_exchange_never_worsens(seed: int, name: str) -> None:
     assert_allclose(found.size, size_of(criterion, menu.of(found.chosen)), rtol=ROUNDING)
     assert len(set(found.chosen.tolist())) == 6
     again = exchange(menu, criterion, found.chosen)
-    assert again.swaps == 0
+    assert np.array_equal(again.chosen, found.chosen)
     few = np.arange(8)
     inside = exchange(menu, criterion, start, few)
     assert set(inside.chosen.tolist()) <= {*start.tolist(), *few.tolist()}
@@ -310,8 +311,6 @@ def test_observability_by_hand() -> None:
         {"O1": 2.0 / 2.0, "O2": 1 / 4, "O3": 1.0, "O4": 1 / 4, "O5": 1 / (1 / 4 + 1 / 2 + 1)}
     )
     assert set(observability(np.array([1.0, 0.0]), 3).values()) == {0.0}
-    turned = np.linalg.qr(np.random.default_rng(0).normal(size=(8, 3)))[0]
-    assert_allclose(singular_values(turned * [1.0, 4.0, 2.0]), [4.0, 2.0, 1.0])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -573,7 +572,7 @@ def test_power_is_what_separate_says(
 ) -> None:
     """Its own proposal of more poses, given to us as candidates that are all measured."""
     one = asked(*pair)
-    told = next_measurement.powers(one.site, one.one, one.value, one.other)
+    told = next_measurement.powers(one.site, one.pair)
     for count in (10, 80):
         rows = one.site.plan.rows("more", count)
         seen = one.site.plan.weight[:, rows].T > 0.0
@@ -618,9 +617,9 @@ def test_effects_that_a_fit_holds_as_a_whole_are_not_asked_for_in_part(
     asked = separating.question(
         robot, narrow, fit.cell, ("joint_compliance:all", "link_bending:L2"), 0
     )
-    assert asked.known == ()
+    assert asked.pair.known == ()
     asked = separating.question(robot, narrow, fit.cell, GAIN, 0)
-    assert [term.label for term, _ in asked.known] == ["joint_compliance:all"]
+    assert [term.label for term, _ in asked.pair.known] == ["joint_compliance:all"]
 
 
 def test_revisits_from_the_other_side_show_play(
@@ -628,9 +627,8 @@ def test_revisits_from_the_other_side_show_play(
 ) -> None:
     rng = np.random.default_rng(1)
     one = asked(*GAIN)
-    played = dataclasses.replace(
-        one, one=separating.Term("backlash", "J2"), value=np.array([3e-5]), known=()
-    )
+    pair = next_measurement.Pair(Term("backlash", "J2"), np.array([3e-5]), one.pair.other)
+    played = dataclasses.replace(one, pair=pair)
     q = random_poses(robot, 12, rng)
     seen = np.ones((12, 2), dtype=bool)
     far = np.full(6, 4.0)

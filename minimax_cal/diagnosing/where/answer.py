@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from minimax_cal.diagnosing.where.gaps import JointGap, Region, TargetGap, Trend, Triage, plain
+from minimax_cal.diagnosing.where.gaps import JointGap, Region, TargetGap, Trend, Triage
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 
 
@@ -47,12 +48,10 @@ class Where:
 
     def to_dict(self) -> dict[str, object]:
         """For JSON: strictly JSON-able, units in the names, null for what cannot be told."""
-        return {
+        whole = {
             "by_target": [gap.to_dict() for gap in self.by_target],
             "by_joint": [gap.to_dict() for gap in self.by_joint],
-            "by_direction": {
-                f"{name}_mm": plain(rms, 1e3) for name, rms in self.by_direction.items()
-            },
+            "by_direction": {f"{name}_mm": 1e3 * rms for name, rms in self.by_direction.items()},
             "by_region": {
                 "cells": [cell.to_dict() for cell in self.by_region],
                 "worst": self.worst_region,
@@ -62,51 +61,10 @@ class Where:
                 "temperature": self.temperature.to_dict(),
             },
             "triage": self.triage.to_dict(),
-            "structure_p": plain(self.structure),
-            "noise_mm": plain(self.noise, 1e3),
+            "structure_p": self.structure,
+            "noise_mm": 1e3 * self.noise,
         }
-
-    def tables(self) -> tuple[Table, ...]:
-        """Triage, targets, joints, directions, regions and trends, a table each."""
-        return (
-            triage_table(self.triage),
-            Table(
-                "by target",
-                ("target", "points", "RMS mm", "max mm", "x mm", "y mm", "z mm", "sight mm"),
-                tuple(
-                    (gap.name, gap.points, *(1e3 * float(v) for v in gap.lengths()))
-                    for gap in self.by_target
-                ),
-                ("", "d", *(".4f",) * 6),
-            ),
-            Table(
-                "by joint: errors as a turn of each, and what a function of it alone explains",
-                ("joint", "RMS mrad|mm", "share", "p"),
-                tuple((gap.joint, 1e3 * gap.rms, gap.share, gap.p) for gap in self.by_joint),
-                ("", ".4f", ".3f", ".2g"),
-            ),
-            Table(
-                "by direction",
-                ("direction", "RMS mm"),
-                tuple((name, 1e3 * rms) for name, rms in self.by_direction.items()),
-                ("", ".4f"),
-            ),
-            Table(
-                "by region",
-                ("region", "points", "RMS mm"),
-                tuple((cell.name, cell.points, 1e3 * cell.rms) for cell in self.by_region),
-                ("", "d", ".4f"),
-            ),
-            Table(
-                "trends",
-                ("against", "share", "p"),
-                (
-                    ("visit order", self.order.share, self.order.p),
-                    ("temperature", self.temperature.share, self.temperature.p),
-                ),
-                ("", ".3f", ".2g"),
-            ),
-        )
+        return dict(plain(whole))
 
 
 def triage_table(triage: Triage) -> Table:

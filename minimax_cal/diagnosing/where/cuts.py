@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from minimax_cal.diagnosing.where.gaps import Region, TargetGap
-from minimax_cal.diagnosing.where.rows import root
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 
 
 def by_target(names: tuple[str, ...], error: Array, sight: Array) -> tuple[TargetGap, ...]:
@@ -21,7 +20,7 @@ def by_target(names: tuple[str, ...], error: Array, sight: Array) -> tuple[Targe
             gaps.append(TargetGap(name, 0, math.nan, math.nan, np.full(3, np.nan), math.nan))
             continue
         along = float((rows * away[seen]).sum(axis=1).mean())
-        gaps.append(TargetGap(name, len(rows), root(far), float(far.max()), rows.mean(0), along))
+        gaps.append(TargetGap(name, len(rows), rms(far), float(far.max()), rows.mean(0), along))
     return tuple(gaps)
 
 
@@ -41,8 +40,8 @@ def by_direction(error: Array, point: Array, sight: Array, up: Array) -> dict[st
         "vertical": error @ (up / np.linalg.norm(up)),
         "along_sight": (error * sight).sum(-1),
     }
-    out = {name: root(values) for name, values in along.items()}
-    square = 3.0 * root(error) ** 2 - out["along_sight"] ** 2
+    out = {name: rms(values) for name, values in along.items()}
+    square = 3.0 * rms(error) ** 2 - out["along_sight"] ** 2
     return out | {"across_sight": math.sqrt(max(0.0, 0.5 * square))}
 
 
@@ -76,6 +75,6 @@ def by_region(error: Array, point: Array, up: Array) -> tuple[Region, ...]:
             if inside.sum() < 9:  # the RMS of a few points is luck
                 continue
             edges = (float(rings[i]), float(rings[i + 1])), (float(floors[j]), float(floors[j + 1]))
-            rms = float(np.sqrt(square[inside].mean()))
-            cells.append(Region(f"{far} and {high}", *edges, int(inside.sum()), rms))
+            size = float(np.sqrt(square[inside].mean()))
+            cells.append(Region(f"{far} and {high}", *edges, int(inside.sum()), size))
     return tuple(cells)

@@ -8,11 +8,6 @@ from dataclasses import dataclass
 from minimax_cal.ground.arrays import Array
 
 
-def plain(value: float, scale: float = 1.0) -> float | None:
-    """A number for JSON: NaN and infinity are null."""
-    return float(value) * scale if math.isfinite(value) else None
-
-
 @dataclass(frozen=True, eq=False)
 class TargetGap:
     """Errors of one target.  mean: (3,) in base axes; sight: mean along the line of sight [m]."""
@@ -24,19 +19,15 @@ class TargetGap:
     mean: Array
     sight: float
 
-    def lengths(self) -> tuple[float, ...]:
-        """RMS, worst, mean x, y, z, mean along the line of sight [m]."""
-        return (self.rms, self.worst, *self.mean, self.sight)
-
     def to_dict(self) -> dict[str, object]:
         """For JSON, in millimetres."""
         return {
             "target": self.name,
             "points": self.points,
-            "rms_mm": plain(self.rms, 1e3),
-            "max_mm": plain(self.worst, 1e3),
-            "mean_mm": [plain(v, 1e3) for v in self.mean],
-            "mean_sight_mm": plain(self.sight, 1e3),
+            "rms_mm": 1e3 * self.rms,
+            "max_mm": 1e3 * self.worst,
+            "mean_mm": 1e3 * self.mean,
+            "mean_sight_mm": 1e3 * self.sight,
         }
 
 
@@ -55,9 +46,9 @@ class JointGap:
         unit = "mm" if self.sliding else "mrad"
         return {
             "joint": self.joint,
-            f"rms_{unit}": plain(self.rms, 1e3),
-            "share": plain(self.share),
-            "p": plain(self.p),
+            f"rms_{unit}": 1e3 * self.rms,
+            "share": self.share,
+            "p": self.p,
         }
 
 
@@ -78,7 +69,7 @@ class Region:
             "radius_mm": [1e3 * edge for edge in self.radius],
             "height_mm": [1e3 * edge for edge in self.height],
             "points": self.points,
-            "rms_mm": plain(self.rms, 1e3),
+            "rms_mm": 1e3 * self.rms,
         }
 
 
@@ -92,7 +83,7 @@ class Part:
 
     def to_dict(self) -> dict[str, object]:
         """For JSON, in millimetres."""
-        return {"rms_mm": plain(self.rms, 1e3), "share": plain(self.share), "p": plain(self.p)}
+        return {"rms_mm": 1e3 * self.rms, "share": self.share, "p": self.p}
 
 
 CANNOT_TELL = Part(math.nan, math.nan, math.nan)
@@ -109,7 +100,7 @@ class Trend:
         """For JSON; null where the data hold no such column."""
         if math.isnan(self.share):
             return None
-        return {"share": plain(self.share), "p": plain(self.p)}
+        return {"share": self.share, "p": self.p}
 
 
 @dataclass(frozen=True)

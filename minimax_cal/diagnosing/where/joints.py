@@ -9,9 +9,9 @@ import numpy as np
 from minimax_cal.diagnosing.where.features import WAVES, waves
 from minimax_cal.diagnosing.where.gaps import JointGap
 from minimax_cal.diagnosing.where.residual import Residual
-from minimax_cal.diagnosing.where.rows import blocks, joint_rows, root
+from minimax_cal.diagnosing.where.rows import blocks, joint_rows
 from minimax_cal.diagnosing.where.significance import explained
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.measurements import Measurements
 
 
@@ -49,5 +49,5 @@ def by_joint(
         size = float((motion[:, :, j] ** 2).sum())
         share, p = explained(rest, tall[:, :, j], size)
         sliding = bool(data.sliding[j])
-        gaps.append(JointGap(f"J{j + 1}", sliding, root(turn[:, j]), share, p))
+        gaps.append(JointGap(f"J{j + 1}", sliding, rms(turn[:, j]), share, p))
     return tuple(gaps)

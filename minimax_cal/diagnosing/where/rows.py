@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
@@ -51,9 +49,3 @@ def summed(rows: Array, group: Array) -> Array:
     out = np.zeros((place.max() + 1, *rows.shape[1:]))
     np.add.at(out, place, rows)
     return out
-
-
-def root(values: Array) -> float:
-    """Root of the mean square, NaN left out; NaN if nothing is left."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan

@@ -7,7 +7,7 @@ or two targets, the residual of a fit must stand out grossly.
 
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.faults.fault import Amount, Fault
-from minimax_cal.measuring.faults.find import find_faults, mended
+from minimax_cal.measuring.faults.find import find_faults, in_lines, mended
 from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
 from minimax_cal.measuring.faults.nests import target_shifts
 from minimax_cal.measuring.faults.outliers import outlying
@@ -18,6 +18,7 @@ __all__ = [
     "Amount",
     "Fault",
     "find_faults",
+    "in_lines",
     "looks_read_back",
     "mended",
     "mixed_units",

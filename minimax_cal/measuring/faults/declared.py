@@ -34,11 +34,8 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
         Fault(
             "noise",
             "all",
-            np.zeros(0, dtype=int),
-            np.zeros(0, dtype=int),
-            (Amount("u95", seen, np.nan, "m"), Amount("declared", declared, np.nan, "m")),
             f"column u95_mm says {1e3 * declared:.3g} mm, {by} say {1e3 * seen:.3g} mm",
-            notice=True,
+            parameters=(Amount("u95", seen, "m"), Amount("declared", declared, "m")),
         ),
     )
 

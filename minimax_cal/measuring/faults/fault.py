@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 
 NO_ERROR: Array = np.zeros((0, 0, 3))
+NONE: Array = np.zeros(0, dtype=int)
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,8 @@ class Amount:
 
     name: str
     value: float
-    sigma: float
-    unit: str
+    unit: str = ""
+    sigma: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +31,14 @@ class Fault:
     rows: (r,) rows of the data; of a shift all rows after it, as visited.
     targets: outliers (r,) the target of each row; swapped rows (r, k) in whose columns each
     target stands; shift: which nest it can be; else of length 0.
-    notice: whether the data may be used as they are.
     """
 
     effect: str
     place: str
-    rows: Array
-    targets: Array
-    parameters: tuple[Amount, ...]
     text: str
-    notice: bool = False
+    rows: Array = field(default_factory=lambda: NONE)
+    targets: Array = field(default_factory=lambda: NONE)
+    parameters: tuple[Amount, ...] = ()
 
 
 def listed(names: list[str], most: int = 8) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
@@ -43,3 +46,8 @@ def mended(data: Measurements, faults: tuple[Fault, ...]) -> Measurements:
         if fault.effect == "outliers":
             y[fault.rows, fault.targets] = np.nan
     return data.with_y(y)
+
+
+def in_lines(data: Measurements, faults: Sequence[Fault], *effects: str) -> list[Fault]:
+    """Faults of some kinds, their rows as lines of the file."""
+    return [replace(f, rows=data.line[f.rows]) for f in faults if f.effect in effects]

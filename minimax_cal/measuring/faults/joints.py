@@ -89,15 +89,13 @@ def unsettled(data: Measurements) -> tuple[Fault, ...]:
         Fault(
             "readback",
             "all",
-            np.flatnonzero(known),
-            np.zeros(0, dtype=int),
-            (
-                Amount("rms", size, np.nan, "rad"),
-                Amount("fraction", middle, np.nan, ""),
-                Amount("explained", found.explained, np.nan, ""),
-            ),
             says,
-            notice=middle >= 0.0,
+            np.flatnonzero(known),
+            parameters=(
+                Amount("rms", size, "rad"),
+                Amount("fraction", middle),
+                Amount("explained", found.explained),
+            ),
         ),
     )
 
@@ -125,15 +123,14 @@ def looks_read_back(data: Measurements, error: Array, push: Array) -> tuple[Faul
         Fault(
             "readback",
             "all",
-            rows,
-            np.zeros(0, dtype=int),
-            (
-                Amount("fraction", middle, np.nan, ""),
-                Amount("explained", own.explained, np.nan, ""),
-                Amount("explained_by_sign", sign.explained, np.nan, ""),
-            ),
             "the joints look read back before the arm had settled: "
             f"{100 * own.explained:.0f} % of the errors lie along each pose's last move, by a "
             "fraction of its own; give the commanded joints",
+            rows,
+            parameters=(
+                Amount("fraction", middle),
+                Amount("explained", own.explained),
+                Amount("explained_by_sign", sign.explained),
+            ),
         ),
     )

@@ -42,12 +42,12 @@ def target_shifts(data: Measurements) -> tuple[Fault, ...]:
     faults: list[Fault] = []
     while len(faults) < MOST_STEPS and (step := find_step(off, apart)):
         off = off.copy()
-        off[:, step[0].at :] -= (step[0].change * apart.of(int(step[0].targets[0])))[:, None]
-        faults.append(shift_of(data, order, apart, step[0]))
+        off[:, step.at :] -= (step.change * apart.of(int(step.targets[0])))[:, None]
+        faults.append(shift_of(data, order, apart, step))
     return tuple(faults)
 
 
-def find_step(off: Array, apart: Between) -> list[Step]:
+def find_step(off: Array, apart: Between) -> Step | None:
     """The clearest step, if one is beyond chance.  off: (p, m) by visit, NaN not measured [m].
 
     Ranks, so that no outlier counts for more than one visit; each pair's scan over all places is
@@ -63,7 +63,7 @@ def find_step(off: Array, apart: Between) -> list[Step]:
             place[pair] = known[first]
     limit = float(stats.chi2.isf(FALSE_ALARM / max(pairs * m, 1), 1))
     if not pairs or best.max() < limit:
-        return []
+        return None
     at = int(place[best.argmax()])
     before, after = off[:, :at], off[:, at:]
     many = np.isfinite(before).sum(axis=1), np.isfinite(after).sum(axis=1)
@@ -82,11 +82,11 @@ def find_step(off: Array, apart: Between) -> list[Step]:
     strength = (change / sigma) ** 2
     rest = np.array([strength[~apart.of(i)].sum() for i in range(int(apart.pairs.max()) + 1)])
     if np.abs(change[told]).max() < MATTERS * float(np.median(scatter(inside))):
-        return []
+        return None
     order = np.argsort(rest, kind="stable")
     targets = order[rest[order] <= rest.min() + ALIKE]
     at = place_of(off[told], change[told], scatter(inside), at)
-    return [Step(at, targets, change, sigma)]
+    return Step(at, targets, change, sigma)
 
 
 def place_of(off: Array, change: Array, sigma: Array, at: int) -> int:
@@ -131,16 +131,16 @@ def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fa
     own = np.flatnonzero(apart.of(first) & np.isfinite(step.sigma))
     size = in_plane(apart, own, first, step.change[own])
     rows = order[step.at :]
-    amounts = [Amount("size", size, float(step.sigma[own].max()), "m")]
+    amounts = [Amount("size", size, "m", float(step.sigma[own].max()))]
     for pair in own:
         a, b = (data.target_names[i] for i in apart.pairs[pair])
-        amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), float(step.sigma[pair]), "m"))
+        amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), "m", float(step.sigma[pair])))
     place = " or ".join(data.target_names[i] for i in step.targets)
     text = (
         f"{place} moved by {1e3 * size:.3g} mm or more before line {data.line[rows[0]]} "
         f"(visit {step.at + 1} of {len(order)})"
     )
-    return Fault("target_shift", place, rows, step.targets, tuple(amounts), text)
+    return Fault("target_shift", place, text, rows, step.targets, tuple(amounts))
 
 
 def in_plane(apart: Between, own: Array, target: int, change: Array) -> float:

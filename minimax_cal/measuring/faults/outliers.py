@@ -45,10 +45,10 @@ def outlying(
         Fault(
             "outliers",
             places[0] if len(places) == 1 else "all",
+            f"points that are elsewhere, by {by}: {named}",
             rows,
             targets,
-            (Amount("points", float(len(points)), np.nan, ""),),
-            f"points that are elsewhere, by {by}: {named}",
+            (Amount("points", float(len(points))),),
         ),
     )
 

@@ -22,11 +22,10 @@ def mixed_units(data: Measurements) -> tuple[Fault, ...]:
         Fault(
             "mixed_units",
             "all",
-            np.flatnonzero(session == other),
-            np.zeros(0, dtype=int),
-            (Amount("ratio", ratio, np.nan, ""),),
             f"{what} from line {data.line[np.argmax(session == other)]} on ({word}) are about "
             f"{ratio:.3g} times those of the first session: another unit?",
+            np.flatnonzero(session == other),
+            parameters=(Amount("ratio", ratio),),
         )
         for other in range(1, int(session.max()) + 1)
         for what, word, ratio in strange_ratios(data, session == 0, session == other)
@@ -90,12 +89,10 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
         Fault(
             "session_jump",
             "frame",
-            rows[label > label[0]],
-            np.zeros(0, dtype=int),
-            (Amount("size", jump, np.nan, "m"),),
             "the whole robot stands elsewhere from session to session (about "
             f"{1e3 * jump:.3g} mm): was the instrument or the base moved, or is the workspace "
             "another one?",
-            notice=True,
+            rows[label > label[0]],
+            parameters=(Amount("size", jump, "m"),),
         ),
     )

@@ -42,10 +42,10 @@ def swapped_rows(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ..
         Fault(
             "swapped_rows",
             "all",
+            f"targets stand under each other's names in {len(rows)} rows: lines {lines}",
             np.array(rows),
             np.stack(orders),
-            (Amount("rows", float(len(rows)), np.nan, ""),),
-            f"targets stand under each other's names in {len(rows)} rows: lines {lines}",
+            (Amount("rows", float(len(rows))),),
         ),
     )
 

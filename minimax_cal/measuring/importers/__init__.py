@@ -161,27 +161,12 @@ def import_files(
     """
     if not files:
         raise OptionError("name a file to import")
-    if layout not in LAYOUTS:
-        raise OptionError(f"--layout {layout!r}: write pose or target")
-    sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
-    if sign not in ("", *DECIMALS):
-        raise OptionError(f"--decimal {decimal!r}: write comma or point")
-    if not isinstance(units, Mapping):
-        units = units_of([units] if isinstance(units, str) else units)
-    told = Told(columns, units, layout, sign)
+    told = told_by(columns, units, layout, decimal)
     readings = [read_any(path, told) for path in files]
     points = [reading for reading in readings if reading.smrs]
     turns = [reading for reading in readings if reading.joints]
-    alone = [reading for reading in turns if not reading.smrs]
     if joints is not None:
-        held = read_any(joints, told, joints=True)
-        if not held.joints:
-            raise DataError(f"{joints}: holds no joint values; name its columns q1_deg, q2_deg ...")
-        if turns:
-            raise DataError(
-                f"{turns[0].sheet.path}: holds joint values, as --joints {joints} does; leave one "
-                "of them out"
-            )
+        held = file_of_joints(joints, turns, told)
     elif len(turns) == 1:
         held = turns[0]
     elif turns:
@@ -195,7 +180,7 @@ def import_files(
         raise DataError(
             f"{held.sheet.path}: holds joint values but no points; add the tracker's file"
         )
-    neither = [r for r in readings if r not in points and r not in alone]
+    neither = [reading for reading in readings if not (reading.smrs or reading.joints)]
     if neither:
         raise DataError(f"{neither[0].sheet.path}: holds neither points nor joint values")
     if held not in points or len(points) == 1:
@@ -206,6 +191,33 @@ def import_files(
         f"{other.sheet.path}: holds points without joints, but {held.sheet.path} holds both; "
         "import it alone"
     )
+
+
+def told_by(
+    columns: str, units: str | Sequence[str] | Mapping[str, str], layout: str, decimal: str
+) -> Told:
+    """What the user says about files.  Raises OptionError."""
+    if layout not in LAYOUTS:
+        raise OptionError(f"--layout {layout!r}: write pose or target")
+    sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
+    if sign not in ("", *DECIMALS):
+        raise OptionError(f"--decimal {decimal!r}: write comma or point")
+    if not isinstance(units, Mapping):
+        units = units_of([units] if isinstance(units, str) else units)
+    return Told(columns, units, layout, sign)
+
+
+def file_of_joints(path: Path | str, turns: Sequence[Reading], told: Told) -> Reading:
+    """The file named for joint values.  turns: other files that hold some.  Raises DataError."""
+    held = read_any(path, told, joints=True)
+    if not held.joints:
+        raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
+    if turns:
+        raise DataError(
+            f"{turns[0].sheet.path}: holds joint values, as --joints {path} does; leave one "
+            "of them out"
+        )
+    return held
 
 
 def no_joints(points: Sequence[Reading]) -> str:

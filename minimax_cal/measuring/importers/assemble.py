@@ -82,6 +82,15 @@ class Scales:
     why_y: str
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A file, the pose (m,) of each of its rows, and which target its columns smr1 ... are."""
+
+    reading: Reading
+    pose: Array
+    targets: Mapping[str, str]
+
+
 def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly:
     """Measurements from files of points and the file of joints (which may be one).
 
@@ -90,54 +99,21 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
     points = in_file_order(list(points))
     places = [place(reading, joints, told.layout) for reading in points]
     poses = len(joints.line)
-    q_units = [unit_of(column, told)[0] for column in joints.joints]
-    sliding = np.array([unit in LENGTHS for unit in q_units])
-    turning = [(joints, c) for c, slides in zip(joints.joints, sliding, strict=True) if not slides]
-    spots = [(r, c) for r in points for c in r.columns if c.family == "smr"]
-    q_unit = one_unit(turning, told, ANGLES)
-    y_unit = one_unit(spots, told, LENGTHS)
-    if q_unit == MIXED:
-        raise DataError(f"{joints.sheet.path}: joint columns mix units of angle; use one of them")
-    raw_q = np.stack([joints.numbers(column, empty=False) for column in joints.joints], axis=1)
-    raw, names = raw_points(points, places, poses, told if y_unit == MIXED else None)
-    where = (joints.sheet.path, points[0].sheet.path)
-    scales = Scales(*decide(raw_q, raw, q_unit, "m" if y_unit == MIXED else y_unit, sliding, where))
-    scale = [LENGTHS.get(unit, ANGLES[scales.q]) for unit in q_units]
-    readings = tuple(points) if joints in points else (*points, joints)
-    columns: dict[str, Array] = {}
-    unknown: dict[str, Array] = {}
-    meanings = []
-    stamped = False
+    raw = raw_of(points, places, joints, told)
     called = callings(points, places)
-    for i, reading in enumerate(readings):
-        alone = reading is joints and joints not in points
-        pose = np.arange(poses) if alone else places[i].pose
-        mine = []
-        for column in reading.columns:
-            if alone and column.family in ("smr", "target"):
-                column = replace(column, meaning="", remark="points come from the other file")
-            who = "" if alone else called[i].get(column.meaning.partition("_")[0], "")
-            found = understood(reading, column, told, scales, who)
-            mine.append(found.meaning)
-            stamped |= found.meaning.known.startswith(STAMPED)
-            if len(found.values) and found.kept:
-                unknown[column.name] = spread(found.values, pose, poses, "first")
-            elif len(found.values):
-                name = column.meaning
-                values = spread(found.values, pose, poses, name)
-                columns[name] = together(name, columns[name], values) if name in columns else values
-        meanings.append(tuple(mine))
-    if stamped:
-        columns["time"] = columns["time"] - np.nanmin(columns["time"])
+    parts = [Part(r, at.pose, c) for r, at, c in zip(points, places, called, strict=True)]
+    if joints not in points:
+        parts.append(Part(without_points(joints), np.arange(poses), {}))
+    columns, unknown, meanings = gathered(parts, told, raw.scales, poses)
     targets = target_names(points, places)
-    for target, name in zip(targets, names, strict=True):
-        if name:
-            unknown[f"{target}_target"] = np.full(poses, name)
+    names = zip(targets, raw.names, strict=True)
+    unknown |= {f"{target}_target": np.full(poses, name) for target, name in names if name}
+    readings = tuple(part.reading for part in parts)
     data = Measurements(
-        q=raw_q * scale,
-        y=raw * LENGTHS[scales.y],
+        q=raw.q,
+        y=raw.y,
         target_names=targets,
-        sliding=sliding,
+        sliding=raw.sliding,
         line=joints.line,
         columns=columns,
         unknown=unknown,
@@ -146,7 +122,74 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
         digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
-    return Assembly(check_finite(data), readings, tuple(meanings), matched)
+    return Assembly(check_finite(data), readings, meanings, matched)
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """Joints q (m, n) and points y (m, k, 3) in SI, the targets' names, and the units they had.
+
+    sliding: (n,) True where a joint slides.
+    """
+
+    q: Array
+    y: Array
+    names: tuple[str, ...]
+    sliding: Array
+    scales: Scales
+
+
+def raw_of(points: Sequence[Reading], places: Sequence[Places], joints: Reading, told: Told) -> Raw:
+    """The numbers of joints and points, their units decided.  Raises DataError."""
+    q_units = [unit_of(column, told)[0] for column in joints.joints]
+    sliding = np.array([unit in LENGTHS for unit in q_units])
+    turning = [(joints, c) for c, slides in zip(joints.joints, sliding, strict=True) if not slides]
+    q_unit = one_unit(turning, told, ANGLES)
+    coordinates = [(r, c) for r in points for c in r.columns if c.family == "smr"]
+    y_unit = one_unit(coordinates, told, LENGTHS)
+    if q_unit == MIXED:
+        raise DataError(f"{joints.sheet.path}: joint columns mix units of angle; use one of them")
+    q = np.stack([joints.numbers(column, empty=False) for column in joints.joints], axis=1)
+    mixed = y_unit == MIXED
+    y, names = raw_points(points, places, len(q), told if mixed else None)
+    where = (joints.sheet.path, points[0].sheet.path)
+    scales = Scales(*decide(q, y, q_unit, "m" if mixed else y_unit, sliding, where))
+    scale = [LENGTHS.get(unit, ANGLES[scales.q]) for unit in q_units]
+    return Raw(q * scale, y * LENGTHS[scales.y], names, sliding, scales)
+
+
+def without_points(joints: Reading) -> Reading:
+    """A file of joints whose own points do not count."""
+    remark = "points come from the other file"
+    columns = tuple(
+        replace(c, meaning="", remark=remark) if c.family in ("smr", "target") else c
+        for c in joints.columns
+    )
+    return replace(joints, columns=columns)
+
+
+def gathered(
+    parts: Sequence[Part], told: Told, scales: Scales, poses: int
+) -> tuple[dict[str, Array], dict[str, Array], tuple[tuple[Meaning, ...], ...]]:
+    """Columns that something uses, columns that are only kept, and the meanings in each file."""
+    columns: dict[str, Array] = {}
+    unknown: dict[str, Array] = {}
+    meanings = []
+    for part in parts:
+        mine = []
+        for column in part.reading.columns:
+            name, target = column.meaning, part.targets.get(column.meaning.partition("_")[0], "")
+            found = understood(part.reading, column, told, scales, target)
+            mine.append(found.meaning)
+            if len(found.values) and found.kept:
+                unknown[column.name] = spread(found.values, part.pose, poses, "first")
+            elif len(found.values):
+                values = spread(found.values, part.pose, poses, name)
+                columns[name] = together(name, columns[name], values) if name in columns else values
+        meanings.append(tuple(mine))
+    if any(meaning.known.startswith(STAMPED) for mine in meanings for meaning in mine):
+        columns["time"] = columns["time"] - np.nanmin(columns["time"])
+    return columns, unknown, tuple(meanings)
 
 
 def target_names(points: Sequence[Reading], places: Sequence[Places]) -> tuple[str, ...]:
@@ -217,25 +260,19 @@ def understood(
     """What a column means, with its values in SI.  who: the target of a point."""
     unit, known = unit_of(column, told)
     first = next((cell for cell in column.cells if cell), "")
-    family, path = column.family, reading.sheet.path
+    family = column.family
     if not column.meaning:
-        kept = column.remark == contract.KEPT
-        what = "kept" if kept else "left out"
-        remark = "" if kept else column.remark
-        text = np.array(column.cells) if kept else NOTHING
-        return Understood(Meaning(column, what, unit, remark, first if kept else ""), text, kept)
+        return left_over(column, unit, first)
     if family == "q":
         unit, known = (unit, known) if unit else (scales.q, scales.why_q)
-        slides = unit in LENGTHS
         value = reading.number(column, 0, first) * (LENGTHS | ANGLES)[unit]
-        what = f"joint {column.meaning[1:]}"
-        si = f"{value:.6g} {'m' if slides else 'rad'}"
-        return Understood(Meaning(column, what, unit, known, si), NOTHING)
+        si = f"{value:.6g} {'m' if unit in LENGTHS else 'rad'}"
+        return Understood(Meaning(column, f"joint {column.meaning[1:]}", unit, known, si), NOTHING)
     if family == "smr":
-        axis = column.meaning[-1]
         unit, known = (unit, known) if unit else (scales.y, scales.why_y)
         si = f"{reading.number(column, 0, first) * LENGTHS[unit]:.6g} m" if first else ""
-        return Understood(Meaning(column, f"{who} {axis}", unit, known, si), NOTHING)
+        what = f"{who} {column.meaning[-1]}"
+        return Understood(Meaning(column, what, unit, known, si), NOTHING)
     if family == "target":
         return Understood(Meaning(column, "name of the target", "", known, first), NOTHING)
     if family == "time":
@@ -250,11 +287,25 @@ def understood(
         return Understood(Meaning(column, what, unit, known, si), values)
     if family in TEXTS:
         return Understood(Meaning(column, family, "", known, first), np.array(column.cells))
+    return optional(reading, column, unit, known)
+
+
+def left_over(column: Column, unit: str, first: str) -> Understood:
+    """A column that means nothing: kept as text, or left out."""
+    if column.remark == contract.KEPT:
+        return Understood(Meaning(column, "kept", unit, "", first), np.array(column.cells), True)
+    return Understood(Meaning(column, "left out", unit, column.remark, ""), NOTHING)
+
+
+def optional(reading: Reading, column: Column, unit: str, known: str) -> Understood:
+    """An optional column of numbers.  Raises DataError where it needs a unit and has none."""
+    family = column.family
     factors = OF_UNIT.get(family, {})
     if factors and unit not in factors:
         what = f"{unit} is no unit for it" if unit else "has no unit"
         raise DataError(
-            f"{path}: column {column.name}: {what}; add --units {family}={next(iter(factors))}"
+            f"{reading.sheet.path}: column {column.name}: {what}; add --units "
+            f"{family}={next(iter(factors))}"
         )
     values = reading.numbers(column) * factors.get(unit, 1.0)
     if not np.isfinite(values).any():

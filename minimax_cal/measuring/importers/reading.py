@@ -45,6 +45,12 @@ class Told:
     decimal: str = ""
 
 
+def family_of(meaning: str) -> str:
+    """A column's meaning without numbers and axes."""
+    found = re.match(r"u95|[a-z]+", meaning)
+    return found[0] if found else ""
+
+
 @dataclass(frozen=True)
 class Column:
     """One column: its name, what it means (as q3, smr1_x, u95, or '' for nothing), its unit.
@@ -62,7 +68,7 @@ class Column:
     @property
     def family(self) -> str:
         """Meaning without numbers and axes: q, smr, u95."""
-        return re.match(r"u95|[a-z]+", self.meaning)[0] if self.meaning else ""  # type: ignore[index]
+        return family_of(self.meaning)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,15 +166,13 @@ def named_reading(
     columns = []
     for i, name in enumerate(sheet.header):
         stem, unit = split_unit(name)
-        what = meaning(stem.lower())
-        column = Column(name, what, unit, tuple(row[i] for row in sheet.cells), "header")
+        what, known = meaning(stem.lower()), "header"
         if not unit:
-            fixed = (units or {}).get(column.family, "") if what else ""
-            column = Column(name, what, fixed, column.cells, "format" if fixed else "")
-        if not what:
-            remark = (remarks or {}).get(stem.lower(), "")
-            column = Column(name, "", column.unit, column.cells, column.known, remark)
-        columns.append(column)
+            unit = (units or {}).get(family_of(what), "")
+            known = "format" if unit else ""
+        remark = "" if what else (remarks or {}).get(stem.lower(), "")
+        cells = tuple(row[i] for row in sheet.cells)
+        columns.append(Column(name, what, unit, cells, known, remark))
     return checked(Reading(title, sheet, tuple(columns), sheet.line))
 
 

@@ -12,11 +12,10 @@ from minimax_cal.modelling.effects.scene import (
     Columns,
     Effect,
     Scene,
-    centres,
     joint_of,
     principal,
 )
-from minimax_cal.robots.gravity import G
+from minimax_cal.robots.gravity import G, centres
 from minimax_cal.robots.kinematics import cross
 
 SHORT = 0.1  # of the reach: shorter links are stiff

@@ -12,11 +12,10 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import G, torques
+from minimax_cal.robots.gravity import MASS_PER_METRE, G, centres, torques
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
-MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]
 MASS_DOUBT = 0.2  # relative sigma of the masses and centres of gravity in a robot file
 LEAST_ARM = 0.02  # sigma of a centre of gravity, where 20 % of it is less [m]
 
@@ -184,13 +183,6 @@ class Scene:
         weight = -G * self.robot.up[:, None] * self.column("payload")
         moment = moment + kinematics.cross(tip, weight)
         return moment, np.full(self.poses, total) + self.column("payload")
-
-
-def centres(links: Chain, com: Array) -> Array:
-    """(n, 3, m) centres of gravity in the base frame [m].  com: (n, 3) in the link frames."""
-    z = np.concatenate([links.z[1:], links.axes[2:]])
-    axes = np.stack([kinematics.cross(links.y, z), links.y, z], axis=1)
-    return np.asarray(links.after + np.einsum("naim,na->nim", axes, com))
 
 
 @dataclass(frozen=True, eq=False)

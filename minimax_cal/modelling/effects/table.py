@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
 from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE
 from minimax_cal.modelling.effects.gears import (
@@ -211,13 +212,8 @@ class Fitted:
     def to_list(self) -> list[dict[str, object]]:
         """For JSON, in SI; an infinite time constant is null."""
         return [
-            {
-                "effect": term.effect,
-                "place": term.place,
-                "choice": {k: v if np.isfinite(v) else None for k, v in term.choice.items()},
-                "values": [float(v) for v in value],
-            }
-            for term, value in zip(self.terms, self.values, strict=True)
+            plain({"effect": t.effect, "place": t.place, "choice": t.choice, "values": value})
+            for t, value in zip(self.terms, self.values, strict=True)
         ]
 
 

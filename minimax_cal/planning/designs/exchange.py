@@ -89,11 +89,10 @@ def floor(menu: Menu, pull: Array, count: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """chosen: (n,) experiments.  size: of their covariance.  swaps: how many led there."""
+    """chosen: (n,) experiments.  size: of their covariance."""
 
     chosen: Array
     size: float
-    swaps: int = 0
 
 
 def exchange(
@@ -113,10 +112,10 @@ def exchange(
     offer = menu.rows[some]
     chosen = np.array(start)
     info = menu.of(chosen)
-    best, swaps = size_of(criterion, info), 0
+    best = size_of(criterion, info)
     ridge = RIDGE * np.diag(np.maximum(np.diag(info), 1e-300))
     for _ in range(sweeps):
-        before = swaps
+        swapped = False
         for place in range(len(chosen)):
             own = menu.rows[chosen[place]]
             rest = info - own.T @ own
@@ -128,13 +127,13 @@ def exchange(
             sizes = sizes_of(criterion, trial)
             if len(sizes) and sizes.min() < best * (1.0 - BETTER):
                 winner = int(np.argmin(sizes))
-                best, swaps = float(sizes[winner]), swaps + 1
+                best, swapped = float(sizes[winner]), True
                 chosen[place] = some[short[winner]]
                 info = trial[winner]
-        if swaps == before:
+        if not swapped:
             break
         info = menu.of(chosen)  # rounding does not add up
-    return Design(chosen, size_of(criterion, menu.of(chosen)), swaps)
+    return Design(chosen, size_of(criterion, menu.of(chosen)))
 
 
 def greedy(menu: Menu, criterion: Criterion, count: int) -> Array:

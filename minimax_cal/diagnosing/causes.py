@@ -1,0 +1,223 @@
+"""What explains the errors that geometry leaves: effects, their rivals, and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of, structure
+from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
+from minimax_cal.diagnosing.result import Alternative, Finding
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence import selection
+from minimax_cal.evidence.alternatives import ENOUGH, alternatives
+from minimax_cal.evidence.selection import Choice, Library
+from minimax_cal.fitting.options import Progress
+from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
+from minimax_cal.modelling.effects.table import Term
+
+LEVEL = 0.01  # chance that noise alone is called structure
+MATTERS = 0.015  # share of what was explained below which more structure is of no account
+OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+ADVISED = 3  # rivals of an effect for which a further measurement is worked out
+
+
+@dataclass(frozen=True, eq=False)
+class Causes:
+    """What may be wrong.
+
+    faults: of the data.  choice: the effects selected, effects: as findings, the weightiest first.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.
+    """
+
+    faults: tuple[Fault, ...]
+    choice: Choice
+    effects: tuple[Finding, ...]
+    traces: tuple[Trace, ...]
+    untestable: tuple[tuple[str, str], ...]
+
+
+def causes_of(
+    study: Study, faults: Sequence[Fault], exclude: Sequence[str], progress: Progress
+) -> Causes:
+    """The effects that explain a study's errors, beside faults that are known."""
+    progress("effects")
+    library, choice = chosen(study, exclude)
+    read_back = read_back_fault(study, choice)
+    if read_back:  # what is left of a move looks like play in the gears
+        library, choice = chosen(study, (*exclude, "backlash"))
+    progress("what remains")
+    traces = structure(study.scene, study.rows, choice.noise, choice.known)
+    if choice.noise.variance < selection.EXACT**2:
+        traces = (Trace("rounding", 1.0, 0.0),)
+    effects = merged([finding(study, choice, i) for i in by_weight(study, choice)])
+    return Causes((*faults, *read_back), choice, tuple(effects), traces, library.untestable)
+
+
+def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
+    """The library and what it explains."""
+    library = selection.library(study.scene, study.rows, exclude)
+    return library, selection.select(library, ripple="gear_ripple" not in exclude)
+
+
+def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
+    """A fault if the joint values look read back before the arm had settled.
+
+    Asked of what the effects leave: a joint that always lacks the same part of its move settles.
+    """
+    effects = {c.term.effect for c in choice.chosen}
+    if not effects & {"backlash", "settling"}:
+        return []
+    rest = rest_of(study.rows, choice.noise, choice.known)
+    error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
+    error = np.where(study.model.seen[..., None], error, np.nan)
+    error = error @ study.fit.state.rotation.T
+    push = np.einsum("ab,nkbm->kman", study.fit.state.rotation, study.scene.jacobian)
+    found = looks_read_back(study.data, error, push * study.robot.sign)
+    return in_lines(study.data, found, "readback")
+
+
+def by_weight(study: Study, choice: Choice) -> list[int]:
+    """The effects in the order in which each takes most of what is left, points weighing alike."""
+    rows, columns = study.rows, choice.library.columns
+    fields = [columns[:, one.candidate.main] for one in choice.fits]
+    fields = [field - rows.basis @ (rows.basis.T @ field) for field in fields]
+    rest, order = rows.error, []
+    waiting = list(range(len(fields)))
+    taken = np.zeros((len(rest), 0))
+    while waiting:
+        left = []
+        for i in waiting:
+            basis = np.linalg.qr(np.concatenate([taken, fields[i]], axis=1))[0]
+            left.append(float(((rest - basis @ (basis.T @ rest)) ** 2).sum()))
+        best = waiting.pop(int(np.argmin(left)))
+        taken = np.concatenate([taken, fields[best]], axis=1)
+        order.append(best)
+    return order
+
+
+def finding(study: Study, choice: Choice, number: int) -> Finding:
+    """An effect with its rivals, and what would tell the nearest of them apart."""
+    one, table = choice.fits[number], choice.benches[number]
+    found = alternatives(table, one)
+    advice = [""] * len(found)
+    unclear = [i for i, (_, _, power) in enumerate(found) if power < ENOUGH][:ADVISED]
+    if unclear:
+        site = Site(study.scene, study.model, study.fit.state, choice.noise)
+        others = [(f.candidate.term, f.value) for f in choice.fits if f is not one]
+        for i in unclear:
+            rival = found[i][0].candidate.term
+            advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
+    columns = one.candidate.term.columns(table.library.scene)
+    size, _ = table.setting(one).likeness(one, one.candidate)
+    return Finding(
+        terms=(one.candidate.term,),
+        names=columns.names,
+        units=columns.units,
+        values=tuple(float(v) for v in one.value),
+        sigmas=tuple(float(v) for v in one.sigma),
+        size=size,
+        p_value=table.p_value(one),
+        alternatives=tuple(
+            Alternative(
+                other.candidate.term.effect,
+                other.candidate.term.place,
+                rho2,
+                power,
+                one.evidence - other.evidence,
+                text,
+            )
+            for (other, rho2, power), text in zip(found, advice, strict=True)
+        ),
+        fixed=columns.fixed,
+    )
+
+
+def merged(findings: Sequence[Finding]) -> list[Finding]:
+    """Lines of one joint are one effect: their parameters together, the strongest first."""
+    out: dict[tuple[str, str], Finding] = {}
+    for found in findings:
+        key = (found.term.effect, found.term.place)
+        if found.term.effect == "gear_ripple":
+            turns = found.fixed["waves_per_turn"]
+            names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
+            found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
+        if key not in out:
+            out[key] = found
+            continue
+        first = out[key]
+        others = {(a.effect, a.place): a for a in (*first.alternatives, *found.alternatives)}
+        out[key] = replace(
+            first,
+            terms=(*first.terms, *found.terms),
+            names=(*first.names, *found.names),
+            units=(*first.units, *found.units),
+            values=(*first.values, *found.values),
+            sigmas=(*first.sigmas, *found.sigmas),
+            size=first.size + found.size,
+            p_value=max(first.p_value, found.p_value),
+            alternatives=tuple(others.values()),
+            fixed={**first.fixed, **found.fixed},
+        )
+    return list(out.values())
+
+
+def judged(
+    findings: Sequence[Finding], traces: Sequence[Trace], explained: float
+) -> tuple[str, tuple[str, float]]:
+    """The verdict; where what remains has structure, and the probability of that by chance.
+
+    explained: weighed square that the effects explain; structure far below it is of no account.
+    """
+    worst = min(traces, key=lambda trace: trace.p)
+    p = min(1.0, worst.p * len(traces))
+    loud = [t for t in traces if t.p * len(traces) < LEVEL and t.excess > MATTERS * explained]
+    if loud:
+        return "unknown", (min(loud, key=lambda t: t.p).name, p)
+    if patched(findings):
+        return "unknown", ("two laws for one joint may stand for one that is not known", p)
+    if not findings:
+        return "none", (worst.name, p)
+    several = any(found.alternatives for found in findings)
+    return ("one_of" if several else "named"), (worst.name, p)
+
+
+def explained(study: Study, choice: Choice) -> float:
+    """Weighed square that the effects explain."""
+    none = np.zeros((len(study.rows.error), 0))
+    without, left = (
+        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
+    )
+    return without - left
+
+
+def patched(findings: Sequence[Finding]) -> bool:
+    """Whether one joint needs two laws of its own angle: likely one law that is not known."""
+    by_angle = [f.term for f in findings if f.term.effect in OF_ANGLE]
+    joints = [t.place for t in by_angle if t.place != "all"]
+    twice = len(set(joints)) < len(joints)
+    return twice or (bool(joints) and any(t.place == "all" for t in by_angle))
+
+
+def fault_findings(faults: Sequence[Fault]) -> list[Finding]:
+    """Faults as entries of the list of effects, those of a kind together."""
+    out = []
+    for effect in dict.fromkeys(fault.effect for fault in faults):
+        same = [fault for fault in faults if fault.effect == effect]
+        places = {fault.place for fault in same}
+        amounts = [amount for fault in same for amount in fault.parameters]
+        out.append(
+            Finding(
+                terms=(Term(effect, places.pop() if len(places) == 1 else "all"),),
+                names=tuple(a.name for a in amounts),
+                units=tuple(a.unit for a in amounts),
+                values=tuple(a.value for a in amounts),
+                sigmas=tuple(a.sigma for a in amounts),
+                size=float("nan"),
+                p_value=float("nan"),
+                rows=tuple(sorted({int(row) for fault in same for row in fault.rows})),
+            )
+        )
+    return out
