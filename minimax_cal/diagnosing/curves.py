@@ -10,9 +10,9 @@ import numpy as np
 
 from minimax_cal.diagnosing.where import joint_equivalent
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.measuring.history import numbered, visits, with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.pose_rows import plain
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Fitted, Term

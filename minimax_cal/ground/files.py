@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from minimax_cal.ground.errors import CalibrationError
 
@@ -62,6 +67,19 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
 def json_text(content: object) -> str:
     """JSON as this project writes it; NaN, which JSON does not know, raises ValueError."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def plain(values: ArrayLike) -> Any:
+    """For JSON: nested lists, or one number; null where there is no finite number."""
+    values = np.asarray(values)
+    out = values.astype(object)
+    out[~np.isfinite(values)] = None
+    return out.tolist()
+
+
+def number(value: float | None) -> float:
+    """A number of a JSON; null is NaN."""
+    return math.nan if value is None else float(value)
 
 
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:

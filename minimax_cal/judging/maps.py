@@ -18,10 +18,10 @@ from scipy.stats import binned_statistic_2d, binom
 from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius, position_factor
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, Saved
-from minimax_cal.measuring.pose_rows import plain
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.robot import Robot
 

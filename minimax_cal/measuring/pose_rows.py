@@ -9,6 +9,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.files import plain
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements, measurements
 
@@ -42,13 +43,6 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
             for name, column in kept.items()
         },
     }
-
-
-def plain(values: Array) -> Any:
-    """Nested lists, null where there is no number."""
-    out = values.astype(object)
-    out[~np.isfinite(values)] = None
-    return out.tolist()
 
 
 def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, Array]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.diagnosing.where import CANNOT_TELL, Part, Triage, triage_table
+from minimax_cal.diagnosing.where import triage_table
+from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -18,18 +18,6 @@ from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import load_robot
 
 NOWHERE = "poses or joints at which it would show"
-
-
-def number(value: float | None) -> float:
-    """A number of a JSON; null is NaN."""
-    return math.nan if value is None else float(value)
-
-
-def part_of(entry: Mapping[str, Any] | None) -> Part:
-    """A part of the mean square from JSON."""
-    if entry is None:
-        return CANNOT_TELL
-    return Part(number(entry["rms_mm"]) * 1e-3, number(entry["share"]), number(entry["p"]))
 
 
 def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
@@ -55,9 +43,8 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         )
         for entry in where["by_joint"]
     )
-    parts = Triage(**{kind: part_of(entry) for kind, entry in where["triage"].items()})
     return (
-        triage_table(parts),
+        triage_table(where["triage"]),
         Table(
             "what geometry leaves, by target",
             ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),

@@ -12,13 +12,16 @@ from numpy.testing import assert_allclose
 from scipy.stats import binom
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.where import Where, joint_equivalent, maps, noise_of, where
-from minimax_cal.diagnosing.where.features import factors, levelled, smooth_rows
-from minimax_cal.diagnosing.where.mean_squares import lack_of_fit
-from minimax_cal.diagnosing.where.residual import orthonormal, residual_of
-from minimax_cal.diagnosing.where.rows import joint_rows
+from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, triage_table, where
+from minimax_cal.diagnosing.where.mean_squares import (
+    lack_of_fit,
+    scatter,
+    shape_energy,
+    shape_scatter,
+)
+from minimax_cal.diagnosing.where.residual import joint_rows, orthonormal, residual_of
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
-from minimax_cal.diagnosing.where.spread import scatter, shape_energy, shape_scatter
+from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import groups
 from minimax_cal.modelling.model import model_of
@@ -371,22 +374,6 @@ def test_joint_equivalent_is_the_turn(rng: np.random.Generator) -> None:
     assert np.quantile(off[:, :3], 0.9) < 1e-4
 
 
-def test_maps_follow_the_curve(rng: np.random.Generator) -> None:
-    made = scene(300, 3, 0)
-    turn = 1e-5 * rng.normal(size=(300, 6))
-    turn[:, 2] += 1e-4 * np.sin(made.data.q[:, 2])
-    found = maps(made.data, turn)
-    assert found.against == ("q1", "q2", "q3", "q4", "q5", "q6", "clock")
-    assert found.value.shape == found.sigma.shape == (7, 6, 25)
-    middle = slice(4, 21)
-    curve = 1e-4 * np.sin(found.grid[2, middle])
-    assert_allclose(found.value[2, 2, middle], curve, atol=2.5e-5)
-    off = np.abs(found.value[0, 4] / found.sigma[0, 4])
-    assert np.nanmax(off) < 5.0
-    assert np.ptp(found.value[2, 2]) > 5.0 * np.ptp(found.value[2, 3])
-    json.dumps(found.to_dict(), allow_nan=False)
-
-
 # ---------------------------------------------------------------- mean squares
 
 
@@ -503,19 +490,11 @@ def test_no_error_at_all() -> None:
     json.dumps(found.to_dict(), allow_nan=False)
 
 
-def test_tables_hold_the_numbers(rng: np.random.Generator) -> None:
-    found = scene().where(scene().noise(rng))
-    text = {table.title.split(":")[0]: table.text() for table in found.tables()}
-    assert set(text) == {
-        "kind of error",
-        "by target",
-        "by joint",
-        "by direction",
-        "by region",
-        "trends",
-    }
-    assert f"{1e3 * found.by_target[0].rms:.4f}" in text["by target"]
-    assert f"{found.triage.noise.share:.3f}" in text["kind of error"]
+def test_a_table_holds_the_numbers(rng: np.random.Generator) -> None:
+    triage = scene().where(scene().noise(rng)).triage
+    text = triage_table(triage.to_dict()).text()
+    assert f"{1e3 * triage.noise.rms:.4f}" in text
+    assert f"{triage.noise.share:.3f}" in text
 
 
 def test_a_real_arm() -> None:

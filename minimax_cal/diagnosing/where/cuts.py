@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 
-from minimax_cal.diagnosing.where.gaps import Region, TargetGap
-from minimax_cal.diagnosing.where.rows import root
-from minimax_cal.ground.arrays import Array
+from minimax_cal.diagnosing.where.answer import Region, TargetGap
+from minimax_cal.ground.arrays import Array, rms
 
 
 def by_target(names: tuple[str, ...], error: Array, sight: Array) -> tuple[TargetGap, ...]:
@@ -21,7 +20,7 @@ def by_target(names: tuple[str, ...], error: Array, sight: Array) -> tuple[Targe
             gaps.append(TargetGap(name, 0, math.nan, math.nan, np.full(3, np.nan), math.nan))
             continue
         along = float((rows * away[seen]).sum(axis=1).mean())
-        gaps.append(TargetGap(name, len(rows), root(far), float(far.max()), rows.mean(0), along))
+        gaps.append(TargetGap(name, len(rows), rms(far), float(far.max()), rows.mean(0), along))
     return tuple(gaps)
 
 
@@ -41,8 +40,8 @@ def by_direction(error: Array, point: Array, sight: Array, up: Array) -> dict[st
         "vertical": error @ (up / np.linalg.norm(up)),
         "along_sight": (error * sight).sum(-1),
     }
-    out = {name: root(values) for name, values in along.items()}
-    square = 3.0 * root(error) ** 2 - out["along_sight"] ** 2
+    out = {name: rms(values) for name, values in along.items()}
+    square = 3.0 * rms(error) ** 2 - out["along_sight"] ** 2
     return out | {"across_sight": math.sqrt(max(0.0, 0.5 * square))}
 
 
