@@ -25,7 +25,7 @@ from minimax_cal.cli.relative import relative_command
 from minimax_cal.cli.report import report_command
 from minimax_cal.cli.simulate import simulate_command
 from minimax_cal.cli.tradeoff import tradeoff_command
-from minimax_cal.fitting.plausibility import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.tables import Table

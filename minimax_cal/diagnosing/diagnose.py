@@ -21,8 +21,7 @@ from minimax_cal.evidence.noise import Noise, Rows, linearised
 from minimax_cal.evidence.selection import Choice, Library
 from minimax_cal.fitting.calibrate import Fit, Options, Progress, fit_cell, silent
 from minimax_cal.fitting.calibration import Provenance
-from minimax_cal.fitting.exchanged import misplaced, put_right
-from minimax_cal.fitting.plausibility import check_sense
+from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
@@ -225,7 +224,7 @@ def cleaned(
     found = find_faults(data)
     faults += in_lines(data, found, "swapped_rows", "outliers")
     data = mended(data, found)
-    check_sense(robot, data)
+    check_plausible(robot, data)
     train, _, _ = split(data, holdout, seed)
     progress("geometry")
     fit = fit_cell(robot, train, SUM, progress)

@@ -17,6 +17,7 @@ from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.calibration import Calibration, Parameter, Provenance
 from minimax_cal.fitting.certificate import Certificate, certify
+from minimax_cal.fitting.checks import POOR_FIT, check_plausible
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import (
     DISTANCE_FORMS,
@@ -24,7 +25,6 @@ from minimax_cal.fitting.minimax_problem import (
     measured_distances,
     minimax_problem,
 )
-from minimax_cal.fitting.plausibility import POOR_FIT, check_sense
 from minimax_cal.fitting.robust import SQUARE, Robust, check_robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
@@ -149,7 +149,7 @@ def calibrate(
         data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
         objective_of(chosen.objective, data)
     if len(np.unique(groups(train))) >= LEAST_POSES:
-        check_sense(robot, data)
+        check_plausible(robot, data)
     progress("start")
     fit = fit_cell(robot, train, chosen, progress)
     calibrated = Cell.of(robot, fit.state, data.target_names, fit.effects)

@@ -8,13 +8,13 @@ import numpy as np
 
 from minimax_cal.fitting.calibrate import WILD_ANGLE
 from minimax_cal.fitting.calibration import Parameter
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
 from minimax_cal.fitting.instruments.identify import has_scale
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import TARGET
-from minimax_cal.fitting.plausibility import POOR_FIT
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.robots.kinematics import MDH_NAMES
