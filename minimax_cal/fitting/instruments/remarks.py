@@ -23,7 +23,7 @@ WEAK = 3.0  # times what was measured: positions that are told worse are weakly 
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
 
-def scale_notices(fit: InstrumentFit) -> tuple[str, ...]:
+def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     """What stands for the length standard that closures lack."""
     kept = [
         name
@@ -39,7 +39,7 @@ def scale_notices(fit: InstrumentFit) -> tuple[str, ...]:
     )
 
 
-def offset_notices(
+def of_offsets(
     fit: InstrumentFit, parameters: tuple[Parameter, ...], options: RelativeOptions
 ) -> tuple[str, ...]:
     """How weakly the offsets of wires are determined."""
@@ -60,7 +60,7 @@ def offset_notices(
     )
 
 
-def remarks(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
+def general(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
     """What the reader should know: nothing held out, measurements that stand out."""
     notices = []
     if not held.any():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
@@ -43,8 +44,8 @@ class RelativeCalibration:
     """A robot calibrated from lengths, closures or poses.
 
     kind: one of `data.KINDS`.  robot: calibrated; nominal: as drawn.
-    parts: what each row of the errors is, as wire1.  accuracy, errors: by key nominal, holdout,
-    nominal_train, train; errors are (parts, m, 3) of the measured quantity, NaN where not measured
+    parts: what each row of the errors is, as wire1.  errors: by key nominal, holdout,
+    nominal_train, train, (parts, m, 3) of the measured quantity, NaN where not measured
     [m]; a length's error stands first of three.  numbers: independent numbers behind each
     accuracy.  turns: RMS and largest error of orientation by key [rad], empty but for poses.
     instrument: what was fitted besides the robot, for JSON.  position_sigma: expected error of a
@@ -60,7 +61,6 @@ class RelativeCalibration:
     iterations: int
     seconds: float
     parameters: tuple[Parameter, ...]
-    accuracy: Mapping[str, Accuracy]
     errors: Mapping[str, Array]
     numbers: Mapping[str, int]
     turns: Mapping[str, tuple[float, float]]
@@ -70,6 +70,11 @@ class RelativeCalibration:
     beyond: tuple[str, ...]
     notices: tuple[str, ...]
     provenance: Provenance
+
+    @cached_property
+    def accuracy(self) -> dict[str, Accuracy]:
+        """Of the errors, by their keys."""
+        return {key: accuracy(error) for key, error in self.errors.items()}
 
     @property
     def identified(self) -> int:
