@@ -1,8 +1,5 @@
 """Arrays, as every room names them."""
 
-from __future__ import annotations
-
-import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +9,6 @@ Array = NDArray[Any]
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square, NaN left out; NaN without any."""
+    """Root of the mean square, NaN left out; NaN if nothing is left."""
     known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")

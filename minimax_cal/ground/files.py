@@ -6,11 +6,11 @@ import json
 import math
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from minimax_cal.ground.errors import CalibrationError
 
@@ -69,17 +69,15 @@ def json_text(content: object) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def plain(values: ArrayLike) -> Any:
-    """For JSON: nested lists, or one number; null where there is no finite number."""
-    values = np.asarray(values)
-    out = values.astype(object)
-    out[~np.isfinite(values)] = None
-    return out.tolist()
-
-
-def number(value: float | None) -> float:
-    """A number of a JSON; null is NaN."""
-    return math.nan if value is None else float(value)
+def plain(content: Any) -> Any:
+    """Data as JSON holds them: arrays are lists, null where there is no finite number."""
+    if isinstance(content, Mapping):
+        return {key: plain(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray | np.generic):
+        content = content.tolist()
+    if isinstance(content, list | tuple):
+        return [plain(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:
@@ -90,3 +88,8 @@ def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationErr
         raise kind(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def number(value: float | None) -> float:
+    """A number of a JSON; null is NaN."""
+    return math.nan if value is None else float(value)
