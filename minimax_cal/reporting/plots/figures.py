@@ -26,10 +26,10 @@ BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Oka
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of a size in inches.  Raises OptionError without matplotlib."""
     try:
-        from matplotlib.figure import Figure
+        from matplotlib import figure
     except ModuleNotFoundError as error:
         raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    return Figure(figsize=(width, height), layout="constrained")
+    return figure.Figure(figsize=(width, height), layout="constrained")
 
 
 def save(figure: Figure, path: Path) -> None:
