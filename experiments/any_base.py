@@ -19,7 +19,6 @@ import numpy as np
 
 from experiments import sweep
 from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
-from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
@@ -142,11 +141,9 @@ def main(study: Study, count: int) -> None:
         tuple(row_of(span, results) for span, results in found.items()),
         (".2f", "d", ".1f", ".1f", ".1f", ".0f", ".0f", ".6f"),
     )  # fmt: skip
-    save_tables(study.out, "any_base", [table, environment()])
-    if study.json:
-        names = ("span_rad", "trials", "snlgn_percent", "snllm_percent", "ours_percent", "paper_ms",
-                 "ours_ms", "worst_ratio")  # fmt: skip
-        save_json(study.json, {"rows": [dict(zip(names, row, strict=True)) for row in table.rows]})
+    names = ("span_rad", "trials", "snlgn_percent", "snllm_percent", "ours_percent", "paper_ms",
+             "ours_ms", "worst_ratio")  # fmt: skip
+    study.save([table], {"rows": [dict(zip(names, row, strict=True)) for row in table.rows]})
 
 
 if __name__ == "__main__":

@@ -41,7 +41,6 @@ from experiments.gap_cases import (
     spec,
     write,
 )
-from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
@@ -760,16 +759,15 @@ def main(study: Study, only: tuple[str, ...], every: int) -> None:
         shrink(rows),
         misses(found),
         *([troubles(rows)] if any(row["trouble"] for row in rows) else []),
-        environment(),
     ]
-    save_tables(study.out, "blind_gap", tables)
-    save_figure(study.out, "blind_gap_detectability", detectability_picture(rows))
-    save_figure(study.out, "blind_gap_confusion", confusion_picture(rows))
-    save_figure(study.out, "blind_gap_oracle", shrink_picture(rows))
-    if study.json:
-        names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
-        lines = [dict(zip(names, row, strict=True)) for row in tables[0].rows]
-        save_json(study.json, {"criteria": clean(lines), "rows": clean(rows)})
+    figures = {
+        "blind_gap_detectability": detectability_picture(rows),
+        "blind_gap_confusion": confusion_picture(rows),
+        "blind_gap_oracle": shrink_picture(rows),
+    }
+    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
+    lines = [dict(zip(names, row, strict=True)) for row in tables[0].rows]
+    study.save(tables, {"criteria": clean(lines), "rows": clean(rows)}, figures)
 
 
 def clean(content: Any) -> Any:

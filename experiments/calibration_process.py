@@ -18,8 +18,8 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments import sweep
-from experiments.conditions import ROBOTS, SHARED, shared
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.conditions import ROBOTS, shared
+from experiments.real import here
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
@@ -144,7 +144,7 @@ def courses(title: str, found: dict[tuple[str, str], Process]) -> Figure:
 
 def present(robots: Sequence[str]) -> list[str]:
     """Those whose measurements are on this machine."""
-    return [name for name in robots if name not in FOLDERS or (SHARED / FOLDERS[name]).is_dir()]
+    return [name for name in robots if name not in FOLDERS or here(FOLDERS[name])]
 
 
 @click.command()
@@ -154,7 +154,7 @@ def main(study: Study) -> None:
     robots = present(("irb2600", "irb120") if study.quick else tuple(ARMS))
     jobs = [Job(name, way, kind, study.seed) for name in robots for way, kind in ways(name)]
     outcomes = study.sweep(run, jobs, "calibration process")
-    tables = []
+    tables, figures = [], {}
     content: list[dict[str, object]] = []
     for name in robots:
         found = {
@@ -163,15 +163,13 @@ def main(study: Study) -> None:
             if job.robot == name
         }
         tables.append(table_of(ARMS[name][0], found))
-        save_figure(study.out, f"process_{name}", courses(ARMS[name][0], found))
+        figures[f"process_{name}"] = courses(ARMS[name][0], found)
         content += [
             {"robot": name, "way": way, "kind": kind, "course_mm": list(p.values),
              "holdout_rms_mm": p.held_mm, "status": p.status}
             for (way, kind), p in found.items()
         ]  # fmt: skip
-    save_tables(study.out, "calibration_process", [*tables, environment()])
-    if study.json:
-        save_json(study.json, {"rows": content})
+    study.save(tables, {"rows": content}, figures)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -20,7 +19,7 @@ import numpy as np
 import minimax_cal as mc
 from experiments import sweep
 from experiments.poses import euler_deviation, orientation_error, poses_of, triangle
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell as TableCell
@@ -33,7 +32,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
 CONDITIONS = ("nominal", "smr:1", "smr:2", "smr:3", "sum", "minimax", "pose", "point")
 PAPER = {  # Table 3 of the paper: F_1, F_2, F_3 [mm^2, 100 poses], RMSE(phi) [mm]
     "nominal": (325.90, 261.23, 373.88, 1.934),
@@ -88,10 +86,7 @@ def simulated(seed: int) -> tuple[Robot, Measurements]:
 
 def shared(name: str) -> Callable[[int], tuple[Robot, Measurements]]:
     """A real robot from shared data."""
-    return lambda seed: (
-        load_robot(SHARED / name / "robot.json"),
-        mc.read_measurements(SHARED / name / "measurements.csv"),
-    )
+    return lambda seed: real(name)
 
 
 ROBOTS: dict[str, tuple[str, Callable[[int], tuple[Robot, Measurements]], int]] = {
@@ -99,12 +94,7 @@ ROBOTS: dict[str, tuple[str, Callable[[int], tuple[Robot, Measurements]], int]] 
     "irb120": ("IRB 120, real", shared("irb120"), 100),
     "fanuc": ("FANUC R-2000, real", shared("fanuc_r2000"), 29),
 }
-
-
-def here(name: str) -> bool:
-    """Whether the robot's measurements are on this machine."""
-    folder = {"irb120": "irb120", "fanuc": "fanuc_r2000"}.get(name)
-    return folder is None or (SHARED / folder).is_dir()
+FOLDERS = {"irb120": "irb120", "fanuc": "fanuc_r2000"}  # of the real ones
 
 
 def run(job: Job) -> Outcome:
@@ -241,7 +231,7 @@ def claims(robots: Sequence[str], found: dict[str, dict[str, Outcome]]) -> Table
 @study_options("conditions")
 def main(study: Study) -> None:
     """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""
-    robots = [name for name in ROBOTS if here(name)]
+    robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
     for name in ROBOTS:
         if name not in robots:
             click.echo(f"{ROBOTS[name][0]}: its measurements are not on this machine", err=True)
@@ -257,16 +247,15 @@ def main(study: Study) -> None:
     }
     tables = [table_of(ROBOTS[name][0], found[name]) for name in robots]
     summary = claims(robots, found)
-    save_tables(study.out, "conditions", [*tables, papers_table(), summary, environment()])
+    figures = {}
     for name in robots:
-        save_figure(study.out, f"accuracy_{name}", boxes(ROBOTS[name][0], found[name]))
-        save_figure(study.out, f"sums_{name}", sums_figure(ROBOTS[name][0], found[name]))
-    if study.json:
-        rows = [
-            {"robot": row[0], "poses": row[1], "minimax_over_best_other": row[4], "best": row[5]}
-            for row in summary.rows
-        ]
-        save_json(study.json, {"rows": rows})
+        figures[f"accuracy_{name}"] = boxes(ROBOTS[name][0], found[name])
+        figures[f"sums_{name}"] = sums_figure(ROBOTS[name][0], found[name])
+    rows = [
+        {"robot": row[0], "poses": row[1], "minimax_over_best_other": row[4], "best": row[5]}
+        for row in summary.rows
+    ]
+    study.save([*tables, papers_table(), summary], {"rows": rows}, figures)
 
 
 if __name__ == "__main__":

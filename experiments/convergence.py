@@ -23,11 +23,11 @@ import click
 import numpy as np
 
 from experiments import pseudo_inverse, sweep
-from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.start import search
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import Model, SumOfSquares
@@ -380,24 +380,20 @@ def main(study: Study, full: bool, base_angle: float) -> None:
         table_2(rows, setting),
         seed_table(study, setting, separable),
         span_table(study, setting, 15 if study.quick else 7),
-        environment(),
     ]
-    save_tables(study.out, "convergence", tables)
+    figures = {}
     for parameters in SETS:
         chosen = [row for row in rows if row.parameters == parameters]
         for what in ("iterations", "RMS mm"):
             name = f"{what.split()[0].lower()}_{parameters}"
-            save_figure(study.out, name, maps(chosen, what))
-        save_figure(study.out, f"surface_{parameters}", surface(chosen))
-    if study.json:
-        names = [name.replace(" ", "_").replace("%", "percent") for name in HEADER]
-        save_json(study.json, {
-            "rows": [
-                {k: None if v != v else v for k, v in zip(names, row.cells(), strict=True)}
-                for row in rows
-            ],
-            "least_rms_mm": float(1e3 * np.sqrt(least / setting.poses)),
-        })  # fmt: skip
+            figures[name] = maps(chosen, what)
+        figures[f"surface_{parameters}"] = surface(chosen)
+    names = [name.replace(" ", "_").replace("%", "percent") for name in HEADER]
+    content = {
+        "rows": plain([dict(zip(names, row.cells(), strict=True)) for row in rows]),
+        "least_rms_mm": float(1e3 * np.sqrt(least / setting.poses)),
+    }
+    study.save(tables, content, figures)
 
 
 if __name__ == "__main__":

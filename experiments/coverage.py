@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments import sweep
-from experiments.record import environment, save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.intervals import chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import Options, silent
@@ -568,10 +567,8 @@ def main(study: Study, count: int, again: int) -> None:
     odd = {name: runs.odd for name, runs in found.items() if runs.odd}
     for name, number in odd.items():
         click.echo(f"{name}: {number} runs left out, they identify other parameters", err=True)
-    save_tables(study.out, "coverage", [*tables, environment()])
-    save_figure(study.out, "coverage", figure_of(found))
-    if study.json:
-        save_json(study.json, {"runs": count, "rows": rows_of(found)})
+    content = {"runs": count, "rows": rows_of(found)}
+    study.save(tables, content, {"coverage": figure_of(found)})
 
 
 def rows_of(found: dict[str, Runs]) -> list[dict[str, object]]:

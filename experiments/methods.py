@@ -35,10 +35,10 @@ from experiments.poses import (
     poses_of,
     position_error,
 )
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.real import SHARED
 from experiments.sweep import Study, start, study_options
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.simulate import simulate
@@ -48,7 +48,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
 PARTS = ("training", "held out")
 LENGTHS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # levers of an angle [m]; 1 is a plain sum in SI units
 
@@ -199,11 +198,6 @@ def errors_of(predict: Callable[[Array], Array], data: Measurements, start: Star
         orientation_error(seen, computed),
         euler_deviation(seen, computed),
     )
-
-
-def rms(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def largest(values: Iterable[float]) -> float:
@@ -530,11 +524,8 @@ def main(options: Study, folder: Path) -> None:
 
     studies = run(options.quick, options.seed, folder, sweep)
     weighted = run_weights(options.quick, options.seed, folder, sweep)
-    save_tables(options.out, "methods", [*tables(studies, weighted), environment(("matplotlib",))])
-    for name, figure in figures(studies).items():
-        save_figure(options.out, name, figure)
-    if options.json:
-        save_json(options.json, {"figures": numbers(studies)})
+    content = {"figures": numbers(studies)}
+    options.save(tables(studies, weighted), content, figures(studies), ("matplotlib",))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -22,9 +21,9 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments import sweep
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.real import here, real
 from experiments.sweep import Study, study_options
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import rms
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.simulate import Truth, simulate
@@ -33,7 +32,6 @@ from minimax_cal.robots.robot import load_robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHARED = Path(__file__).parents[2] / "shared" / "data" / "irb120"
 ROBOTS = ("irb2600", "ur10")
 TRIM = 0.25  # more than the largest share of wrong points
 SHARE, SHIFT = 5, 1.0  # the setting that the promise is about [%, mm]
@@ -192,11 +190,6 @@ class Row:
         return "yes" if good else "no"
 
 
-def rms(values: Array) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def table_of(title: str, rows: Sequence[Row]) -> Table:
     """Held-out RMS, also against the true arm; recall and false alarms of the suspects.
 
@@ -282,12 +275,12 @@ class RealResult:
 
 def run_real(job: RealJob) -> RealResult:
     """One fit to real measurements."""
-    data = mc.read_measurements(SHARED / "measurements.csv")
+    robot, data = real("irb120")
     if job.rows:
         data = data.take(np.arange(data.poses) < job.rows)
     objective, loss, trim = WAYS[job.way]
     fit = mc.calibrate(
-        SHARED / "robot.json", data, objective, holdout=0.2, seed=job.seed, effects=job.effects,
+        robot, data, objective, holdout=0.2, seed=job.seed, effects=job.effects,
         loss=loss, trim=trim,
     )  # fmt: skip
     error = 1e3 * np.linalg.norm(fit.errors["holdout"], axis=-1)
@@ -326,7 +319,7 @@ def real_table(jobs: Sequence[RealJob], results: Sequence[RealResult]) -> Table:
 
 def real_jobs(study: Study) -> list[RealJob]:
     """Splits of the real measurements; none where they are not on this machine."""
-    if not SHARED.is_dir():
+    if not here("irb120"):
         click.echo("IRB 120: its measurements are not on this machine", err=True)
         return []
     ways = ("sum", "sum, tukey") if study.quick else tuple(w for w in WAYS if "sum" in w)
@@ -379,22 +372,19 @@ def main(study: Study, seeds: int) -> None:
         table_of(f"wrong points off by {SHIFT:g} mm", by_share),
         table_of(f"{SHARE} % of points wrong", by_shift),
     ]
-    real = real_jobs(study)
-    if real:
-        tables.append(real_table(real, study.sweep(run_real, real, "IRB 120")))
-    save_tables(study.out, "outliers", [*tables, environment()])
-    save_figure(study.out, "outliers", picture(by_share, by_shift))
-    if study.json:
-        content: dict[str, object] = {
-            "promise": {r.way: r.kept == "yes" for r in told},
-            "by_share": [plain(row) for row in by_share],
-            "by_shift": [plain(row) for row in by_shift],
-        }
-        if real:
-            content["irb120"] = [
-                dict(zip(tables[-1].header, row, strict=True)) for row in tables[-1].rows
-            ]
-        save_json(study.json, content)
+    splits = real_jobs(study)
+    if splits:
+        tables.append(real_table(splits, study.sweep(run_real, splits, "IRB 120")))
+    content: dict[str, object] = {
+        "promise": {r.way: r.kept == "yes" for r in told},
+        "by_share": [plain(row) for row in by_share],
+        "by_shift": [plain(row) for row in by_shift],
+    }
+    if splits:
+        content["irb120"] = [
+            dict(zip(tables[-1].header, row, strict=True)) for row in tables[-1].rows
+        ]
+    study.save(tables, content, {"outliers": picture(by_share, by_shift)})
 
 
 def plain(row: Row) -> dict[str, object]:

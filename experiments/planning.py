@@ -26,10 +26,11 @@ import click
 import numpy as np
 
 from experiments import sweep
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.real import SHARED
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -51,7 +52,6 @@ from minimax_cal.robots.robot import load_robot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
 REAL = ("irb120", "ur10_b")
 FEW, SETS, SPLITS = 40, 7, 2  # poses of a first fit of a real arm; random sets; divisions
 ROBOT, POSES = "irb2600", 40
@@ -461,11 +461,6 @@ def study(
     return dict(zip(jobs, run_all(run, jobs), strict=True))
 
 
-def plain(cell: TableCell) -> TableCell | None:
-    """For JSON: null where there is no number."""
-    return None if isinstance(cell, float) and not np.isfinite(cell) else cell
-
-
 @click.command()
 @study_options("planning")
 @click.option("--data", "folder", type=click.Path(path_type=Path), default=SHARED)
@@ -481,19 +476,11 @@ def main(options: Study, folder: Path) -> None:
     if waiting:
         results = options.sweep(run_real, waiting, "real arms")
         tables.append(real_table(dict(zip(waiting, results, strict=True))))
-    save_tables(options.out, "planning", [*tables, environment(("cvxpy", "scs", "matplotlib"))])
-    save_figure(options.out, "planning", picture(found))
-    if options.json:
-        save_json(
-            options.json,
-            {
-                name: [
-                    {key: plain(cell) for key, cell in zip(table.header, row, strict=True)}
-                    for row in table.rows
-                ]
-                for name, table in zip(("predicted", "simulated", "real"), tables, strict=False)
-            },
-        )
+    content: dict[str, object] = {
+        name: plain([dict(zip(table.header, row, strict=True)) for row in table.rows])
+        for name, table in zip(("predicted", "simulated", "real"), tables, strict=False)
+    }
+    options.save(tables, content, {"planning": picture(found)}, ("cvxpy", "scs", "matplotlib"))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +64,7 @@ def save_figure(folder: Path, name: str, figure: Figure) -> None:
         save(figure, folder / f"{name}.{suffix}")
 
 
-def save_json(path: Path, content: dict[str, object]) -> None:
+def save_json(path: Path, content: Mapping[str, object]) -> None:
     """Write the figures of a study for other programs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json_text({"schema": 1, **content}))

@@ -22,8 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments import sweep
-from experiments.conditions import SHARED
-from experiments.record import environment, save_figure, save_json, save_tables
+from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.instruments import (
@@ -40,7 +39,7 @@ from minimax_cal.fitting.instruments.identify import position_sigma
 from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements, split
+from minimax_cal.measuring.measurements import Measurements, measurements, split
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import gravity, random_poses
 from minimax_cal.robots.robot import Robot, load_robot
@@ -430,8 +429,8 @@ class RealOutcome:
 
 def run_real(job: RealJob) -> RealOutcome:
     """Reduce real points to lengths, calibrate, and judge by the held-out points."""
-    robot = load_robot(SHARED / job.robot / "robot.json")
-    data = read_measurements(SHARED / job.robot / "measurements.csv").only(0)
+    robot, every = real(job.robot)
+    data = every.only(0)
     train, held, _ = split(data, job.held, job.seed)
     fit = calibrate(robot, train, objective="sum", holdout=0.0)
     nominal = after_base(held, robot, fit.before.target_positions[0])
@@ -577,35 +576,24 @@ def main(study: Study, seeds: int) -> None:
     jobs = [Job(r, k, study.seed + i, bend) for r, k, bend in keys for i in range(seeds)]
     outcomes = study.sweep(run, jobs, "arms")
     found = {key: outcomes[i * seeds : (i + 1) * seeds] for i, key in enumerate(keys)}
-    there = [robot for robot in REAL if (SHARED / robot).is_dir()]
-    real_keys = [(robot, kind) for robot in there for kind in REAL_KINDS]
+    real_keys = [(robot, kind) for robot in filter(here, REAL) for kind in REAL_KINDS]
     splits = 1 if study.quick else min(seeds, 10)
     tries = [RealJob(r, k, study.seed + i) for r, k in real_keys for i in range(splits)]
-    real = study.sweep(run_real, tries, "real arms")
-    judged = {key: real[i * splits : (i + 1) * splits] for i, key in enumerate(real_keys)}
+    results = study.sweep(run_real, tries, "real arms")
+    judged = {key: results[i * splits : (i + 1) * splits] for i, key in enumerate(real_keys)}
     tables = [identified_table(found), *(accuracy_table(found, bend) for bend in bends)]
     tables += [real_table(judged)] if judged else []
-    save_tables(study.out, "relative", [*tables, environment()])
-    save_figure(study.out, "relative", figure_of(found))
-    if study.json:
-        save_json(
-            study.json,
-            {
-                "rows": [
-                    {
-                        "robot": robot,
-                        "kind": kind,
-                        "compliance": bend,
-                        "seeds": list(map(vars, some)),
-                    }
-                    for (robot, kind, bend), some in found.items()
-                ],
-                "real": [
-                    {"robot": robot, "kind": kind, "hold_outs": [*map(vars, some)]}
-                    for (robot, kind), some in judged.items()
-                ],
-            },
-        )
+    content: dict[str, object] = {
+        "rows": [
+            {"robot": robot, "kind": kind, "compliance": bend, "seeds": [*map(vars, some)]}
+            for (robot, kind, bend), some in found.items()
+        ],
+        "real": [
+            {"robot": robot, "kind": kind, "hold_outs": [*map(vars, some)]}
+            for (robot, kind), some in judged.items()
+        ],
+    }
+    study.save(tables, content, {"relative": figure_of(found)})
 
 
 if __name__ == "__main__":

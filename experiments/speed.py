@@ -20,7 +20,6 @@ import numpy as np
 from scipy import optimize
 
 from experiments import sweep
-from experiments.record import environment, save_json, save_tables
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distances, minimax_problem
@@ -304,9 +303,7 @@ def main(study: Study, repeats: int) -> None:
     counts = (100, 1000) if study.quick else (100, 1000, 10000)
     squares, worst, figures = peers(study.seed, repeats)
     table, grown = growth(study.seed, counts, repeats)
-    save_tables(study.out, "speed", [squares, worst, table, environment()])
-    if study.json:
-        save_json(study.json, {"figures": figures | grown})
+    study.save([squares, worst, table], {"figures": figures | grown})
     if figures["minimax_value_difference"] > 1e-6:
         raise click.ClickException("the two minimax solvers disagree")
 

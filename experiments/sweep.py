@@ -21,14 +21,14 @@ import hashlib
 import inspect
 import pickle
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.console import Console
@@ -36,8 +36,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import minimax_cal
 import qp_backends
+from experiments.record import environment, save_figure, save_json, save_tables
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -340,6 +345,23 @@ class Study:
             cluster=self.cluster,
             fresh=self.fresh,
         )
+
+    def save(
+        self,
+        tables: Sequence[Table],
+        content: Mapping[str, object],
+        figures: Mapping[str, Figure] | None = None,
+        packages: Iterable[str] = (),
+    ) -> None:
+        """Leave tables, with what they were made on, figures by name, and the JSON if asked for.
+
+        packages: whose versions matter besides the usual ones.
+        """
+        save_tables(self.out, self.name, [*tables, environment(packages)])
+        for name, figure in (figures or {}).items():
+            save_figure(self.out, name, figure)
+        if self.json:
+            save_json(self.json, content)
 
 
 class Misuse(click.ClickException):

@@ -8,7 +8,7 @@ import click
 import numpy as np
 
 from minimax_cal.cli import options
-from minimax_cal.fitting.plausibility import POOR_FIT
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.ground.files import json_text
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.measurements import read_measurements

@@ -57,7 +57,7 @@ class Leftover:
     data: with its history.  held: (m,) True where held out.  noise: of a coordinate [m].
     effects: as fitted.
     errors: (k, m, 3) of the first views in base axes, NaN where not measured [m].
-    law: as errors, of the fit with effects once the first effect is taken out; none without one.
+    law: as errors, of the fit with effects once the first effect is taken out; None without one.
     points: (k, m, 3) measured, in base axes [m].  term: the first effect that was fitted, if any.
     """
 
@@ -67,7 +67,7 @@ class Leftover:
     effects: Fitted
     scene: Scene
     errors: tuple[Array, ...]
-    law: tuple[Array, ...]
+    law: Array | None
     points: Array
     term: Term | None
 
@@ -82,7 +82,7 @@ class Leftover:
         axes, origin = first.base[:3, :3], first.base[:3, 3]
         known = {term.label for term in last.effects.terms}
         term = next((term for term in found if term.label in known), None)
-        law = [replace(last, effects=without(last.effects, term))] if term else []
+        bare = replace(last, effects=without(last.effects, term)) if term else None
         return Leftover(
             data=data,
             held=held,
@@ -90,10 +90,15 @@ class Leftover:
             effects=last.effects,
             scene=first.scene(data),
             errors=tuple(cell.error(data) @ axes for cell in cells),
-            law=tuple(cell.error(data) @ axes for cell in law),
+            law=bare.error(data) @ axes if bare else None,
             points=np.moveaxis((data.y - origin) @ axes, 1, 0),
             term=term,
         )
+
+    @property
+    def views(self) -> tuple[Array, ...]:
+        """Errors of VIEWS, or of the first ones."""
+        return self.errors if self.law is None else (*self.errors, self.law)
 
     def distances(self) -> list[Array]:
         """(k, m) sizes of the errors of each view [mm]."""
@@ -114,10 +119,10 @@ def turns(left: Leftover) -> list[Array]:
 
     Of all views at once, so that one ridge serves them all and they compare.
     """
-    views = (*left.errors, *left.law)
-    jacobian = np.concatenate([left.scene.jacobian] * len(views), axis=-1)
-    together = np.concatenate(views, axis=1)
-    return np.split(joint_equivalent(together, jacobian, left.noise), len(views), axis=0)
+    count = len(left.views)
+    jacobian = np.concatenate([left.scene.jacobian] * count, axis=-1)
+    together = np.concatenate(left.views, axis=1)
+    return np.split(joint_equivalent(together, jacobian, left.noise), count, axis=0)
 
 
 def guilty(left: Leftover, turn: list[Array]) -> int:
@@ -125,13 +130,12 @@ def guilty(left: Leftover, turn: list[Array]) -> int:
 
     Without an effect, the one that moves the targets most.
     """
-    place = left.term.place if left.term else ""
+    effect, place = (left.term.effect, left.term.place) if left.term else ("", "")
     if place[:1] == "J":
         return int(place[1:]) - 1
     lever = np.sqrt(np.nanmean((left.scene.jacobian**2).sum(axis=2), axis=(1, 2)))
     fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
     size = fell * lever**2
-    effect = left.term.effect if left.term else ""
     if effect in BY_WEIGHT:
         torque = left.scene.gravity
         size = np.where(np.ptp(torque, axis=1) > FLAT * np.abs(torque).max(), size, -np.inf)
@@ -153,9 +157,8 @@ def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
     name, stem = term.effect, BY_MOVE.get(term.effect, "")
     if name == "gear_ripple":
         period = 360.0 / term.choice["turns"]
-        return f"joint {joint + 1} within a wave of {period:.3g}° (deg)", np.mod(
-            np.degrees(scene.q[joint]), period
-        )
+        wave = np.mod(np.degrees(scene.q[joint]), period)
+        return f"joint {joint + 1} within a wave of {period:.3g}° (deg)", wave
     if name == "joint_coupling":
         return value_of(scene, int(term.choice["source"]) - 1)
     if name in BY_WEIGHT:
@@ -166,9 +169,8 @@ def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
         unit, scale = ("mm", 1e3) if sliding else ("deg", 180.0 / np.pi)
         return f"last move of joint {joint + 1} ({unit})", scale * move
     if stem:
-        return f"side that joint {joint + 1} came from (-1 or 1)", scene.column(
-            f"{stem}{joint + 1}"
-        )
+        side = scene.column(f"{stem}{joint + 1}")
+        return f"side that joint {joint + 1} came from (-1 or 1)", side
     if name == "tool_flex":
         tilt = np.clip((scene.links.axes[2] * scene.robot.up[:, None]).sum(axis=0), -1.0, 1.0)
         return "flange axis from the vertical (deg)", np.degrees(np.arccos(tilt))
@@ -192,8 +194,7 @@ def along_motion(left: Leftover, term: Term) -> Curve:
         xlabel, time = against(scene, term, 0)
         x = np.broadcast_to(time, (len(names), len(time)))
     along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
-    views = (*left.errors, *left.law)
-    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in views)
+    y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in left.views)
     whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
     title = f"error of {whose}, for {term.effect} {term.place}"
     return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
@@ -210,25 +211,20 @@ def motion_of(left: Leftover, term: Term) -> Array:
 
 def residual_curve(left: Leftover) -> Curve:
     """The errors as turns of the guilty joint, against what its effect depends on."""
-    if left.term and left.term.effect in ("target_offset", *BY_TIME):
-        return along_motion(left, left.term)
+    scene, term = left.scene, left.term
+    if term and term.effect in ("target_offset", *BY_TIME):
+        return along_motion(left, term)
     turn = turns(left)
     joint = guilty(left, turn)
-    xlabel, x = against(left.scene, left.term, joint) if left.term else value_of(left.scene, joint)
-    unit = "mm" if left.scene.robot.prismatic[joint] else "mrad"
-    what = "travel" if unit == "mm" else "turn"
+    xlabel, x = against(scene, term, joint) if term else value_of(scene, joint)
+    what, unit = ("travel", "mm") if scene.robot.prismatic[joint] else ("turn", "mrad")
     title = f"errors as a {what} of joint {joint + 1}"
-    if left.term:
-        title += f", for {left.term.effect} {left.term.place}"
-    if left.term and left.term.effect in LINEAR:  # a constant turn is geometry: leave it out
+    if term:
+        title += f", for {term.effect} {term.place}"
+    if term and term.effect in LINEAR:  # a constant turn is geometry: leave it out
         turn[-1] = turn[-1] - turn[-1].mean(axis=0)
-    return Curve(
-        title,
-        xlabel,
-        f"equivalent {what} of joint {joint + 1} ({unit})",
-        x,
-        tuple(1e3 * part[:, joint] for part in turn),
-    )
+    ylabel = f"equivalent {what} of joint {joint + 1} ({unit})"
+    return Curve(title, xlabel, ylabel, x, tuple(1e3 * part[:, joint] for part in turn))
 
 
 def order_curve(left: Leftover) -> Curve:

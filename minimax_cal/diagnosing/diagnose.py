@@ -18,11 +18,10 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import resemblances
-from minimax_cal.fitting.exchanged import misplaced, put_right
+from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
-from minimax_cal.fitting.plausibility import check_sense
-from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
@@ -161,7 +160,7 @@ def cleaned(
     data, exchanged = in_order(robot, data)
     found = find_faults(data)
     sound = mended(data, found)
-    check_sense(robot, sound)
+    check_plausible(robot, sound)
     train, _, _ = split(sound, holdout, seed)
     progress("geometry")
     fit = fit_cell(robot, train, SUM, progress)

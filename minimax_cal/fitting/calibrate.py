@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
+from minimax_cal.fitting.checks import POOR_FIT, check_plausible
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.options import (
     Options,
@@ -21,7 +22,6 @@ from minimax_cal.fitting.options import (
     silent,
     usable,
 )
-from minimax_cal.fitting.plausibility import POOR_FIT, check_sense
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.ground.arrays import Array
@@ -131,7 +131,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
         objective_of(options.objective, data)
     if len(np.unique(groups(train))) >= LEAST_POSES:
-        check_sense(robot, data)
+        check_plausible(robot, data)
     return Parts(data, train, held, notices)
 
 

@@ -6,7 +6,7 @@ one member is left at its nominal value.  Which one is a matter of taste: predic
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +24,9 @@ PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count a
 # others, and its estimate would be noise (a target 0.1 mm off the last axis "measures" the wrist).
 RANK = 1e-6
 RESOLUTION = 1e-3
+SHOWN = 4  # names in a reason
+SAME_MOTION = "same motion as {}"
+NOT_TOLD = "these poses do not tell it from {}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,59 @@ class Identification:
     def condition(self) -> float:
         """Condition number of the scaled Jacobian of the kept parameters (1/O2 of the field)."""
         return float(self.singular[0] / self.singular[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What is left while parameters are given up.
+
+    active: (p,) True where a parameter is kept.  reasons: why others are not, by name; {} stands
+    for the parameters that move the points alike.
+    """
+
+    names: Names
+    active: Array
+    reasons: Mapping[str, str]
+
+    def without(self, gone: Array | list[int], reason: str) -> Kept:
+        """Fewer.  gone: (p,) mask, or indices."""
+        active = self.active.copy()
+        active[gone] = False
+        lost = np.arange(len(active))[gone]
+        named = dict.fromkeys((self.names.all[i] for i in lost), reason)
+        return Kept(self.names, active, {**self.reasons, **named})
+
+    def identification(
+        self, gram: Array, scale: Array, stems: Iterable[str], whole: str
+    ) -> Identification:
+        """The reasons written out, and the singular values.
+
+        gram: (p, p).  scale: (p,), see `Identification`.  stems: points as smr1, of which several
+        are one thing to the reader, called `whole`.
+        """
+        reasons = {}
+        for name, reason in self.reasons.items():
+            shown = self.partners(gram, scale, name, stems, whole) if "{}" in reason else ""
+            reasons[name] = reason.format(shown)
+        active = self.active
+        scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
+        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
+        return Identification(active, reasons, singular, scale)
+
+    def partners(
+        self, gram: Array, scale: Array, name: str, stems: Iterable[str], whole: str
+    ) -> str:
+        """The kept parameters that together move the points as one does, largest first."""
+        names, i = self.names.all, self.names.index(name)
+        chosen = np.flatnonzero(self.active)
+        mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
+        share = np.abs(mix) * scale[chosen] / scale[i]
+        shown = [names[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
+        spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
+        if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
+            shown = [name for name in shown if name not in spots] + [whole]
+        more = len(shown) - SHOWN
+        return ", ".join(shown[:SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def drop_order(robot: Robot, names: Names) -> Array:
@@ -82,31 +138,17 @@ def identify(
     what these poses do not.  known: (p,) True where a prior stands in for poses.  resolution:
     relative singular value that counts as not measured.
     """
-    gram = gram_of(model, state)
-    points = max(int(model.counts.sum()), 1)
-    scale = np.sqrt(np.diag(gram) / points)
-    active, fixed = allowed.copy(), ~allowed
-    reasons = {model.names.all[i]: "fixed by the user" for i in np.flatnonzero(fixed)}
-    dead = active & (scale <= 1e-12)
-    active &= ~dead
-    reasons |= {model.names.all[i]: "moves no measured point" for i in np.flatnonzero(dead)}
-    geometric = np.arange(len(active)) < model.names.geometric
+    names, gram = model.names, gram_of(model, state)
+    scale = np.sqrt(np.diag(gram) / max(int(model.counts.sum()), 1))
+    kept = Kept(names, allowed, {}).without(~allowed, "fixed by the user")
+    kept = kept.without(kept.active & (scale <= 1e-12), "moves no measured point")
+    geometric = np.arange(names.count) < names.geometric
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
-    for i in redundant(
-        np.pad(plain, (0, len(active) - len(plain))), active & geometric, order, RANK
-    ):
-        active[i] = False
-        reasons[model.names.all[i]] = "same motion as {}"
+    plain = np.pad(plain, (0, names.count - len(plain)))
+    kept = kept.without(redundant(plain, kept.active & geometric, order, RANK), SAME_MOTION)
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    for i in redundant(told, active, order, resolution):
-        active[i] = False
-        reasons[model.names.all[i]] = "these poses do not tell it from {}"
-    for i, name in enumerate(model.names.all):
-        if "{}" in reasons.get(name, ""):
-            reasons[name] = reasons[name].format(partners(gram, scale, active, i, model.names))
-    scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
-    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
-    return Identification(active, reasons, singular, scale)
+    kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
+    return kept.identification(gram, scale, names.target_names, "all targets moved together")
 
 
 def gram_of(model: Model, state: State) -> Array:
@@ -151,27 +193,17 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
     return gone
 
 
-def partners(gram: Array, scale: Array, active: Array, i: int, names: Names) -> str:
-    """The kept parameters that together move the points as parameter i does, largest first."""
-    chosen = np.flatnonzero(active)
-    mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
-    share = np.abs(mix) * scale[chosen] / scale[i]
-    shown = [names.all[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
-    spots = [name for name in shown if name.rsplit("_", 1)[0] in names.target_names]
-    if len({name.rsplit("_", 1)[0] for name in spots}) > 1:  # one thing to the reader
-        shown = [name for name in shown if name not in spots] + ["all targets moved together"]
-    more = len(shown) - 4
-    return ", ".join(shown[:4]) + (f" and {more} more" if more > 0 else "")
+def random_joints(robot: Robot, size: tuple[int, ...], rng: np.random.Generator) -> Array:
+    """Joint values (*size, n) over the joints' whole range, at most one turn [rad, m]."""
+    span = np.where(robot.prismatic, 0.5, np.pi)
+    lower, upper = np.maximum(robot.lower, -span), np.minimum(robot.upper, span)
+    return rng.uniform(lower, upper, (*size, robot.joints))
 
 
 def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
     """A model of the same cell at random poses over the joints' whole range."""
-    rng = np.random.default_rng(0)
-    span = np.where(model.prismatic, 0.5, np.pi)
-    lower = np.maximum(robot.lower, -span)
-    upper = np.minimum(robot.upper, span)
-    k = model.y.shape[0]
-    q = rng.uniform(lower, upper, (poses, robot.joints)) * robot.sign
+    k = len(model.y)
+    q = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
     return Model(
         q=q,
         prismatic=model.prismatic,

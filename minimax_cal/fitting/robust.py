@@ -241,8 +241,7 @@ def flatness(robust: Robust, state: State) -> float:
 
     The sandwich of a weighted fit takes the weights for given; the true slope of psi is less.
     """
-    derivative, _ = moments(robust.kept, state, robust.loss, robust.loss_scale)
-    counts = robust.kept.counts
     if robust.loss == SQUARE or not np.isfinite(robust.loss_scale):
         return 1.0
-    return float(robust.weights[robust.kept.seen].sum() / (derivative * counts).sum())
+    derivative, _ = moments(robust.kept, state, robust.loss, robust.loss_scale)
+    return float(robust.weights[robust.kept.seen].sum() / (derivative * robust.kept.counts).sum())

@@ -11,10 +11,10 @@ from minimax_cal.evidence.noise import linearised
 from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
 from minimax_cal.fitting.options import Options, Progress, objective_of, silent, usable
-from minimax_cal.fitting.plausibility import POOR_FIT
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of

@@ -43,31 +43,17 @@ def fit_base(model: Model, mdh: Array) -> BaseFit:
     leaves a quadratic in the nine entries of S; over the rotations it is minimised from its
     unconstrained minimum projected by SVD, and from the 24 turns of a cube, all at once.
     """
-    links = kinematics.chain(mdh, model.q, model.prismatic)
-    k, _, m = model.y.shape
-    root = np.sqrt(model.weight)[..., None, None]
-    measured = np.swapaxes(model.y, -1, -2)
-    centre = measured[model.seen].mean(axis=0)
-    y = measured - centre
-    plain = np.zeros((k, m, 3, 3 + 3 * k))
-    plain[..., :3] = np.eye(3)
-    for i in range(k):
-        plain[i, ..., 3 + 3 * i : 6 + 3 * i] = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
-    turned = np.einsum("ij,kmc->kmijc", np.eye(3), y).reshape(k, m, 3, 9)
-    known = np.broadcast_to(links.origin.T[None, :, :, None], (k, m, 3, 1))
-    rows = np.concatenate([root * plain, root * turned, root * known], axis=-1)
-    rows = rows[model.seen].reshape(-1, rows.shape[-1])
+    centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
+    plain, turned, known = np.split(linear_rows(model, mdh, centre), (-10, -1), axis=1)
     # one QR eliminates c and t and condenses the rest to ten columns
-    free = 3 + 3 * k
-    plain_q, _ = np.linalg.qr(rows[:, :free])
-    rest = rows[:, free:]
-    rest = rest - plain_q @ (plain_q.T @ rest)
-    _, condensed = np.linalg.qr(rest)
+    plain_q, _ = np.linalg.qr(plain)
+    rest = np.concatenate([turned, known], axis=1)
+    _, condensed = np.linalg.qr(rest - plain_q @ (plain_q.T @ rest))
     matrix, right = condensed[:, :9], condensed[:, 9]
+    guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
+    starts = np.concatenate([project(guess[None]), OCTAHEDRAL])
 
     def best(handed: float) -> tuple[Array, float]:
-        guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
-        starts = np.concatenate([project(guess[None]), OCTAHEDRAL])
         found, cost = polish(handed * matrix, right, starts)
         winner = int(np.argmin(cost))
         return handed * found[winner], float(cost[winner]) / np.count_nonzero(model.seen)
@@ -75,13 +61,31 @@ def fit_base(model: Model, mdh: Array) -> BaseFit:
     turn, mean_square = best(1.0)
     _, mirrored = best(-1.0)
     # an ill-conditioned set of poses leaves some of c, t open: the least solution then
-    s = turn.reshape(9)
-    lengths = np.linalg.lstsq(
-        rows[:, :free], rows[:, free : free + 9] @ s - rows[:, -1], rcond=1e-10
-    )
-    shift, targets = lengths[0][:3], lengths[0][3:].reshape(k, 3)
+    remaining = turned @ turn.reshape(9) - known[:, 0]
+    lengths = np.linalg.lstsq(plain, remaining, rcond=1e-10)[0]
+    shift, targets = lengths[:3], lengths[3:].reshape(-1, 3)
     state = State(mdh, turn.T, centre + turn.T @ shift, targets)
     return BaseFit(state, mean_square, mirrored)
+
+
+def linear_rows(model: Model, mdh: Array, centre: Array) -> Array:
+    """What the residual of `fit_base` is linear in, times the root of each weight.
+
+    centre: (3,) that is taken off the points [m].  Returns (3 points, 3 + 3k + 9 + 1): columns of
+    c, t and S, and what is known.
+    """
+    links = kinematics.chain(mdh, model.q, model.prismatic)
+    k, _, m = model.y.shape
+    plain = np.zeros((k, m, 3, 3 + 3 * k))
+    plain[..., :3] = np.eye(3)
+    for i in range(k):
+        plain[i, ..., 3 + 3 * i : 6 + 3 * i] = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
+    y = np.swapaxes(model.y, -1, -2) - centre
+    turned = np.einsum("ij,kmc->kmijc", np.eye(3), y).reshape(k, m, 3, 9)
+    known = np.broadcast_to(links.origin.T[None, :, :, None], (k, m, 3, 1))
+    root = np.sqrt(model.weight)[..., None, None]
+    rows = root * np.concatenate([plain, turned, known], axis=-1)
+    return np.asarray(rows[model.seen].reshape(-1, rows.shape[-1]))
 
 
 def project(matrix: Array) -> Array:

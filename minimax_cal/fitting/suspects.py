@@ -101,6 +101,13 @@ class Spread:
         ratio = found.square / directions / self.scale**2
         return np.where(judged, stats.f.sf(ratio, directions, self.dof), 1.0)
 
+    def far(self, found: Scores) -> Array:
+        """(k, m) True for the points that stand out, see `unlikely`."""
+        judged = found.directions > 0
+        out = np.zeros(judged.shape, dtype=bool)
+        out[judged] = unlikely(self.p_value(found)[judged])
+        return out
+
 
 def spread_of(found: Scores, dof: float) -> Spread:
     """Scale and tails of the ordinary points, whatever the suspects are.
@@ -112,18 +119,15 @@ def spread_of(found: Scores, dof: float) -> Spread:
     freedom of the fit, which the scale cannot have more of.
     """
     judged = found.directions > 0
-    directions, mean_square = (
-        found.directions[judged],
-        (found.square / np.maximum(found.directions, 1)),
-    )
-    mean_square = mean_square[judged]
+    directions = found.directions[judged]
+    mean_square = found.square[judged] / directions
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
     middle = np.median(mean_square / stats.f.ppf(0.5, directions, dof))
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(ROUNDS):
-        far = unlikely(here.p_value(found)[judged])
+        far = here.far(found)[judged]
         if any(np.array_equal(far, other) for other in before):
             break
         before.append(far)
@@ -158,11 +162,10 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
         found = minimize_scalar(
             loss, bounds=(middle - 2.0, middle + 2.0), args=(tail,), method="bounded"
         )
-        scale = max(float(np.exp(found.x)), LEAST_SCALE)
-        best.append(
-            (float(found.fun) + (CLEARLY if tail < dof else 0.0), Spread(scale, float(tail)))
-        )
-    return min(best, key=lambda one: one[0])[1]
+        doubt = CLEARLY if tail < dof else 0.0
+        spread = Spread(max(float(np.exp(found.x)), LEAST_SCALE), float(tail))
+        best.append((float(found.fun) + doubt, spread))
+    return min(best, key=lambda trial: trial[0])[1]
 
 
 def unlikely(p_value: Array, level: float = LEVEL) -> Array:
@@ -212,10 +215,7 @@ def suspects_of(
     model: Model, state: State, found: Scores, spread: Spread, line: Array
 ) -> tuple[Suspect, ...]:
     """The points that stand out, the least likely first.  line: (m,) of the file."""
-    p_value = spread.p_value(found)
-    judged = found.directions > 0
-    far = np.zeros(judged.shape, dtype=bool)
-    far[judged] = unlikely(p_value[judged])
+    p_value, far = spread.p_value(found), spread.far(found)
     distance = np.linalg.norm(model.error(state), axis=-1)
     score = np.sqrt(found.square) / spread.scale
     together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)

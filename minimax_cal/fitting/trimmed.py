@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.fitting.suspects import LEAST_SCALE, Scores, Spread, scores, spread_of, unlikely
+from minimax_cal.fitting.suspects import LEAST_SCALE, Scores, Spread, scores, spread_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
@@ -136,9 +136,7 @@ def set_aside(at: Weighted, share: float) -> Weighted:
     count = at.most(share)
 
     def goes(found: Scores) -> Array:
-        far = np.zeros(found.square.shape, dtype=bool)
-        judged = found.directions > 0
-        far[judged] = unlikely(at.spread(found).p_value(found)[judged])
+        far = at.spread(found).far(found)
         return farthest(np.where(far, found.square, -1.0), count) & far
 
     return leave(at, goes)

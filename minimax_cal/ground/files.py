@@ -99,3 +99,8 @@ def finite(value: float) -> float | None:
 def numbers(values: Any) -> Array:
     """An array of floats from JSON, NaN for null."""
     return np.array(values, dtype=float)
+
+
+def number(value: float | None) -> float:
+    """A number of a JSON; null is NaN."""
+    return math.nan if value is None else float(value)

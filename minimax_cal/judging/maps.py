@@ -133,6 +133,10 @@ class Sampled:
     radius: Array
     reached: Array
 
+    def take(self, mask: Array) -> Sampled:
+        """Some of the samples."""
+        return Sampled(self.place[mask], self.radius[mask], self.reached[mask])
+
 
 @dataclass(frozen=True, eq=False)
 class WorkspaceMap:
@@ -177,7 +181,7 @@ class WorkspaceMap:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        table = self.table()
+        keys = ("what", "count", "median_mm", "q95_mm", "worst_mm")
         return {
             "schema": 1,
             "kind": "map",
@@ -185,16 +189,14 @@ class WorkspaceMap:
             "height_mm": 1e3 * self.height,
             "slab_mm": 1e3 * self.slab,
             "summary": [
-                dict(zip(("what", "count", "median_mm", "q95_mm", "worst_mm"),
-                         [plain(np.array(v)) if isinstance(v, float) else v for v in row],
-                         strict=True))
-                for row in table.rows
+                dict(zip(keys, (what, count, *plain(sizes)), strict=True))
+                for what, count, *sizes in self.table().rows
             ],
             "held_out_inside": dict(zip(("count", "of"), self.inside, strict=True)),
             "sections": [section.to_dict() for section in self.sections],
             "observed": self.seen.to_dict(),
             "notices": list(self.notices),
-        }  # fmt: skip
+        }
 
 
 def spread(values: Array) -> tuple[float, float, float]:
@@ -294,8 +296,24 @@ def workspace_map(saved: Saved, predict: Predict = unknown, grid: Grid = Grid())
     cell, data, held = saved.cells[AFTER], saved.data, saved.held
     train = data.q[~held]
     some = sample(cell, predict, train if len(train) else data.q, grid)
+    sections, height, slab = sections_of(some, grid, cell.robot.reach())
+    seen = seen_of(saved)
+    radius, error = predict(data.q[held]), seen.error[AFTER][held]
+    known = np.isfinite(radius) & np.isfinite(error)
+    inside = int((error[known] <= radius[known]).sum()), int(known.sum())
+    notices = tuple(remarks(cell.robot, train, inside))
+    return WorkspaceMap(cell.robot.name, sections, some, seen, height, slab, inside, notices)
+
+
+def sections_of(
+    some: Sampled, grid: Grid, reach: float
+) -> tuple[tuple[Section, ...], float, float]:
+    """The vertical and the horizontal section, and height and thickness of the latter [m].
+
+    reach: of the arm [m].  Raises OptionError.
+    """
     height = grid.height if np.isfinite(grid.height) else float(np.median(some.place[:, 2]))
-    slab = grid.slab if np.isfinite(grid.slab) else 0.2 * cell.robot.reach()
+    slab = grid.slab if np.isfinite(grid.slab) else 0.2 * reach
     x, y, z = some.place.T
     flat = np.abs(z - height) <= 0.5 * slab
     if not flat.any():
@@ -304,27 +322,22 @@ def workspace_map(saved: Saved, predict: Predict = unknown, grid: Grid = Grid())
             f"{1e3 * z.min():.0f} to {1e3 * z.max():.0f} mm"
         )
     size = float(max(2.0 * np.hypot(x, y).max(), np.ptp(z))) / grid.bins
+    upright, level = ("distance from axis 1 (m)", "height (m)"), ("x (m)", "y (m)")
     sections = (
-        section("vertical", ("distance from axis 1 (m)", "height (m)"), (np.hypot(x, y), z), some,
-                size),
-        section("horizontal", ("x (m)", "y (m)"), (x[flat], y[flat]), taken(some, flat), size),
-    )  # fmt: skip
+        section("vertical", upright, (np.hypot(x, y), z), some, size),
+        section("horizontal", level, (x[flat], y[flat]), some.take(flat), size),
+    )
+    return sections, height, slab
+
+
+def seen_of(saved: Saved) -> Seen:
+    """What was observed at the poses that were measured."""
+    data, there = saved.data, saved.data.seen.T[..., None]
     errors = {}
-    for name, one in saved.cells.items():
-        there = data.seen.T[..., None]
-        total = np.where(there, one.error(data), 0.0).sum(axis=0)
+    for name, cell in saved.cells.items():
+        total = np.where(there, cell.error(data), 0.0).sum(axis=0)
         errors[name] = np.linalg.norm(total, axis=-1) / there.sum(axis=(0, 2))
-    seen = Seen(tcp_place(cell, data.q), errors, held)
-    radius, error = predict(data.q[held]), errors[AFTER][held]
-    known = np.isfinite(radius) & np.isfinite(error)
-    inside = int((error[known] <= radius[known]).sum()), int(known.sum())
-    notices = tuple(remarks(cell.robot, train, inside))
-    return WorkspaceMap(cell.robot.name, sections, some, seen, height, slab, inside, notices)
-
-
-def taken(some: Sampled, mask: Array) -> Sampled:
-    """Some of the samples."""
-    return Sampled(some.place[mask], some.radius[mask], some.reached[mask])
+    return Seen(tcp_place(saved.cells[AFTER], data.q), errors, saved.held)
 
 
 def check_grid(grid: Grid) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.diagnosing.where import CANNOT_TELL, Part, Triage, triage_table
+from minimax_cal.diagnosing.where import triage_table
+from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -20,16 +20,9 @@ from minimax_cal.robots.robot import load_robot
 NOWHERE = "poses or joints at which it would show"
 
 
-def number(value: float | None) -> float:
-    """A number of a JSON; null is NaN."""
-    return math.nan if value is None else float(value)
-
-
-def part_of(entry: Mapping[str, Any] | None) -> Part:
-    """A part of the mean square from JSON."""
-    if entry is None:
-        return CANNOT_TELL
-    return Part(number(entry["rms_mm"]) * 1e-3, number(entry["share"]), number(entry["p"]))
+def numbers(entry: Mapping[str, Any], *keys: str) -> list[float]:
+    """Some of the numbers of an entry of a JSON."""
+    return [number(entry[key]) for key in keys]
 
 
 def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
@@ -38,11 +31,7 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
     where: as in the JSON of a diagnosis.
     """
     targets = tuple(
-        (
-            entry["target"],
-            entry["points"],
-            *(number(entry[key]) for key in ("rms_mm", "max_mm", "mean_sight_mm")),
-        )
+        (entry["target"], entry["points"], *numbers(entry, "rms_mm", "max_mm", "mean_sight_mm"))
         for entry in where["by_target"]
     )
     joints = tuple(
@@ -50,14 +39,12 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
             entry["joint"],
             "mm" if "rms_mm" in entry else "mrad",
             number(entry.get("rms_mm", entry.get("rms_mrad"))),
-            number(entry["share"]),
-            number(entry["p"]),
+            *numbers(entry, "share", "p"),
         )
         for entry in where["by_joint"]
     )
-    parts = Triage(**{kind: part_of(entry) for kind, entry in where["triage"].items()})
     return (
-        triage_table(parts),
+        triage_table(where["triage"]),
         Table(
             "what geometry leaves, by target",
             ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
@@ -99,37 +86,25 @@ def bare_scene() -> Scene:
 
 def effects_list(scene: Scene | None = None) -> list[dict[str, Any]]:
     """The library for JSON; with a scene, the places that its data can test and what they lack."""
-    if scene is None:
-        bare = bare_scene()
-        return [
-            {"effect": e.name, "cause": e.cause, "law": e.law, "needs": e.needs(bare)}
-            for e in EFFECTS.values()
-        ]
     out: list[dict[str, Any]] = []
+    at = bare_scene() if scene is None else scene
     for effect in EFFECTS.values():
-        missing = effect.needs(scene)
-        places: Sequence[str] = () if missing else tuple(effect.places(scene))
-        out.append(
-            {
-                "effect": effect.name,
-                "cause": effect.cause,
-                "law": effect.law,
-                "places": list(places),
-                "needs": missing or ("" if places else NOWHERE),
-            }
-        )
+        missing = effect.needs(at)
+        out.append({"effect": effect.name, "cause": effect.cause, "law": effect.law})
+        if scene is not None:
+            places = [] if missing else list(effect.places(scene))
+            missing = missing or ("" if places else NOWHERE)
+            out[-1]["places"] = places
+        out[-1]["needs"] = missing
     return out
 
 
 def effects_table(entries: Sequence[Mapping[str, Any]]) -> Table:
     """`effects_list` for people."""
-    if "places" not in entries[0]:
-        keys = ("effect", "cause", "law", "needs")
-        rows = tuple(tuple(str(entry[key]) for key in keys) for entry in entries)
-        return Table("effects beyond geometry", ("name", "cause", "law", "needs"), rows)
-    rows = tuple(
-        (entry["effect"], ", ".join(entry["places"]), entry["cause"], entry["needs"])
-        for entry in entries
-    )
-    header = ("name", "places these data can test", "cause", "lacking")
-    return Table("effects beyond geometry", header, rows)
+    header = {"effect": "name", "cause": "cause", "law": "law", "needs": "needs"}
+    if "places" in entries[0]:
+        places = "places these data can test"
+        header = {"effect": "name", "places": places, "cause": "cause", "needs": "lacking"}
+    told = [{**entry, "places": ", ".join(entry.get("places", ()))} for entry in entries]
+    rows = tuple(tuple(entry[key] for key in header) for entry in told)
+    return Table("effects beyond geometry", tuple(header.values()), rows)

@@ -13,7 +13,7 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, Sealed, make
 from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
-from minimax_cal.fitting.exchanged import misplaced, put_right
+from minimax_cal.fitting.checks import misplaced, put_right
 from minimax_cal.modelling.simulate import Simulation
 
 

@@ -12,13 +12,16 @@ from numpy.testing import assert_allclose
 from scipy.stats import binom
 
 import minimax_cal as mc
-from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, where
-from minimax_cal.diagnosing.where.features import factors, levelled, smooth_rows
-from minimax_cal.diagnosing.where.mean_squares import lack_of_fit
-from minimax_cal.diagnosing.where.residual import orthonormal, residual_of
-from minimax_cal.diagnosing.where.rows import joint_rows
+from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, triage_table, where
+from minimax_cal.diagnosing.where.mean_squares import (
+    lack_of_fit,
+    scatter,
+    shape_energy,
+    shape_scatter,
+)
+from minimax_cal.diagnosing.where.residual import joint_rows, orthonormal, residual_of
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
-from minimax_cal.diagnosing.where.spread import scatter, shape_energy, shape_scatter
+from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import groups
 from minimax_cal.modelling.model import model_of
@@ -485,6 +488,13 @@ def test_no_error_at_all() -> None:
     assert found.structure == 1.0
     assert all(gap.share == 0.0 for gap in found.by_joint)
     json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_a_table_holds_the_numbers(rng: np.random.Generator) -> None:
+    triage = scene().where(scene().noise(rng)).triage
+    text = triage_table(triage.to_dict()).text()
+    assert f"{1e3 * triage.noise.rms:.4f}" in text
+    assert f"{triage.noise.share:.3f}" in text
 
 
 def test_a_real_arm() -> None:

@@ -6,18 +6,8 @@ scatter between revisits and the static rest apart; a kernel test tells whether 
 """
 
 from minimax_cal.diagnosing.where.answer import Where, triage_table
-from minimax_cal.diagnosing.where.gaps import CANNOT_TELL, Part, Triage
-from minimax_cal.diagnosing.where.joints import joint_equivalent
 from minimax_cal.diagnosing.where.locate import where
-from minimax_cal.diagnosing.where.spread import noise_of
+from minimax_cal.diagnosing.where.mean_squares import noise_of
+from minimax_cal.diagnosing.where.smooth import joint_equivalent
 
-__all__ = [
-    "CANNOT_TELL",
-    "Part",
-    "Triage",
-    "Where",
-    "joint_equivalent",
-    "noise_of",
-    "triage_table",
-    "where",
-]
+__all__ = ["Where", "joint_equivalent", "noise_of", "triage_table", "where"]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from minimax_cal.diagnosing.where.gaps import Region, TargetGap
+from minimax_cal.diagnosing.where.answer import Region, TargetGap
 from minimax_cal.ground.arrays import Array, rms
 
 
@@ -75,6 +75,6 @@ def by_region(error: Array, point: Array, up: Array) -> tuple[Region, ...]:
             if inside.sum() < 9:  # the RMS of a few points is luck
                 continue
             edges = (float(rings[i]), float(rings[i + 1])), (float(floors[j]), float(floors[j + 1]))
-            size = float(np.sqrt(square[inside].mean()))
-            cells.append(Region(f"{far} and {high}", *edges, int(inside.sum()), size))
+            rms = float(np.sqrt(square[inside].mean()))
+            cells.append(Region(f"{far} and {high}", *edges, int(inside.sum()), rms))
     return tuple(cells)

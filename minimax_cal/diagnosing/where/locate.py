@@ -8,14 +8,17 @@ import numpy as np
 
 from minimax_cal.diagnosing.where.answer import Where
 from minimax_cal.diagnosing.where.cuts import by_direction, by_region, by_target
-from minimax_cal.diagnosing.where.features import levelled, smooth_rows
-from minimax_cal.diagnosing.where.joints import by_joint, joint_equivalent
-from minimax_cal.diagnosing.where.mean_squares import triage
-from minimax_cal.diagnosing.where.residual import NO_FIT, residual_of
-from minimax_cal.diagnosing.where.rows import base_rows, joint_rows
+from minimax_cal.diagnosing.where.mean_squares import noise_of, triage
+from minimax_cal.diagnosing.where.residual import NO_FIT, base_rows, joint_rows, residual_of
 from minimax_cal.diagnosing.where.significance import structure_by_pose
-from minimax_cal.diagnosing.where.spread import noise_of
-from minimax_cal.diagnosing.where.trends import clock, trend
+from minimax_cal.diagnosing.where.smooth import (
+    by_joint,
+    clock,
+    joint_equivalent,
+    levelled,
+    smooth_rows,
+    trend,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements, groups
 

@@ -1,17 +1,18 @@
-"""Mean squares that tell the kind of cause apart."""
+"""Mean squares that tell the kind of cause apart, and scatter that shows without any model."""
 
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import chi2, f
 
-from minimax_cal.diagnosing.where.gaps import CANNOT_TELL, Part, Triage
-from minimax_cal.diagnosing.where.residual import Residual
+from minimax_cal.diagnosing.where.answer import CANNOT_TELL, Part, Triage
+from minimax_cal.diagnosing.where.residual import Residual, summed
 from minimax_cal.diagnosing.where.significance import flips
-from minimax_cal.diagnosing.where.spread import revisit_scatter, shape_scatter
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements, groups
 
 
 def lack_of_fit(rest: Residual) -> float:
@@ -68,3 +69,96 @@ def above(energy: float, free: float, variance: float, behind: float) -> float:
     """p that energy / free is that large if its expectation is variance, known from `behind`."""
     ratio = energy / variance
     return float(f.sf(ratio / free, free, behind) if behind < 1e9 else chi2.sf(ratio, free))
+
+
+def noise_of(data: Measurements) -> float:
+    """Noise per coordinate from the data alone [m]: distances between targets, else revisits.
+
+    Distances: median over pairs of the robust scatter / sqrt(2).  NaN if there are neither.
+    """
+    off, weight = scatter(distances(data), np.zeros(data.poses, dtype=int))
+    if weight.sum() >= 8.0:
+        spread = [np.median(np.abs(c[w > 0])) for c, w in zip(off.T, weight.T, strict=True)]
+        return float(np.median(spread)) * 1.4826 / math.sqrt(2.0)
+    off, weight = scatter(data.y.reshape(data.poses, -1), groups(data))
+    dof = float(weight.sum())
+    return math.sqrt(float((off**2).sum()) / dof) if dof >= 8.0 else math.nan
+
+
+def pairs(k: int) -> Array:
+    """All pairs of k targets: (k (k - 1) / 2, 2)."""
+    return np.array(list(combinations(range(k), 2)), dtype=int).reshape(-1, 2)
+
+
+def distances(data: Measurements) -> Array:
+    """Between all pairs of targets: (m, pairs), NaN where not both were measured [m]."""
+    pair = pairs(len(data.target_names))
+    return np.asarray(np.linalg.norm(data.y[:, pair[:, 0]] - data.y[:, pair[:, 1]], axis=-1))
+
+
+def scatter(values: Array, group: Array) -> tuple[Array, Array]:
+    """Deviations (m, c) from the mean of the group, 0 for NaN, and degrees of freedom of each."""
+    known = np.isfinite(values)
+    _, place = np.unique(group, return_inverse=True)
+    count = np.maximum(summed(known.astype(float), group), 1.0)[place]
+    # means of what is left after one row of each group are exact to rounding, far from the origin
+    first = np.unique(place, return_index=True)[1][place]
+    moved = np.where(known & known[first], values - values[first], 0.0)
+    moved = np.where(known & ~known[first], values, moved)
+    alone = np.where(known, moved - (summed(moved, group)[place] / count), 0.0)
+    return alone, np.where(known, 1.0 - 1.0 / count, 0.0)
+
+
+def shape_energy(data: Measurements, off: Array) -> tuple[Array, Array]:
+    """Least sum of squared target motions that changes distances by `off` (m, pairs).
+
+    Changes are D e to first order, e (3k,) the targets' motions: |e|^2 = off' (DD')^+ off, which no
+    rigid motion enters.  DD' follows from the mean distances by the law of cosines.
+    Returns energy (m,) [m^2] and rank (m,), 3k - 6 for k > 2 targets in general places.
+    """
+    pair, seen = pairs(len(data.target_names)), data.seen
+    apart = distances(data)
+    known = np.isfinite(apart)
+    mean = np.where(known, apart, 0.0).sum(0) / np.maximum(known.sum(0), 1)
+    square = np.zeros((len(data.target_names),) * 2)
+    square[pair[:, 0], pair[:, 1]] = square[pair[:, 1], pair[:, 0]] = mean**2
+    (a, b), (c, d) = pair.T[:, :, None], pair.T[:, None, :]
+    dot = 0.5 * (square[a, d] + square[b, c] - square[a, c] - square[b, d])
+    common = (a == c).astype(float) + (b == d) - (a == d) - (b == c)
+    gram = common * dot / np.maximum(np.outer(mean, mean), 1e-12)
+    energy, rank = np.zeros(data.poses), np.zeros(data.poses)
+    for pattern in np.unique(seen, axis=0):
+        rows = (seen == pattern).all(axis=1)
+        both = pattern[pair].all(axis=1)
+        if both.any():
+            value, vector = np.linalg.eigh(gram[np.ix_(both, both)])
+            kept = value > 1e-3 * value[-1]
+            part = off[np.ix_(rows, both)] @ (vector[:, kept] / np.sqrt(value[kept]))
+            energy[rows], rank[rows] = (part**2).sum(1), kept.sum()
+    return energy, rank
+
+
+def shape_scatter(data: Measurements) -> tuple[float, float]:
+    """Energy [m^2] of the targets' motion against each other, and its degrees of freedom.
+
+    From the scatter of inter-target distances over all poses: free of model and fit.  White noise
+    of s per coordinate gives s^2 times the degrees of freedom; more is instrument, nests, bracket.
+    """
+    off, _ = scatter(distances(data), np.zeros(data.poses, dtype=int))
+    energy, rank = shape_energy(data, off)
+    return float(energy.sum()), float(rank.sum() - rank.max(initial=0.0))
+
+
+def revisit_scatter(data: Measurements) -> tuple[float, float, float]:
+    """Energy [m^2] of rigid motion between visits to a pose, degrees of freedom, free points.
+
+    The targets' motion against each other is taken off: it is told by `shape_scatter`.
+    """
+    group = groups(data)
+    off, weight = scatter(data.y.reshape(data.poses, -1), group)
+    apart, free = scatter(distances(data), group)
+    energy, rank = shape_energy(data, apart)
+    most = free.max(axis=1, initial=0.0)
+    points = float(weight.sum()) / 3.0
+    shape = float((rank * most).sum())
+    return float((off**2).sum() - energy.sum()), 3.0 * points - shape, points

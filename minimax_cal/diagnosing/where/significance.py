@@ -11,8 +11,7 @@ import math
 import numpy as np
 from scipy.stats import chi2, norm
 
-from minimax_cal.diagnosing.where.residual import Residual
-from minimax_cal.diagnosing.where.rows import flat_of, summed
+from minimax_cal.diagnosing.where.residual import Residual, flat_of, summed
 from minimax_cal.ground.arrays import Array
 
 FLAT = 1e-8  # share of a feature's energy below which the fit has taken it

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from minimax_cal.fitting.identify import random_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
@@ -57,9 +58,7 @@ def closing_poses(
     Each socket is reached from `visits` random starts over the joints' whole range.  Where fewer
     than two ways to it are found, it is left out.
     """
-    span = np.where(robot.prismatic, 0.5, np.pi)
-    lower, upper = np.maximum(robot.lower, -span), np.minimum(robot.upper, span)
-    q = rng.uniform(lower, upper, (sockets, visits, robot.joints))
+    q = random_joints(robot, (sockets, visits), rng)
     pose = robot.pose(q[:, 0])
     place = pose[:, :3, :3] @ ball + pose[:, :3, 3]
     goal = np.repeat(place, visits, axis=0)

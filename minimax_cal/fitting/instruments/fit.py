@@ -20,7 +20,7 @@ from minimax_cal.fitting.instruments.rows import (
     arm_at,
     places,
 )
-from minimax_cal.fitting.instruments.split import free_numbers, misclosures
+from minimax_cal.fitting.instruments.split import before_and_after, free_numbers, misclosures
 from minimax_cal.fitting.instruments.start import ball_start, wire_start
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -155,29 +155,32 @@ def check_count(train: RelativeData, unknowns: int, known: int) -> int:
     return numbers + known
 
 
-def errors_at(
-    robot: Robot, fit: InstrumentFit, x: State, data: RelativeData, held: Array
-) -> tuple[Array, Array]:
-    """Errors of training and of held-out rows: (parts, m, 3) each [m], NaN where not measured.
+def errors_of(
+    robot: Robot, fit: InstrumentFit, data: RelativeData, held: Array
+) -> dict[str, Array]:
+    """Errors by the keys of a result: (parts, m, 3) each [m], NaN where not measured.
 
     The error of a length stands first of three; that of a visit is about its socket.
     """
-    if isinstance(fit.instrument, Wires):
-        wires = replace(fit.instrument, model=arm_at(robot, data.at.q), length=data.length)
-        error = wires.errors(x)
-        rows = np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
-    else:
-        place = places(arm_at(robot, data.at.q), x).T
-        rows = misclosures(place, data.socket, held)[None]
-    return rows[:, ~held], rows[:, held]
+    arm = arm_at(robot, data.at.q)
+
+    def errors(x: State) -> Array:
+        if not isinstance(fit.instrument, Wires):
+            return misclosures(places(arm, x).T, data.socket, held)[None]
+        error = replace(fit.instrument, model=arm, length=data.length).errors(x)
+        return np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
+
+    return before_and_after(errors(fit.nominal), errors(fit.state), held)
 
 
-def count_numbers(data: RelativeData, held: Array) -> tuple[int, int]:
-    """Independent numbers behind the errors of training and of held-out rows."""
+def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
+    """Independent numbers behind the errors, by the keys of a result."""
     if data.kind == "distances":
         seen = np.isfinite(data.length)
-        return int(seen[~held].sum()), int(seen[held].sum())
-    return free_numbers(data.socket, held)
+        trained, left = int(seen[~held].sum()), int(seen[held].sum())
+    else:
+        trained, left = free_numbers(data.socket, held)
+    return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
 
 
 def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
@@ -211,21 +214,15 @@ def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Pa
 
 def placed(fit: InstrumentFit, data: RelativeData, options: RelativeOptions) -> dict[str, Any]:
     """For JSON: what was fitted besides the robot, in the robot's base and last frame."""
-
-    def millimetres(values: Array) -> list[float]:
-        return [1e3 * float(value) for value in values]
-
-    out: dict[str, Any] = {"target_mm": millimetres(fit.state.target_positions[0])}
+    out: dict[str, Any] = {"target_mm": (1e3 * fit.state.target_positions[0]).tolist()}
     if isinstance(fit.instrument, Wires):
         anchors, offsets = fit.instrument.split(fit.state.effects)
-        wires = data.wires
-        out["anchors_mm"] = {w: millimetres(a) for w, a in zip(wires, anchors, strict=True)}
+        out["anchors_mm"] = dict(zip(data.wires, (1e3 * anchors).tolist(), strict=True))
         if options.offset:
-            out["offsets_mm"] = dict(zip(wires, millimetres(offsets), strict=True))
+            out["offsets_mm"] = dict(zip(data.wires, (1e3 * offsets).tolist(), strict=True))
     else:
-        centre = fit.instrument.barycentres(places(fit.instrument.model, fit.state))
-        labels = [str(label) for label in np.unique(data.socket)]
-        out["sockets_mm"] = {s: millimetres(c) for s, c in zip(labels, centre.T, strict=True)}
+        centre = fit.instrument.barycentres(places(fit.instrument.model, fit.state)).T
+        out["sockets_mm"] = dict(zip(data.sockets, (1e3 * centre).tolist(), strict=True))
         out["known_distances"] = [[a, b, 1e3 * length] for a, b, length in options.known_distances]
         out["scale"] = "known distance" if has_scale(fit.instrument) else "as drawn"
     return out

@@ -11,9 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.identify import (
+    NOT_TOLD,
     RANK,
     RESOLUTION,
+    SAME_MOTION,
     Identification,
+    Kept,
     drop_order,
     plenty_of_poses,
     redundant,
@@ -26,12 +29,10 @@ from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
-from minimax_cal.solvers.least_squares import solve_normal
 
 PLENTY = 200  # poses that show what no poses could tell
 SOCKETS, VISITS = 20, 10
 STILL = 1e-7  # relative motion of a column that moves nothing
-SHOWN = 4  # names in a reason
 FRAMELESS = {
     Wires: "moves nothing that is measured",
     Closures: "moves or turns all sockets alike: closures know no base frame",
@@ -131,34 +132,23 @@ def identified(
     plain = gram_of(reference, x)
     here = closed(robot, instrument, x) if isinstance(instrument, Closures) else instrument
     gram = gram_of(here, x)
-    scale = np.sqrt(np.diag(gram) / max(instrument.points, 1))
-    active = allowed.copy()
-    fixed = ~allowed & names.links
-    reasons = {names.all[i]: "fixed by the user" for i in np.flatnonzero(fixed)}
-    size = np.sqrt(np.diag(plain))
-    for still, reason in (
-        (size <= STILL * size.max(), FRAMELESS[type(instrument)]),
-        (scale <= STILL * scale.max(), "moves nothing at these poses"),
+    size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(instrument.points, 1))
+    kept = Kept(names, allowed, {}).without(~allowed & names.links, "fixed by the user")
+    for motion, reason in (
+        (size, FRAMELESS[type(instrument)]),
+        (scale, "moves nothing at these poses"),
     ):
-        reasons |= {names.all[i]: reason for i in np.flatnonzero(active & still)}
-        active &= ~still
+        kept = kept.without(kept.active & (motion <= STILL * motion.max()), reason)
     order = order_of(robot, names)
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
-    no_length = open_scale(reference, x, active, order)
-    keeper = scale_keeper(robot, active, wanted) if no_length else []
+    no_length = open_scale(reference, x, kept.active, order)
+    keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
-    for i in redundant(plain, active, order, RANK):
-        active[i] = False
-        reasons[names.all[i]] = SCALE if i in keeper else "same motion as {}"
-    for i in redundant(gram, active, order, resolution):
-        active[i] = False
-        reasons[names.all[i]] = "these poses do not tell it from {}"
-    for name, reason in list(reasons.items()):
-        mates = partners(gram, scale, active, names.index(name), names) if "{}" in reason else ""
-        reasons[name] = reason.format(mates)
-    scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
-    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
-    return Identification(active, reasons, singular, scale)
+    gone = redundant(plain, kept.active, order, RANK)
+    kept = kept.without(gone, SAME_MOTION).without([i for i in gone if i in keeper], SCALE)
+    kept = kept.without(redundant(gram, kept.active, order, resolution), NOT_TOLD)
+    anchors = {name.partition("_")[0] for name in names.all if name.startswith("anchor")}
+    return kept.identification(gram, scale, anchors, "all anchors moved together")
 
 
 def generic_count(robot: Robot, instrument: Instrument, x: State, allowed: Array) -> int:
@@ -167,19 +157,6 @@ def generic_count(robot: Robot, instrument: Instrument, x: State, allowed: Array
     moving = allowed & (np.sqrt(np.diag(plain)) > STILL * np.sqrt(np.diag(plain).max()))
     gone = redundant(plain, moving, order_of(robot, instrument.names), RANK)
     return int(moving.sum()) - len(gone)
-
-
-def partners(gram: Array, scale: Array, active: Array, i: int, names: Names) -> str:
-    """The kept parameters that together do what parameter i does, largest first."""
-    chosen = np.flatnonzero(active)
-    mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
-    share = np.abs(mix) * scale[chosen] / scale[i]
-    shown = [names.all[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
-    anchors = [name for name in shown if name.startswith("anchor")]
-    if len({name.partition("_")[0] for name in anchors}) > 1:  # one thing to the reader
-        shown = [name for name in shown if name not in anchors] + ["all anchors moved together"]
-    more = len(shown) - SHOWN
-    return ", ".join(shown[:SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> float:

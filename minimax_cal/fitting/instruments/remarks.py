@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.calibrate import WILD_ANGLE
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
@@ -14,7 +15,6 @@ from minimax_cal.fitting.instruments.identify import has_scale
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import TARGET
-from minimax_cal.fitting.plausibility import POOR_FIT
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.robots.kinematics import MDH_NAMES
@@ -23,7 +23,7 @@ WEAK = 3.0  # times what was measured: positions that are told worse are weakly 
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
 
-def scale_notices(fit: InstrumentFit) -> tuple[str, ...]:
+def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     """What stands for the length standard that closures lack."""
     kept = [
         name
@@ -39,7 +39,7 @@ def scale_notices(fit: InstrumentFit) -> tuple[str, ...]:
     )
 
 
-def offset_notices(
+def of_offsets(
     fit: InstrumentFit, parameters: tuple[Parameter, ...], options: RelativeOptions
 ) -> tuple[str, ...]:
     """How weakly the offsets of wires are determined."""
@@ -60,7 +60,7 @@ def offset_notices(
     )
 
 
-def remarks(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
+def general(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
     """What the reader should know: nothing held out, measurements that stand out."""
     notices = []
     if not held.any():

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from minimax_cal.fitting.fit import Parameter, Provenance
 from minimax_cal.fitting.fit_file import SCHEMA
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
@@ -44,8 +46,8 @@ class RelativeCalibration:
     """A robot calibrated from lengths, closures or poses.
 
     kind: one of `data.KINDS`.  robot: calibrated; nominal: as drawn.
-    parts: what each row of the errors is, as wire1.  accuracy, errors: by key nominal, holdout,
-    nominal_train, train; errors are (parts, m, 3) of the measured quantity, NaN where not measured
+    parts: what each row of the errors is, as wire1.  errors: by key nominal, holdout,
+    nominal_train, train, (parts, m, 3) of the measured quantity, NaN where not measured
     [m]; a length's error stands first of three.  numbers: independent numbers behind each
     accuracy.  turns: RMS and largest error of orientation by key [rad], empty but for poses.
     instrument: what was fitted besides the robot, for JSON.  position_sigma: expected error of a
@@ -61,7 +63,6 @@ class RelativeCalibration:
     iterations: int
     seconds: float
     parameters: tuple[Parameter, ...]
-    accuracy: Mapping[str, Accuracy]
     errors: Mapping[str, Array]
     numbers: Mapping[str, int]
     turns: Mapping[str, tuple[float, float]]
@@ -71,6 +72,11 @@ class RelativeCalibration:
     beyond: tuple[str, ...]
     notices: tuple[str, ...]
     provenance: Provenance
+
+    @cached_property
+    def accuracy(self) -> dict[str, Accuracy]:
+        """Of the errors, by their keys."""
+        return {key: accuracy(error) for key, error in self.errors.items()}
 
     @property
     def identified(self) -> int:
@@ -93,13 +99,12 @@ class RelativeCalibration:
 
     def parts_table(self) -> Table:
         """RMS errors wire by wire."""
-        rows: list[tuple[Cell, ...]] = []
-        for i, part in enumerate(self.parts):
-            found = [self.accuracy[key] for _, key in ROWS]
-            each = [(a.sse_mm2[i], a.counts[i]) for a in found]
-            rows.append((part, *(math.sqrt(f / m) if m else math.nan for f, m in each)))
+        rows: tuple[tuple[Cell, ...], ...] = tuple(
+            (part, *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for _, key in ROWS))
+            for i, part in enumerate(self.parts)
+        )
         header = ("RMS mm", *(title for title, _ in ROWS))
-        return Table("by wire", header, tuple(rows), ("", *[".4f"] * len(ROWS)))
+        return Table("by wire", header, rows, ("", *[".4f"] * len(ROWS)))
 
     def parameter_rows(self) -> Table:
         """Every parameter with its nominal value, change and sigma, in mm and mrad."""
@@ -148,10 +153,10 @@ class RelativeCalibration:
         """For JSON: `robot` is the calibrated robot, whole, as `load_robot` reads it."""
         accuracies = {}
         for key, value in self.accuracy.items():
-            accuracies[key] = value.to_dict() | {"numbers": self.numbers[key]}
-            for name, turn in zip(("rms_mrad", "max_mrad"), self.turns.get(key, ()), strict=False):
-                accuracies[key][name] = finite(1e3 * turn)
-        return {
+            turns = [1e3 * turn for turn in self.turns.get(key, ())]
+            angles = dict(zip(("rms_mrad", "max_mrad"), turns, strict=False))
+            accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
+        content = {
             "schema": SCHEMA,
             "kind": KIND,
             "measured": self.kind,
@@ -166,12 +171,13 @@ class RelativeCalibration:
             "parameters": [p.to_dict() for p in self.parameters],
             "identified": self.identified,
             "beyond_one_reflector": list(self.beyond),
-            "condition": finite(self.identification.condition),
-            "position_sigma_mm": finite(1e3 * self.position_sigma),
+            "condition": self.identification.condition,
+            "position_sigma_mm": 1e3 * self.position_sigma,
             "accuracy": accuracies,
             "notices": list(self.notices),
             "provenance": vars(self.provenance),
         }
+        return dict(plain(content))
 
     def json(self) -> str:
         """`to_dict` as text."""

@@ -7,11 +7,30 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import groups, split
 
 WHOLE = 5  # sockets from which on whole ones are held out
+
+
+def held_out(data: RelativeData, options: RelativeOptions) -> tuple[Array, tuple[str, ...]]:
+    """(m,) True where a length or a visit is held out, and notices."""
+    if data.kind != "closures":
+        return split_rows(data, options.holdout, options.seed)
+    needed = tuple(label for known in options.known_distances for label in known[:2])
+    return split_sockets(data, options.holdout, options.seed, needed)
+
+
+def before_and_after(nominal: Array, calibrated: Array, held: Array) -> dict[str, Array]:
+    """Errors (parts, m, ...) of all poses by the keys of a result.  held: (m,)."""
+    return {
+        "nominal": nominal[:, held],
+        "train": calibrated[:, ~held],
+        "holdout": calibrated[:, held],
+        "nominal_train": nominal[:, ~held],
+    }
 
 
 def split_rows(data: RelativeData, holdout: float, seed: int) -> tuple[Array, tuple[str, ...]]:

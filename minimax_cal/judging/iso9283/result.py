@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283.formulas import mean_of
@@ -81,40 +82,41 @@ class Iso9283:
 
     def position_table(self) -> Table:
         """AP of the TCP."""
-        rows: list[tuple[TableCell, ...]] = []
-        for title, name, part, values in self.rows():
-            size = 1e3 * np.linalg.norm(values.position, axis=1)
-            if np.isfinite(size).any():
-                each = (1e3 * rms(axis) for axis in values.position.T)
-                rows.append((title, name, *summary(size), *each, worst(part.names, size)))
+        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+            (title, name, *summary(size), *(1e3 * rms(axis) for axis in values.position.T),
+             worst(part.names, size))
+            for title, name, part, values in self.rows()
+            if np.isfinite(size := millimetres(values.position)).any()
+        )  # fmt: skip
         return Table(
             f"{self.robot}: pose accuracy AP of {self.tcp} (7.2), by the formulas of ISO 9283",
             ("poses", "cell", "count", "AP mean mm", "RMS mm", "max mm",
              "AP_x RMS mm", "AP_y RMS mm", "AP_z RMS mm", "worst pose"),
-            tuple(rows),
+            rows,
             ("", "", "d", *[".4f"] * 6, ""),
         )  # fmt: skip
 
     def target_table(self) -> Table:
         """AP of each target; empty where there is only one."""
-        rows: list[tuple[TableCell, ...]] = [
-            (title, name, target, *summary(1e3 * np.linalg.norm(values.targets[:, i], axis=1)))
+        rows = tuple(
+            (title, name, target, *summary(millimetres(values.targets[:, i])))
             for title, name, _, values in self.rows()
             for i, target in enumerate(self.target_names)
             if len(self.target_names) > 1
-        ]
+        )
         header = ("poses", "cell", "target", "count", "AP mean mm", "RMS mm", "max mm")
         formats = ("", "", "", "d", *[".4f"] * 3)
-        return Table("pose accuracy AP of each target (7.2)", header, tuple(rows), formats)
+        return Table("pose accuracy AP of each target (7.2)", header, rows, formats)
 
     def orientation_table(self) -> Table:
         """AO and AO'; or why there is none."""
-        rows: list[tuple[TableCell, ...]] = []
-        for title, name, part, values in self.rows():
-            if np.isfinite(values.angle).any():
-                each = (1e3 * rms(axis) for axis in values.euler.T)
-                rows.append((title, name, *summary(1e3 * values.angle), *each, part.locked))
         title = "orientation accuracy (7.2)"
+        rows: tuple[tuple[TableCell, ...], ...] = tuple(
+            (words, name, *summary(1e3 * values.angle),
+             *(1e3 * rms(axis) for axis in values.euler.T), part.locked)
+            for words, name, part, values in self.rows()
+            if np.isfinite(values.angle).any()
+        )  # fmt: skip
         if not rows:
             return Table(title, ("poses", "AO"), (("all", NO_TURNS),))
         return Table(
@@ -122,7 +124,7 @@ class Iso9283:
             f"angles about x, y, z ({LOCKED})",
             ("poses", "cell", "count", "AO' mean mrad", "RMS mrad", "max mrad",
              "AO_a RMS mrad", "AO_b RMS mrad", "AO_c RMS mrad", "left out"),
-            tuple(rows),
+            rows,
             ("", "", "d", *[".4f"] * 6, "d"),
         )  # fmt: skip
 
@@ -133,10 +135,10 @@ class Iso9283:
             kinds = {"all": values.pairs, "consecutive": values.moves, "repeated": values.repeated}
             for kind, errors in kinds.items():
                 if len(errors):
-                    mean = 1e3 * float(errors.mean())
                     scatter = part.scatter.distance if kind == "repeated" else np.zeros(0)
                     most = 1e3 * float(scatter.max()) if len(scatter) else math.nan
-                    rows.append((title, name, kind, *summary(1e3 * np.abs(errors)), mean, most))
+                    mean = 1e3 * float(errors.mean())
+                    rows.append((title, name, kind, *summary(1e3 * abs(errors)), mean, most))
         return Table(
             "distance accuracy AD and repeatability RD between poses of one part (7.3)",
             ("poses", "cell", "pairs", "count", "|AD| mean mm", "RMS mm", "max mm",
@@ -150,11 +152,10 @@ class Iso9283:
         rows: list[tuple[TableCell, ...]] = []
         for key, part in self.parts.items():
             s = part.scatter
+            sizes = np.column_stack([s.one_way, s.all_ways, s.variation, s.euler, s.angle])
             for i in np.flatnonzero(np.isfinite(s.all_ways)):
-                position = (1e3 * float(v[i]) for v in (s.one_way, s.all_ways, s.variation))
-                angles = (1e3 * float(v) for v in (*s.euler[i], s.angle[i]))
-                rows.append((str(part.names[i]), PARTS[key], int(s.stops[i]), int(s.ways[i]),
-                             *position, *angles))  # fmt: skip
+                counts = int(s.stops[i]), int(s.ways[i])
+                rows.append((str(part.names[i]), PARTS[key], *counts, *(1e3 * sizes[i]).tolist()))
         return Table(
             f"pose repeatability (7.2) of {self.tcp}: RP of the worst single way of approach, RP "
             f"over all ways, vAP between ways, RO ({CYCLES} visits each way are due)",
@@ -170,8 +171,8 @@ class Iso9283:
         for title, name, part, values in self.rows():
             size = np.linalg.norm(values.position, axis=1)
             columns = np.column_stack([size, values.position, values.angle, values.euler])
-            for i, row in enumerate(1e3 * columns):
-                rows.append((str(part.names[i]), title, name, *map(float, row)))
+            for pose, row in zip(part.names, (1e3 * columns).tolist(), strict=True):
+                rows.append((str(pose), title, name, *row))
         return Table(
             "every pose",
             ("pose", "poses", "cell", "AP mm", "AP_x mm", "AP_y mm", "AP_z mm", "AO' mrad",
@@ -223,55 +224,64 @@ class Iso9283:
 
 def part_to_dict(part: Part, targets: Sequence[str]) -> dict[str, Any]:
     """One part for JSON."""
+    return {
+        "cells": {name: values_to_dict(values, targets) for name, values in part.values.items()},
+        "repeat": {
+            "RP_mm": figures(part.scatter.one_way),
+            "RP_all_mm": figures(part.scatter.all_ways),
+            "vAP_mm": figures(part.scatter.variation),
+            "RO_angle_mrad": figures(part.scatter.angle),
+            "RD_mm": figures(part.scatter.distance),
+        },
+        "not_available": part.reasons,
+        "poses": [pose_to_dict(part, i, targets) for i in range(len(part.names))],
+    }
+
+
+def values_to_dict(values: Values, targets: Sequence[str]) -> dict[str, Any]:
+    """What one cell makes of the poses of a part, for JSON."""
+    each = zip(targets, np.moveaxis(values.targets, 1, 0), strict=True)
+    return {
+        "AP_mm": figures(np.linalg.norm(values.position, axis=1)),
+        **{f"AP_{x}_mm": figures(values.position[:, i]) for i, x in enumerate("xyz")},
+        "AP_target_mm": {target: figures(np.linalg.norm(off, axis=1)) for target, off in each},
+        "AO_angle_mrad": figures(values.angle),
+        **{f"AO_{a}_mrad": figures(values.euler[:, i]) for i, a in enumerate("abc")},
+        "AD_mm": {
+            "all": figures(values.pairs),
+            "consecutive": figures(values.moves),
+            "repeated": figures(values.repeated),
+        },
+    }
+
+
+def pose_to_dict(part: Part, i: int, targets: Sequence[str]) -> dict[str, Any]:
+    """Pose i of a part for JSON."""
     s = part.scatter
-    cells = {
-        name: {
-            "AP_mm": figures(1e3 * np.linalg.norm(v.position, axis=1)),
-            **{f"AP_{x}_mm": figures(1e3 * v.position[:, i]) for i, x in enumerate("xyz")},
-            "AP_target_mm": {
-                target: figures(1e3 * np.linalg.norm(v.targets[:, i], axis=1))
-                for i, target in enumerate(targets)
-            },
-            "AO_angle_mrad": figures(1e3 * v.angle),
-            **{f"AO_{a}_mrad": figures(1e3 * v.euler[:, i]) for i, a in enumerate("abc")},
-            "AD_mm": {
-                "all": figures(1e3 * v.pairs),
-                "consecutive": figures(1e3 * v.moves),
-                "repeated": figures(1e3 * v.repeated),
-            },
-        }
-        for name, v in part.values.items()
+    return {
+        "pose": str(part.names[i]),
+        "visits": int(s.stops[i]),
+        "directions": int(s.ways[i]),
+        "RP_mm": plain(1e3 * s.one_way[i]),
+        "RP_all_mm": plain(1e3 * s.all_ways[i]),
+        "RP_target_mm": dict(zip(targets, plain(1e3 * s.targets[i]), strict=True)),
+        "vAP_mm": plain(1e3 * s.variation[i]),
+        "RO_mrad": plain(1e3 * s.euler[i]),
+        "RO_angle_mrad": plain(1e3 * s.angle[i]),
+        "cells": {
+            name: {
+                "AP_mm": plain(1e3 * values.position[i]),
+                "AO_mrad": plain(1e3 * values.euler[i]),
+                "AO_angle_mrad": plain(1e3 * values.angle[i]),
+            }
+            for name, values in part.values.items()
+        },
     }
-    each = [
-        {
-            "pose": str(part.names[i]),
-            "visits": int(s.stops[i]),
-            "directions": int(s.ways[i]),
-            "RP_mm": finite(1e3 * s.one_way[i]),
-            "RP_all_mm": finite(1e3 * s.all_ways[i]),
-            "RP_target_mm": {t: finite(1e3 * s.targets[i, j]) for j, t in enumerate(targets)},
-            "vAP_mm": finite(1e3 * s.variation[i]),
-            "RO_mrad": [finite(1e3 * value) for value in s.euler[i]],
-            "RO_angle_mrad": finite(1e3 * s.angle[i]),
-            "cells": {
-                name: {
-                    "AP_mm": [finite(1e3 * value) for value in v.position[i]],
-                    "AO_mrad": [finite(1e3 * value) for value in v.euler[i]],
-                    "AO_angle_mrad": finite(1e3 * v.angle[i]),
-                }
-                for name, v in part.values.items()
-            },
-        }
-        for i in range(len(part.names))
-    ]
-    repeat = {
-        "RP_mm": figures(1e3 * s.one_way),
-        "RP_all_mm": figures(1e3 * s.all_ways),
-        "vAP_mm": figures(1e3 * s.variation),
-        "RO_angle_mrad": figures(1e3 * s.angle),
-        "RD_mm": figures(1e3 * s.distance),
-    }
-    return {"cells": cells, "repeat": repeat, "not_available": part.reasons, "poses": each}
+
+
+def millimetres(off: Array) -> Array:
+    """(m,) lengths [mm] of (m, 3) [m]."""
+    return np.asarray(1e3 * np.linalg.norm(off, axis=1))
 
 
 def summary(values: Array) -> tuple[int, float, float, float]:
@@ -283,26 +293,15 @@ def summary(values: Array) -> tuple[int, float, float, float]:
 
 
 def figures(values: Array) -> dict[str, float | None]:
-    """`summary` for JSON."""
-    count, mean, square, most = summary(values)
-    return {"count": count, "mean": finite(mean), "rms": finite(square), "max": finite(most)}
-
-
-def rms(values: Array) -> float:
-    """Root of the mean square, NaN left out; NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+    """`summary` for JSON, in thousandths of the unit."""
+    count, *sizes = summary(1e3 * values)
+    return {"count": count, **dict(zip(("mean", "rms", "max"), plain(sizes), strict=True))}
 
 
 def worst(names: Array, values: Array) -> str:
     """The name with the largest value."""
     known = np.isfinite(values)
     return str(names[known][np.argmax(values[known])]) if known.any() else ""
-
-
-def finite(value: float) -> float | None:
-    """For JSON: null where there is no number."""
-    return float(value) if math.isfinite(value) else None
 
 
 def iso9283(
@@ -321,10 +320,11 @@ def iso9283(
     chosen, told = tcp_of(data, tcp)
     commanded = {name: data.y - np.moveaxis(c.error(data), 0, 1) for name, c in cells.items()}
     stops = stops_of(data, commanded, np.asarray(held, dtype=bool))
-    parts = {}
-    for key, mask in (("holdout", stops.held), ("train", ~stops.held)):
-        if mask.any():
-            parts[key] = part_of(cells, stops.take(mask), data.target_names, chosen)
+    parts = {
+        key: part_of(cells, stops.take(mask), data.target_names, chosen)
+        for key, mask in (("holdout", stops.held), ("train", ~stops.held))
+        if mask.any()
+    }
     robot = next(iter(cells.values())).robot.name
     notices = tuple(remarks(data, stops, parts))
     asked = conditions(data, stops)

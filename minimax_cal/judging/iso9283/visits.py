@@ -55,15 +55,9 @@ class Stops:
 
     def take(self, rows: Array) -> Stops:
         """Some of the stops.  rows: (v,) mask."""
-        return Stops(
-            self.attained[rows],
-            {name: points[rows] for name, points in self.commanded.items()},
-            self.pose[rows],
-            self.way[rows],
-            self.place[rows],
-            self.linked[rows],
-            self.held[rows],
-        )
+        arrays = {name: part[rows] for name, part in vars(self).items() if name != "commanded"}
+        commanded = {name: points[rows] for name, points in self.commanded.items()}
+        return Stops(commanded=commanded, **arrays)
 
 
 def stops_of(data: Measurements, commanded: Mapping[str, Array], held: Array) -> Stops:

@@ -8,8 +8,9 @@ from typing import Any
 
 from minimax_cal.diagnosing.result import Diagnosis, Finding
 from minimax_cal.diagnosing.sentences import at, cause
+from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.reporting.tables import number, where_tables
+from minimax_cal.reporting.tables import where_tables
 
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one

@@ -11,8 +11,15 @@ import numpy as np
 from minimax_cal.diagnosing.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
-from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+from minimax_cal.reporting.plots.figures import (
+    AFTER,
+    BEFORE,
+    logarithmic,
+    new_figure,
+    plain_ticks,
+    save,
+    scale_bar,
+)
 
 COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
 
@@ -52,16 +59,6 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
     outside(axes, 4)
 
 
-def plain_ticks(axis: Any, values: Array) -> None:
-    """Labels 0.1 0.2 0.5 1 on a logarithmic axis; the powers of ten alone where those are many."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    many = np.nanmax(values) > 200.0 * np.nanmin(values)
-    axis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(NullFormatter())
-
-
 def outside(axes: Any, columns: int) -> None:
     """The legend above the axes, where no point can lie under it."""
     axes.legend(
@@ -97,22 +94,14 @@ def room(values: Array, widest: float) -> tuple[float, float]:
 
 def draw_maps(part: Any, left: Leftover) -> None:
     """The errors over the workspace from above and from the side, all on one colour scale."""
-    from matplotlib.colors import LogNorm
-
     sizes = left.distances()
-    seen = np.concatenate([size[np.isfinite(size)] for size in sizes])
-    seen = seen[seen > 0.0] if (seen > 0.0).any() else np.ones(1)
-    low, high = float(np.quantile(seen, 0.05)), float(seen.max())
-    scale = LogNorm(low, max(high, 1.5 * low))
+    scale = logarithmic(np.concatenate([size.ravel() for size in sizes]), 0.05)
     up = left.scene.robot.up
     tall = int(np.argmax(np.abs(up)))
     first, second = (axis for axis in range(3) if axis != tall)
-    height = left.points @ up
-    views = (("top", left.points[..., second], f"{'xyz'[second]} (m)"),
-             ("side", height, "height (m)"))  # fmt: skip
-    spans = [np.nanmax(p) - np.nanmin(p) for p in
-             (left.points[..., first], left.points[..., second], height)]  # fmt: skip
-    widest = float(max(spans))
+    across, deep, high = left.points[..., first], left.points[..., second], left.points @ up
+    views = (("top", deep, f"{'xyz'[second]} (m)"), ("side", high, "height (m)"))
+    widest = float(max(np.nanmax(along) - np.nanmin(along) for along in (across, deep, high)))
     wide = len(sizes) > 1  # one view stands beside the other; two above each other
     grid = part.subplots(
         len(sizes), 2, squeeze=False, sharex=True, sharey="row" if wide else "none"
@@ -121,22 +110,18 @@ def draw_maps(part: Any, left: Leftover) -> None:
     for axes, ((view, down, label), size, name) in zip(grid.flat, panels, strict=True):
         order = np.argsort(np.nan_to_num(size), axis=None)  # the worst on top
         shown = axes.scatter(
-            left.points[..., first].ravel()[order], down.ravel()[order],
+            across.ravel()[order], down.ravel()[order],
             c=size.ravel()[order], norm=scale, cmap="cividis_r", s=9,
         )  # fmt: skip
         axes.set_aspect("equal", adjustable="box")
-        axes.set(xlim=room(left.points[..., first], widest), ylim=room(down, widest))
+        axes.set(xlim=room(across, widest), ylim=room(down, widest))
         axes.set_title(f"{name}, {view}", fontsize="medium")
         axes.grid(visible=True, alpha=0.3)
         if axes in grid[:, 0] or not wide:
             axes.set_ylabel(label)
         if axes in grid[-1]:
             axes.set_xlabel(f"{'xyz'[first]} (m)")
-    place = "right" if wide else "bottom"
-    bar = part.colorbar(
-        shown, ax=grid, label="error of a point (mm)", extend="min", location=place, shrink=0.8
-    )
-    plain_ticks(bar.ax.yaxis if wide else bar.ax.xaxis, np.array([low, high]))
+    scale_bar(part, shown, grid, "error of a point (mm)", "right" if wide else "bottom")
 
 
 def verdict_of(diagnosis: Diagnosis) -> str:
@@ -158,15 +143,9 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
 
     path: its suffix, one of `figures.PICTURES`, chooses the format.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
     left = diagnosis.leftover()
     residual, order = residual_curve(left), order_curve(left)
-    figure = Figure(figsize=(12.5, 10), layout="constrained")
+    figure = new_figure(12.5, 10)
     title = textwrap.fill(f"{diagnosis.robot}: {verdict_of(diagnosis)}", 110)
     figure.suptitle(title, fontweight="bold")
     parts: Any = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
@@ -14,41 +15,74 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axis import Axis
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure, FigureBase
 
 PICTURES = (".png", ".svg", ".pdf")
 BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Okabe and Ito 2008]
 
 
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size in inches.  Raises OptionError without matplotlib."""
+    try:
+        from matplotlib import figure
+    except ModuleNotFoundError as error:
+        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+    return figure.Figure(figsize=(width, height), layout="constrained")
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure whole; the suffix, one of PICTURES, chooses the format."""
+    from matplotlib import rc_context
+
     kind = path.suffix.lower().lstrip(".")
     stream = io.BytesIO()
     stamp = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": None}[kind]
-    figure.savefig(stream, format=kind, dpi=150, metadata=stamp)
+    with rc_context({"svg.hashsalt": "minimax-cal"}):  # the same picture gives the same file
+        figure.savefig(stream, format=kind, dpi=150, metadata=stamp)
     write_whole(path, stream.getvalue())
+
+
+def logarithmic(values: Array, quantile: float) -> LogNorm:
+    """A colour scale for lengths, from a quantile of the positive ones to the largest [mm]."""
+    from matplotlib.colors import LogNorm
+
+    known = values[np.isfinite(values) & (values > 0.0)]
+    known = known if len(known) else np.ones(1)
+    low, high = float(np.quantile(known, quantile)), float(known.max())
+    return LogNorm(low, max(high, 1.5 * low))
+
+
+def plain_ticks(axis: Axis, values: ArrayLike) -> None:
+    """Labels 0.1 0.2 0.5 1 on a logarithmic axis; the powers of ten alone where those are many."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    many = np.nanmax(values) > 200.0 * np.nanmin(values)
+    axis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def scale_bar(part: FigureBase, shown: Any, panels: Array, label: str, side: str) -> None:
+    """A colour bar beside its panels, or at their bottom, with plain numbers."""
+    bar = part.colorbar(
+        shown, ax=list(panels.flat), label=label, extend="min", location=side, shrink=0.8
+    )
+    plain_ticks(bar.long_axis, [shown.norm.vmin, shown.norm.vmax])
 
 
 def save_errors(fit: Fit, path: Path) -> None:
     """Errors before and after: pose by pose, and their distribution on held-out poses."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import MaxNLocator
-    except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
-
-    def distances(key: str) -> Array:
-        return 1e3 * np.asarray(np.linalg.norm(fit.errors[key], axis=-1))
+    figure = new_figure(10, 3.8)
+    from matplotlib.ticker import MaxNLocator
 
     held = fit.accuracy["holdout"].poses > 0
     keys = ("nominal", "holdout") if held else ("nominal_train", "train")
     where = "held-out poses" if held else "training poses (none held out)"
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     for key, colour, name in zip(keys, (BEFORE, AFTER), ("nominal", "calibrated"), strict=True):
-        distance = distances(key)
+        distance = 1e3 * np.linalg.norm(fit.errors[key], axis=-1)
         a = fit.accuracy[key]
         pose = np.broadcast_to(np.arange(1, distance.shape[1] + 1), distance.shape)
         seen = np.isfinite(distance)

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.maps import Section, WorkspaceMap
 from minimax_cal.judging.saved import AFTER, BEFORE
-from minimax_cal.reporting.plots.figures import save
+from minimax_cal.reporting.plots.figures import logarithmic, new_figure, save, scale_bar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,14 +26,8 @@ MARKS: dict[bool, dict[str, Any]] = {  # held out or not: size and rim of a poin
 
 def save_map(found: WorkspaceMap, path: Path) -> None:
     """Draw a map.  path: its suffix, one of `figures.PICTURES`, chooses the format."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
     columns = 4 if found.predicted else 2
-    figure = Figure(figsize=(3.9 * columns, 9.0), layout="constrained")
+    figure = new_figure(3.9 * columns, 9.0)
     grid = np.asarray(figure.subplots(2, columns, squeeze=False, sharex="row", sharey="row"))
     if found.predicted:
         draw_predicted(figure, grid[:, :2], found)
@@ -60,33 +53,10 @@ def legend(found: WorkspaceMap) -> str:
     )
 
 
-def scale_of(values: Array) -> Any:
-    """A logarithmic colour scale for lengths [mm]."""
-    from matplotlib.colors import LogNorm
-
-    known = values[np.isfinite(values) & (values > 0.0)]
-    known = known if len(known) else np.ones(1)
-    low, high = float(np.quantile(known, 0.02)), float(known.max())
-    return LogNorm(low, max(high, 1.5 * low))
-
-
-def scale_bar(figure: Figure, shown: Any, grid: Array, label: str) -> None:
-    """A colour bar below its panels, with plain numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    bar = figure.colorbar(
-        shown, ax=list(grid.flat), label=label, location="bottom", shrink=0.8, extend="min"
-    )
-    many = shown.norm.vmax > 200.0 * shown.norm.vmin
-    bar.ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 2.0, 5.0)))
-    bar.ax.xaxis.set_major_formatter("{x:g}")
-    bar.ax.xaxis.set_minor_formatter(NullFormatter())
-
-
 def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     """Median and worst radius in each bin."""
     every = [1e3 * part for s in found.sections for part in (s.median, s.worst)]
-    scale = scale_of(np.concatenate([part.reshape(-1) for part in every]))
+    scale = logarithmic(np.concatenate([part.reshape(-1) for part in every]), 0.02)
     for row, part in zip(grid, found.sections, strict=True):
         both = {"median": part.median, "worst": part.worst}
         for axes, (name, values) in zip(row, both.items(), strict=True):
@@ -95,13 +65,13 @@ def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
             )
             hatch(axes, part)
             axes.set_title(f"predicted, {name} of each bin", fontsize="medium")
-    scale_bar(figure, shown, grid, "radius that holds 95 % (mm)")
+    scale_bar(figure, shown, grid, "radius that holds 95 % (mm)", "bottom")
 
 
 def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     """Errors of the poses that were measured, before and after on one colour scale."""
     seen = found.seen
-    scale = scale_of(1e3 * np.concatenate(list(seen.error.values())))
+    scale = logarithmic(1e3 * np.concatenate(list(seen.error.values())), 0.02)
     x, y, z = seen.place.T
     flat = np.abs(z - found.height) <= 0.5 * found.slab
     views = ((np.hypot(x, y), z, np.ones(len(x), dtype=bool)), (x, y, flat))
@@ -120,7 +90,7 @@ def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
                         alpha=alpha, zorder=3, **mark,
                     )  # fmt: skip
             axes.set_title(f"observed, {name}", fontsize="medium")
-    scale_bar(figure, shown, grid, "error of the targets' centroid (mm)")
+    scale_bar(figure, shown, grid, "error of the targets' centroid (mm)", "bottom")
 
 
 def hatch(axes: Axes, part: Section) -> None:

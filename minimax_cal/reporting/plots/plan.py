@@ -8,22 +8,15 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.planning.result import POWER, Plan
-from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, save
 
 GREY = "#bbbbbb"
 
 
 def save_plan(plan: Plan, path: Path) -> None:
     """Where the flange goes, from the side and from above, and what other numbers would tell."""
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
-    figure = Figure(figsize=(13.5, 4.4), layout="constrained")
+    figure = new_figure(13.5, 4.4)
     side, above, growth = figure.subplots(1, 3, width_ratios=(1.0, 1.2, 1.1))
     views(plan, side, above)
     grown(plan, growth)

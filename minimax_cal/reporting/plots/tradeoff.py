@@ -5,9 +5,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.tradeoff import Tradeoff
-from minimax_cal.reporting.plots.figures import AFTER, BEFORE, save
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, save
 
 
 def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
@@ -15,13 +14,7 @@ def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
 
     path: its suffix, one of `figures.PICTURES`, chooses the format.
     """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
-    mpl.rcParams["svg.hashsalt"] = "minimax-cal"  # the same picture gives the same file
-    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    figure = new_figure(10, 4.2)
     parts = {"training poses": [c.train for c in found.choices]}
     if found.choices[0].holdout.poses:
         parts["held-out poses"] = [c.holdout for c in found.choices]

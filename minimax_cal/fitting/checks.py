@@ -1,0 +1,136 @@
+"""Slips of the data that show once base and targets are fitted: names, units, signs, rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from minimax_cal.fitting.start import BaseFit, fit_base
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.checks import best_orders, suspicions, swapped
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import Model, in_base, model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
+
+FEW = 30  # poses that are enough to test a slip of units or signs
+POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
+ROUNDS = 5
+APART = 8.0  # times the typical miss, and this share of the reach: no error of the arm
+LEAST = 0.02
+CLOSE = 3.0  # times the typical miss: where a row belongs
+NO_ROWS: Array = np.zeros(0, dtype=int)
+
+
+def fitted(robot: Robot, data: Measurements) -> BaseFit:
+    """Base and targets that fit the robot as drawn best."""
+    return fit_base(model_of(robot, data), robot.mdh)
+
+
+def measured_and_predicted(model: Model, state: State) -> tuple[Array, Array]:
+    """Points of the targets in the base, (k, 3, m) each [m]."""
+    links = kinematics.chain(state.mdh, model.q, model.prismatic)
+    return in_base(state, model.y), kinematics.points(links, state.target_positions)
+
+
+def check_plausible(robot: Robot, data: Measurements) -> None:
+    """Raise DataError for slips that show once base and targets are fitted: names, units, signs.
+
+    All rows are looked at, those held out too: they judge the fit.
+    """
+    given = fitted(robot, data)
+    check_names(robot, data, given)
+    limit = POOR_FIT * robot.reach()
+    if np.sqrt(given.mean_square) <= limit:
+        return
+    trials = [("the measurement frame looks left-handed; reverse one of its axes", given.mirrored)]
+    few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
+    for text, mended in suspicions(robot, data.take(few)):
+        trials.append((text, fitted(robot, mended).mean_square))
+    least_square = min(mean_square for _, mean_square in trials)
+    # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
+    text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
+    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < 0.04 * given.mean_square:
+        raise DataError(
+            f"{data.source}: {text} (the nominal robot then misses by "
+            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(given.mean_square):.3g} mm)"
+        )
+
+
+def check_names(robot: Robot, data: Measurements, given: BaseFit) -> None:
+    """Raise DataError where targets stand under each other's names.  given: see `fitted`."""
+    rows = misnamed(robot, data, given) if len(data.target_names) > 1 else NO_ROWS
+    if len(rows):
+        lines = ", ".join(str(data.line[row]) for row in rows[:8])
+        more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+        raise DataError(
+            f"{data.source}:{data.line[rows[0]]}: targets look swapped in {len(rows)} rows: "
+            f"lines {lines}{more}; put their columns right or delete them"
+        )
+
+
+def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:
+    """Rows whose targets stand under each other's names.
+
+    Swapped rows pull the frame that is to find them: rename, fit again, until nothing changes.
+    """
+    model, renamed = model_of(robot, data), given
+    order = np.tile(np.arange(len(data.target_names)), (data.poses, 1))
+    for _ in range(10):
+        better, _, _ = best_orders(cross_errors(model, renamed.state))
+        if np.array_equal(better, order):
+            break
+        order = better
+        y = np.empty_like(data.y)
+        np.put_along_axis(y, np.repeat(order[..., None], 3, axis=2), data.y, axis=1)
+        renamed = fitted(robot, data.with_y(y))
+    good = np.sqrt(renamed.mean_square) <= 4.0 * POOR_FIT * robot.reach()
+    return swapped(cross_errors(model, renamed.state)) if good else NO_ROWS
+
+
+def cross_errors(model: Model, state: State) -> Array:
+    """(k, k, m) distance of measured target i from predicted target j, NaN where not measured."""
+    measured, predicted = measured_and_predicted(model, state)
+    distance = np.linalg.norm(measured[:, None] - predicted[None], axis=-2)
+    return np.where(model.seen[:, None], distance, np.nan)
+
+
+def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
+    """Rows whose points belong to other poses: (b,) rows, and (b,) the row whose points are theirs.
+
+    Found by where the arm would have been.  A row whose points belong nowhere has itself there.
+    """
+    model, good = model_of(robot, data), np.ones(data.poses, dtype=bool)
+    for _ in range(ROUNDS):
+        state = fitted(robot, data.take(good)).state
+        measured, predicted = measured_and_predicted(model, state)
+        squares = (np.where(model.seen[:, None], measured - predicted, 0.0) ** 2).sum(axis=(0, 1))
+        miss = np.sqrt(squares / np.maximum(model.seen.sum(axis=0), 1))
+        typical = float(np.median(miss[good]))
+        limit = max(APART * typical, LEAST * robot.reach())
+        if not (miss > limit).any() and good.all():
+            break
+        kept = miss < max(CLOSE * float(np.median(miss)), limit)
+        if (kept == good).all() or kept.sum() < max(10, data.poses // 2):
+            break
+        good = kept
+    bad = np.flatnonzero(miss > max(APART * float(np.median(miss)), LEAST * robot.reach()))
+    if not len(bad) or len(bad) > data.poses // 5:
+        return NO_ROWS, NO_ROWS
+    off = measured[:, :, None, bad] - predicted[:, :, bad, None]  # of points b at pose a
+    both = model.seen[:, None, bad] & model.seen[:, bad, None]
+    distance = np.sqrt((off**2).sum(axis=1) * both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
+    pose, points = linear_sum_assignment(distance)
+    fits = distance[pose, points] < max(CLOSE * typical, LEAST * robot.reach() / 4.0)
+    return bad, bad[np.where(fits, points, pose)]
+
+
+def put_right(data: Measurements, rows: Array, source: Array) -> Measurements:
+    """Points put where they belong; rows that belong nowhere are left out."""
+    y = data.y.copy()
+    y[rows] = data.y[source]
+    kept = np.ones(data.poses, dtype=bool)
+    kept[rows[rows == source]] = False
+    return data.with_y(y).take(kept)
