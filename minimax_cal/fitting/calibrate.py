@@ -75,11 +75,14 @@ def calibrate(
 ) -> Fit:
     """Calibrate a robot from measurements.
 
-    robot, data: loaded, or a name or path.  objective ... trim: as the fields of `Options`; lists
-    of names may be one text with commas.  progress: called with a word on each stage.
+    robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
+    worst point), pose, or smr:K.  qp: backend of the minimax.  holdout: share of the poses kept out
+    of the fit.  seed: of that choice.  fix, free, effects: lists of names, or one text with commas.
+    priors, method, lever, hessian, distance, distance_tolerance, resolution, loss, trim: as the
+    fields of `Options` [m, rad].  progress: called with a word on each stage.
     Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
 
-    Example: ``mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary()``
+    >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
     began = time.perf_counter()
     options = Options(

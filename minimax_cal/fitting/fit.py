@@ -468,7 +468,9 @@ class Fit:
 def load_fit(path: Path | str) -> Fit:
     """The fit that `Fit.save` or `minimax-cal calibrate -o` wrote, whole.
 
-    Raises CalibrationError.  Example: ``mc.load_fit("fit.json").summary()``.
+    path: of the file.  Raises CalibrationError.
+
+    >>> print(mc.load_fit("fit.json").summary())
     """
     return Fit.from_dict(saved_content(path), str(path))
 
