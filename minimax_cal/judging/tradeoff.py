@@ -257,9 +257,11 @@ def tradeoff(
 ) -> Tradeoff:
     """The choices between least squares and the worst point for a robot and its measurements.
 
-    steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.  progress: called
-    with a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended
-    is in the result's `status`.
+    robot, data: loaded, or a name or path.  steps: compromises between the two.  qp, holdout, seed:
+    as in `calibrate`.  progress: called with a word on each stage.  Raises CalibrationError for
+    wrong input; how the numbers ended is in the result's `status`.
+
+    >>> print(mc.tradeoff("irb2600", "poses.csv", steps=5).headline())
     """
     if not 0 <= steps <= MOST_STEPS:
         raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")

@@ -163,7 +163,12 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
 
 
 def load_cell(path: Path | str) -> Cell:
-    """The calibrated cell of a file that `minimax-cal calibrate -o` wrote."""
+    """The calibrated cell of a file that `minimax-cal calibrate -o` wrote.
+
+    path: of the file.  Raises CalibrationError.
+
+    >>> mc.load_cell("fit.json").predict([[0, 0.3, 0.2, 0, 0.5, 0]])
+    """
     return cell_from_dict(saved_content(path), str(path))
 
 
@@ -179,5 +184,11 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
 
 
 def evaluate(cell: Cell, data: Measurements) -> Accuracy:
-    """Accuracy of a calibrated cell on new measurements in the same measurement frame."""
+    """Accuracy of a calibrated cell on new measurements in the same measurement frame.
+
+    cell: of a fit, or of its file.  data: (m, k) points, and the columns that effects look at; nothing
+    is fitted to them.  Errors of the result are in mm.  Raises DataError.
+
+    >>> print(mc.evaluate(fit.cell, mc.read_measurements("new_poses.csv")).rms_mm)
+    """
     return accuracy(cell.error(data))
