@@ -345,7 +345,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
     """
     points, method = float(model.counts.sum()), METHODS[task.options.method]
     problem = SumOfSquares(model)
-    return least_squares.solve(problem, stage.squares.x, 1, points, method, least_squares.NEAR)
+    return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
 
 
 def worst_case(

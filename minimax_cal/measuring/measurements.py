@@ -305,6 +305,10 @@ def split(
     group = groups(data)
     poses = np.unique(group)
     count = round(holdout * len(poses))
+    if count == len(poses):
+        raise OptionError(
+            f"holdout {holdout:g} leaves none of {len(poses)} poses for training; give less"
+        )
     chosen = np.random.default_rng(seed).permutation(poses)[:count]
     held = np.isin(group, chosen)
     return data.take(~held), data.take(held), ()

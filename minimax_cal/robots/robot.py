@@ -225,11 +225,27 @@ def builtin_robots() -> tuple[str, ...]:
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
 
 
+class WrittenOut(yaml.SafeLoader):
+    """YAML without aliases, which a few lines can make larger than any memory."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """A node.  Raises YAMLError for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            line = self.line + 1
+            raise yaml.YAMLError(f"line {line}: an alias (*name); write the value out")
+        return super().compose_node(parent, index)
+
+
+def written_out(text: str) -> Any:
+    """A YAML document.  Raises YAMLError."""
+    return yaml.load(text, WrittenOut)
+
+
 PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
     ".json": (json.loads, json.JSONDecodeError),
     ".toml": (tomllib.loads, tomllib.TOMLDecodeError),
-    ".yaml": (yaml.safe_load, yaml.YAMLError),
-    ".yml": (yaml.safe_load, yaml.YAMLError),
+    ".yaml": (written_out, yaml.YAMLError),
+    ".yml": (written_out, yaml.YAMLError),
 }
 
 

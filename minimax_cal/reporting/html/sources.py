@@ -16,6 +16,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import read_raw
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -176,10 +177,7 @@ def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> t
 
 def read_json(path: Path | str) -> tuple[dict[str, Any], str]:
     """A JSON object with its text cleaned, and the SHA-256 of the file."""
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
+    raw = read_raw(path)
     try:
         content = clean(json.loads(raw, parse_constant=refuse))
     except (ValueError, RecursionError) as error:
