@@ -270,3 +270,10 @@ def test_pose_after_a_search_over_base_rotations(robot: mc.Robot, noisy: Simulat
 def test_a_holdout_that_leaves_nothing_is_refused(robot: mc.Robot, noisy: Simulation) -> None:
     with pytest.raises(mc.OptionError, match="leaves none of 60 poses"):
         mc.calibrate(robot, noisy.data, holdout=0.995)
+
+
+@pytest.mark.parametrize("objective", ["sum", "minimax", "point", "pose"])
+def test_exact_data_are_a_success(objective: str, robot: mc.Robot, clean: Simulation) -> None:
+    fit = mc.calibrate(robot, clean.data, objective)
+    assert fit.status == "converged"
+    assert fit.accuracy["holdout"].max_mm < 1e-6
