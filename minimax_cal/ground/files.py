@@ -87,6 +87,26 @@ def json_text(content: object) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
+def json_of(text: str | bytes) -> Any:
+    """JSON whose every key stands once.  Raises ValueError: NaN and Infinity are no JSON either."""
+    return json.loads(text, parse_constant=refuse, object_pairs_hook=once)
+
+
+def refuse(constant: str) -> float:
+    """NaN and Infinity are no JSON."""
+    raise ValueError(f"{constant} is not a number that JSON knows")
+
+
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, if no key stands twice: which of the two would count?  Raises ValueError."""
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice[:60]!r} stands twice")
+    return out
+
+
 def plain(content: Any) -> Any:
     """Data as JSON holds them: arrays are lists, null where there is no finite number."""
     if isinstance(content, Mapping):

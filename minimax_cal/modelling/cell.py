@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import json_of, read_text
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
@@ -175,8 +174,8 @@ def load_cell(path: Path | str) -> Cell:
 def saved_content(path: Path | str) -> Mapping[str, Any]:
     """The JSON of a saved calibration.  Raises NotSaved."""
     try:
-        content = json.loads(read_text(path, kind=NotSaved))
-    except (json.JSONDecodeError, RecursionError) as error:
+        content = json_of(read_text(path, kind=NotSaved))
+    except (ValueError, RecursionError) as error:
         raise NotSaved(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, Mapping):
         raise NotSaved(f"{path}: is not a saved calibration")

@@ -143,3 +143,20 @@ def test_yaml_that_grows_is_refused(tmp_path: Path) -> None:
     path.write_text("\n".join(lines))
     with pytest.raises(mc.RobotError, match="line 3: an alias"):
         mc.load_robot(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"name":', '"name": "twice", "name":', "the key 'name' stands twice"),
+        ('"sign": 1', '"sign": 1, "ratio": 0', "gear ratio of zero"),
+    ],
+)
+def test_json_that_could_mean_two_things_is_refused(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    path = tmp_path / "robot.json"
+    mc.load_robot("irb2600").save(path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(mc.RobotError, match=says):
+        mc.load_robot(path)
