@@ -247,8 +247,10 @@ class Diagnosis:
         Of the cells between geometry and the last effect nothing is kept.
         """
         from minimax_cal.diagnosing.result_file import read
+        from minimax_cal.ground.records import reading
 
-        return read(content, source)
+        with reading(source):
+            return read(content, source)
 
     def json(self) -> str:
         """`to_dict` as text."""

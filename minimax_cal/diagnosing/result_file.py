@@ -13,7 +13,7 @@ from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
 from minimax_cal.fitting.fit_file import ParameterPart, ProvenancePart, ScoresPart, measured_poses
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import numbers
-from minimax_cal.ground.records import AGAIN, FAULTS, UNKNOWN, Ends, Number, Part, checked
+from minimax_cal.ground.records import AGAIN, UNKNOWN, Ends, Number, Part, checked
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
@@ -172,14 +172,11 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
     if content.get("kind") != "diagnosis":
         raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose -o")
     part = checked(DiagnosisPart, content, source)
-    try:
-        cells = tuple(
-            cell_from_dict(cell, f"{source}: cells[{i}]")
-            for i, cell in enumerate(content.get("cells", ()))
-        )
-        return assembled(content, source, part, cells)
-    except FAULTS as error:
-        raise CalibrationError(f"{source}: cannot be read ({error}); {AGAIN}") from error
+    cells = tuple(
+        cell_from_dict(cell, f"{source}: cells[{i}]")
+        for i, cell in enumerate(content.get("cells", ()))
+    )
+    return assembled(content, source, part, cells)
 
 
 def assembled(

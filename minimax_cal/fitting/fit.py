@@ -312,7 +312,11 @@ class Fit:
     @property
     def options(self) -> Options:
         """How it was made, its effects with the variants that were chosen."""
-        settings = {k: v for k, v in self.provenance.settings.items() if k in vars(Options())}
+        settings = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in self.provenance.settings.items()
+            if key in vars(Options())
+        }
         return Options(**{**settings, "effects": self.cell.effects.terms})  # type: ignore[arg-type]
 
     @property
@@ -453,8 +457,10 @@ class Fit:
     def from_dict(content: Mapping[str, Any], source: str = "fit") -> Fit:
         """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError."""
         from minimax_cal.fitting.fit_file import read
+        from minimax_cal.ground.records import reading
 
-        return read(content, source)
+        with reading(source):
+            return read(content, source)
 
     def json(self) -> str:
         """`to_dict` as text."""
@@ -466,9 +472,13 @@ class Fit:
 
 
 def load_fit(path: Path | str) -> Fit:
-    """The fit that `Fit.save` or `minimax-cal calibrate -o` wrote, whole.
+    """A fit, whole.  path: what `Fit.save` or `minimax-cal calibrate -o` wrote.
 
+    <<<<<<< HEAD
+    Raises CalibrationError.
+    =======
     path: of the file.  Raises CalibrationError.
+    >>>>>>> work-f
 
     >>> print(mc.load_fit("fit.json").summary())
     """

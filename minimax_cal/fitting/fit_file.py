@@ -335,11 +335,8 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     exact = restored(data.y, arrays.get("measured"))
     data = replace(data, y=exact, digest=part.provenance.data_sha256)
     nominal = nominal_of(content, source, cell, arrays)
-    try:
-        before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
-        return assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
-    except FAULTS as error:
-        raise CalibrationError(f"{source}: cannot be read ({error}); {AGAIN}") from error
+    before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
+    return assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
 
 
 def assembled(

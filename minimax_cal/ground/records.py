@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -64,6 +65,17 @@ def explain(error: ValidationError) -> str:
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"])
     return f"{place}: {first['msg']}" if place else str(first["msg"])
+
+
+@contextmanager
+def reading(source: str, part: str = "") -> Iterator[None]:
+    """Turns what goes wrong while a file, or a part of it, is used into one line for people."""
+    try:
+        yield
+    except FAULTS as error:
+        what = f"its {part} " if part else ""
+        text = str(error).partition("\n")[0]
+        raise CalibrationError(f"{source}: {what}cannot be read ({text}); {AGAIN}") from error
 
 
 def packed(values: Array) -> dict[str, Any]:

@@ -106,7 +106,7 @@ def shown_noise(
 ) -> tuple[Instrument, str]:
     """The noise to plan with, and where it is from."""
     given = {name: getattr(options, name) for name in ("noise", "per_metre", "jitter")}
-    told = {name: float(value) for name, value in given.items() if np.isfinite(value)}
+    told = {name: float(value) for name, value in given.items() if value is not None}
     base, source = Instrument(), "assumed"
     if measured and not told:
         noise = noise_of(cell, measured[0])

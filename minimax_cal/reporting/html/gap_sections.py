@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.ground.records import reading
 from minimax_cal.reporting.html.content import Block, Section, missing, text
 from minimax_cal.reporting.html.gap_tables import (
     effect_parameters,
@@ -94,7 +95,8 @@ def where_section(sources: Sources) -> Section:
     if not (sources.gap and sources.gap.where):
         return Section("where", title, (missing(NO_GAP),))
     where = sources.gap.where
-    blocks: list[Block] = [*place_tables(where)]
-    if worst := where["by_region"]["worst"]:
-        blocks.append(text(f"Worst region: {worst}."))
+    with reading("diagnosis", "where"):
+        blocks: list[Block] = [*place_tables(where)]
+        if worst := where["by_region"]["worst"]:
+            blocks.append(text(f"Worst region: {worst}."))
     return Section("where", title, tuple(blocks))
