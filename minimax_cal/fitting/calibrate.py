@@ -76,7 +76,6 @@ def calibrate(
     """Calibrate a robot from measurements.
 
     robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
-    <<<<<<< HEAD
     worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
     out of the fit; seed: of that choice.  fix, free: parameters as ``beta*``, a list or a text with
     commas.  priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of
@@ -86,12 +85,6 @@ def calibrate(
     resolution: relative singular value that counts as not measured.  effects: beyond geometry, as
     joint_compliance:J2.  loss: square, huber, cauchy or tukey.  trim: share of the points that may
     be set aside.  progress: called with a word on each stage.
-    =======
-    worst point), pose, or smr:K.  qp: backend of the minimax.  holdout: share of the poses kept out
-    of the fit.  seed: of that choice.  fix, free, effects: lists of names, or one text with commas.
-    priors, method, lever, hessian, distance, distance_tolerance, resolution, loss, trim: as the
-    fields of `Options` [m, rad].  progress: called with a word on each stage.
-    >>>>>>> work-f
     Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())

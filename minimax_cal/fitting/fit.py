@@ -474,11 +474,7 @@ class Fit:
 def load_fit(path: Path | str) -> Fit:
     """A fit, whole.  path: what `Fit.save` or `minimax-cal calibrate -o` wrote.
 
-    <<<<<<< HEAD
     Raises CalibrationError.
-    =======
-    path: of the file.  Raises CalibrationError.
-    >>>>>>> work-f
 
     >>> print(mc.load_fit("fit.json").summary())
     """

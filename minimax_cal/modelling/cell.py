@@ -185,8 +185,8 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
 def evaluate(cell: Cell, data: Measurements) -> Accuracy:
     """Accuracy of a calibrated cell on new measurements in the same measurement frame.
 
-    cell: of a fit, or of its file.  data: (m, k) points, and the columns that effects look at;
-    nothing is fitted to them.  Errors of the result are in mm.  Raises DataError.
+    cell: of a fit, or of its file.  data: points, and the columns that effects look at; nothing is
+    fitted to them.  Errors of the result are in mm.  Raises DataError.
 
     >>> print(mc.evaluate(fit.cell, mc.read_measurements("new_poses.csv")).rms_mm)
     """
