@@ -17,7 +17,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import NOTHING, Fitted, fitted_from_list
+from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted_from_list
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, robot_from_dict
 
@@ -140,7 +140,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
         targets = content["targets_mm"]
         spots = np.array([targets[name] for name in targets], dtype=float).reshape(-1, 3) * 1e-3
         robot = content["robot"]
-        effects = fitted_from_list(content.get("effects", []))
+        effects = effects_from(content, source)
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: is not a saved calibration (robot, base, targets_mm: {error}); "
@@ -159,6 +159,17 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     except (KeyError, IndexError, ValueError) as error:
         raise CalibrationError(f"{source}: its effects do not fit its robot ({error})") from error
     return cell
+
+
+def effects_from(content: Mapping[str, Any], source: str) -> Fitted:
+    """The effects of a saved calibration.  Raises CalibrationError for one that is not known."""
+    listed = content.get("effects", [])
+    strange = [str(e["effect"]) for e in listed if e["effect"] not in EFFECTS]
+    if strange:
+        raise CalibrationError(
+            f"{source}: effect {strange[0]!r} is not known here; register it before loading"
+        )
+    return fitted_from_list(listed)
 
 
 def load_cell(path: Path | str) -> Cell:

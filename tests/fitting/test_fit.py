@@ -127,6 +127,10 @@ def test_a_file_of_an_earlier_version_opens(fit: mc.Fit) -> None:
         (lambda c: c["parameters"][0].update(name="nonsense"), "cannot be read"),
         (lambda c: c["poses"]["q"].pop(), "its list of poses cannot be read"),
         (lambda c: c.update(status="fine"), "status: Input should be"),
+        (
+            lambda c: c.update(effects=[{"effect": "gremlin", "place": "J1"}]),
+            "effect 'gremlin' is not known here; register it",
+        ),
     ],
 )
 def test_a_broken_file_is_one_line(
