@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
-    FAILED,
     FIT,
     PATH,
     WIDTH,

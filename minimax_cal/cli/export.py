@@ -6,10 +6,11 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, QUIET, Output, output, with_output
+from minimax_cal.cli.options import PATH, QUIET, Output, options_of, output, with_output
 from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.options import Option
 
 
 @click.command(name="export")
@@ -21,11 +22,10 @@ from minimax_cal.ground.files import write_whole
     metavar="ORIGINAL",
     help="Correct the joint origins of this URDF; all else stays, byte for byte.",
 )
-@click.option("--tip", default="", metavar="LINK", help="Last link of the chain in that URDF.")
-@click.option(
-    "--experimental",
-    is_flag=True,
-    help="Agree to a format whose frames its maker does not document (moc).",
+@options_of(
+    exported,
+    tip=Option("Last link of the chain in that URDF.", metavar="LINK"),
+    experimental=Option("Agree to a format whose frames its maker does not document (moc)."),
 )
 @output("the robot")
 @QUIET

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
-from minimax_cal.cli.options import FIT, SOME_DATA, Output, result_options, show
+from minimax_cal.cli.options import FIT, SOME_DATA, Output, options_of, result_options, show
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import Option
 from minimax_cal.judging.standard import iso9283
 
 
@@ -26,27 +28,24 @@ def point_of(text: str) -> str | Sequence[float]:
 @click.command(name="iso9283")
 @FIT
 @SOME_DATA
-@click.option(
-    "--nominal", default="", help="Robot before calibration, file or name [default: of the fit]."
-)
-@click.option(
-    "--tcp",
-    default="centroid",
-    show_default=True,
-    metavar="POINT",
-    help="centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+@options_of(
+    iso9283,
+    nominal=Option("Robot before calibration, file or name [default: of the fit]."),
+    tcp=Option(
+        "centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+        metavar="POINT",
+        read=point_of,
+    ),
 )
 @click.option("--poses", is_flag=True, help="A row for every pose, too.")
 @result_options("the values (JSON)")
-def iso9283_command(
-    fit: Path, data: Path | None, nominal: str, tcp: str, poses: bool, to: Output
-) -> int:
+def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **chosen: Any) -> int:
     """Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.
 
     FIT is what `calibrate -o` wrote, DATA the measurements [default: those of the fit].  Held-out
     poses stand apart from training poses.  Poses that were visited again give repeatability.
     """
-    found = iso9283(fit, data, nominal=nominal, tcp=point_of(tcp))
+    found = iso9283(fit, data, **chosen)
     to.notice(*found.notices)
     if to.deliver(lambda: json_text(found.to_dict())):
         show(*found.tables(poses=poses))

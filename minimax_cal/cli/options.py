@@ -14,12 +14,12 @@ from typing import Any
 import click
 from rich.console import Console
 
+from minimax_cal.cli import FAILED
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
 from minimax_cal.solvers.status import Status
 
-FAILED, MISUSED = 1, 2  # exit codes of the contract
 WIDTH = 110  # of text that goes to no terminal
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
@@ -98,7 +98,7 @@ def kind_of(default: Any, told: Option, flag: str) -> tuple[type, Any, str, Call
         shown = None if default is None or isnan(default) else round(default / scale, 9)
         return float, shown, told.unit.upper(), lambda value: value * scale
     if isinstance(default, bool | int | str) and default != "":
-        return type(default), default, "", type(default)
+        return type(default), default, "", told.read or type(default)
     return str, None, "", told.read or (tuple if told.values > 1 else str)
 
 
