@@ -77,7 +77,8 @@ plt.show()
 # change.
 
 fit = fits["wrong model", "point"]
-(best,) = fit.worst
-print(f"{np.count_nonzero(best.mu > 1e-6)} of {len(best.mu)} points decide; the first five:")
-for i in fit.telling(best)[:5]:
-    print(f"  {fit.labels[i]:14} {fit.sizes[i]:.4f} mm, multiplier {best.mu[i]:.3f}")
+worst = fit.minimax
+deciding = list(zip(worst.functions, worst.size, worst.multiplier, strict=True))
+print(f"{len(deciding)} of {np.count_nonzero(fit.train.seen)} points decide; the first five:")
+for name, size, multiplier in deciding[:5]:
+    print(f"  {name:14} {size:.4f} mm, multiplier {multiplier:.3f}")

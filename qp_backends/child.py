@@ -33,7 +33,7 @@ def run(
     task = pickle.dumps((module, problem, method, tolerance, warm_start))
     try:
         done = subprocess.run(
-            [sys.executable, "-m", __name__],
+            [sys.executable, "-P", "-m", __name__],
             input=task,
             capture_output=True,
             timeout=time_limit,

@@ -18,6 +18,7 @@ from urllib.parse import unquote, urldefrag, urlsplit
 import click
 import pytest
 from conftest import ROOT, run
+from test_folders import FOLDERS
 
 import minimax_cal as mc
 import qp_backends
@@ -167,7 +168,7 @@ def test_every_public_name_is_in_the_reference(site: Path, package: object) -> N
 def test_docstrings_keep_their_words(site: Path) -> None:
     page = re.sub(r"<[^>]+>", "", (site / "api" / "minimax_cal.html").read_text())
     assert "names or patterns as beta*" in page  # a star is no emphasis here
-    assert "measured minus predicted points under the same keys" in page
+    assert "Errors (k, m, 3) by the keys of accuracy [m]" in page  # quoted, with its brackets
     page = re.sub(r"<[^>]+>", "", (site / "api" / "qp_backends.html").read_text())
     assert "|xᵀPx + qᵀx + uᵀy⁺ - lᵀy⁻|, primal minus dual objective" in page  # nor is a bar a link
 
@@ -229,7 +230,12 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", text).replace(" ", "-")
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda path: path.stem)
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", CONTRIBUTING, *PAGES], ids=lambda path: path.stem
+)
 def test_links_lead_to_files_and_headings(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
     for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`]*`", "code", text)):
@@ -257,6 +263,35 @@ def test_the_files_named_in_the_mathematics_are_there() -> None:
         room = "" if name == "minimax_cal" else f".{rooms[name]}.{name}"
         module = importlib.import_module(f"minimax_cal{room}")
         assert callable(getattr(module, function)), f"{name}.{function}"
+
+
+def test_the_rooms_are_those_of_the_folders() -> None:
+    named = re.findall(r"^\| `(\w+)/` \|", CONTRIBUTING.read_text(), re.M)
+    assert tuple(named) == FOLDERS
+
+
+def test_an_owner_stands_where_it_is_said_to_stand() -> None:
+    rows = CONTRIBUTING.read_text().partition("| thing | owner | where |")[2].partition("\n\n")[0]
+    for row in rows.splitlines()[2:]:
+        _, _, owner, where, _ = row.split("|")
+        first, *others = re.findall(r"`([\w/]+\.py)`", where)
+        files = [ROOT / "minimax_cal" / first]
+        files += [ROOT / "minimax_cal" / o if "/" in o else files[0].parent / o for o in others]
+        text = "".join(path.read_text() for path in files)
+        for name in re.findall(r"`\.?(\w+)", owner):
+            said = rf"\b(class|def) {name}\b|^{name}\b"
+            assert files[0].stem == name or re.search(said, text, re.M), row
+
+
+def test_what_is_to_be_copied_and_entered_is_there() -> None:
+    text = CONTRIBUTING.read_text().partition("## Add an effect")[2]
+    there = [path.relative_to(ROOT).as_posix() for path in ROOT.glob("*/**/*.py")]
+    code = {path: (ROOT / path).read_text() for path in there}
+    for name in re.findall(r"`([\w/]+/\w+\.(?:py|md))`", text):
+        if not (ROOT / name).exists() and "NAME" not in name:
+            assert any(path.endswith(f"/{name}") for path in there), name
+    for name in re.findall(r"`([A-Z_]{4,}|test_\w+)`", text):
+        assert any(re.search(rf"^(def )?{name}\b", held, re.M) for held in code.values()), name
 
 
 # ---- the commands ------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +115,19 @@ def calibrate(
     progress("start")
     solved = fit_cell(robot, parts.train, options, progress)
     return judged(robot, options, parts, solved, began)
+
+
+def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
+    """A fit of the same poses, split as they were, with some options changed.
+
+    changes: fields of `Options`.  Raises CalibrationError.
+    """
+    began = time.perf_counter()
+    options = replace(fit.options, **changes)  # type: ignore[arg-type]
+    check(fit.before.robot, fit.data, options)
+    parts = Parts(fit.data, fit.train, fit.data.take(fit.held), fit.data.notices)
+    solved = fit_cell(fit.before.robot, parts.train, options, progress)
+    return judged(fit.before.robot, options, parts, solved, began)
 
 
 def check(robot: Robot, data: Measurements, options: Options) -> None:

@@ -51,6 +51,7 @@ PRIOR_ROUNDS = 20  # of weighing a prior against the noise that remains
 FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
+EXACT = 1e-9  # an error below is rounding: data that were computed, not measured [m]
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -345,7 +346,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
     """
     points, method = float(model.counts.sum()), METHODS[task.options.method]
     problem = SumOfSquares(model)
-    return least_squares.solve(problem, stage.squares.x, 1, points, method, least_squares.NEAR)
+    return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
 
 
 def worst_case(
@@ -361,6 +362,8 @@ def worst_case(
     name, notices = usable(options.qp)
     qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
     optimum = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+    if optimum.status is Status.STALLED and optimum.value * problem.size < EXACT**2:
+        optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left
     certificate = None
     if per == "point" and optimum.status is not Status.FAILED:
         certificate = certify(problem, optimum, task.data.line)

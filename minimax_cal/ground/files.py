@@ -15,13 +15,15 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 
+LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
+
 
 def write_whole(path: Path | str, content: str | bytes) -> None:
     """Write content to path in one step: a reader sees the old file or the new one.
 
     Raises CalibrationError when the folder does not exist or cannot be written.
     """
-    path = Path(path).resolve()  # a link keeps pointing at what is written
+    path = resolved(path)  # a link keeps pointing at what is written
     raw = content.encode("utf-8") if isinstance(content, str) else content
     if path.exists() and not path.is_file():
         write_into(path, raw)
@@ -33,13 +35,28 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(raw)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)  # mkstemp is private; a result is an ordinary file
+        os.chmod(name, mode_of(path))
         os.replace(name, path)
     except OSError as error:
         Path(name).unlink(missing_ok=True)
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def resolved(path: Path | str) -> Path:
+    """Where a path leads.  Raises CalibrationError for links that lead in a circle."""
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError) as error:
+        raise CalibrationError(f"{path}: cannot be written (its links lead nowhere)") from error
+
+
+def mode_of(path: Path) -> int:
+    """The permissions of a file that is there, else those of any new one."""
+    if path.exists():
+        return path.stat().st_mode & 0o777
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask
 
 
 def write_into(path: Path, raw: bytes) -> None:
@@ -61,13 +78,33 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
         raise CalibrationError(f"{path}: the file's ending must be one of {', '.join(suffixes)}")
     if path.is_dir():
         raise CalibrationError(f"{path}: is a folder; name a file")
-    if not path.resolve().parent.is_dir():
+    if not resolved(path).parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
 
 
 def json_text(content: object) -> str:
     """JSON as this project writes it; NaN, which JSON does not know, raises ValueError."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def json_of(text: str | bytes) -> Any:
+    """JSON whose every key stands once.  Raises ValueError: NaN and Infinity are no JSON either."""
+    return json.loads(text, parse_constant=refuse, object_pairs_hook=once)
+
+
+def refuse(constant: str) -> float:
+    """NaN and Infinity are no JSON."""
+    raise ValueError(f"{constant} is not a number that JSON knows")
+
+
+def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object, if no key stands twice: which of the two would count?  Raises ValueError."""
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice[:60]!r} stands twice")
+    return out
 
 
 def plain(content: Any) -> Any:
@@ -81,12 +118,25 @@ def plain(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
+def read_raw(
+    path: Path | str, *, kind: type[CalibrationError] = CalibrationError, most: int = LARGEST
+) -> bytes:
+    """The bytes of a file or a pipe, no more than any result has; errors as `read_text`."""
+    try:
+        with Path(path).open("rb") as stream:
+            raw = stream.read(most + 1)
+    except OSError as error:
+        raise kind(f"{path}: cannot be read ({error.strerror})") from error
+    if len(raw) > most:
+        raise kind(f"{path}: is larger than {most >> 20} MiB; split it, or check the name")
+    return raw
+
+
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:
     """The text of a UTF-8 file, without a leading byte order mark; errors are of the kind given."""
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise kind(f"{path}: cannot be read ({error.strerror})") from error
+        text = read_raw(path, kind=kind).decode("utf-8-sig")
+        return text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
 

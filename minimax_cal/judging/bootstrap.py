@@ -137,8 +137,11 @@ def bootstrap(
 ) -> Bootstrap:
     """Calibrate again on poses drawn from the training poses.
 
+    fit: of any objective but point.  replicates: draws of whole poses.  seed: of the draws.
     progress: called with a word on progress.  Raises OptionError; DataError where most draws do not
     determine the parameters.
+
+    >>> print(mc.bootstrap(fit, replicates=200).table().text())
     """
     if replicates < 2:
         raise OptionError(f"{replicates} replicates: give 2 or more, 500 as a rule")

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.calibrate import again, calibrate
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.minimax_problem import MinimaxProblem, minimax_problem
 from minimax_cal.fitting.options import Progress, silent, usable
@@ -247,8 +247,8 @@ class Tradeoff:
 
 
 def tradeoff(
-    robot: Robot | str | Path,
-    data: Measurements | str | Path,
+    robot: Robot | Fit | str | Path,
+    data: Measurements | str | Path | None = None,
     steps: int = STEPS,
     qp: str = "daqp",
     holdout: float = 0.2,
@@ -257,17 +257,29 @@ def tradeoff(
 ) -> Tradeoff:
     """The choices between least squares and the worst point for a robot and its measurements.
 
-    steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.  progress: called
-    with a word on each stage.  Raises CalibrationError for wrong input; how the numbers ended
-    is in the result's `status`.
+    robot, data: loaded, or a name or path; or a fit alone, whose measurements are taken as they
+    were split.  steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.
+    progress: called with a word on each stage.  Raises CalibrationError for wrong input; how the
+    numbers ended is in the result's `status`.
+
+    >>> print(mc.tradeoff(mc.load_fit("fit.json"), steps=5).headline())
     """
     if not 0 <= steps <= MOST_STEPS:
         raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")
     began = time.perf_counter()
-    first, last = (
-        calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
-        for objective in ("sum", "point")
-    )
+    if isinstance(robot, Fit):
+        given = robot
+        first, last = (
+            given if given.objective == objective else again(given, progress, objective=objective)
+            for objective in ("sum", "point")
+        )
+    elif data is None:
+        raise OptionError("tradeoff: give the measurements too, or a fit that holds them")
+    else:
+        first, last = (
+            calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
+            for objective in ("sum", "point")
+        )
     worst = problem_of(first)
     ends = (
         Compromise.of(worst, 1.0, first.cell.state, first.status),

@@ -26,6 +26,11 @@ from minimax_cal.measuring.columns import (
 )
 
 FARTHEST = 1e5  # no instrument measures farther [m]
+PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
+    "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
+    "payload": ("payload_kg", 0.0, 1e5, 1.0),
+    "u95": ("u95_mm", -np.inf, 1.0, 1e3),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +149,15 @@ def check_finite(data: Measurements) -> Measurements:
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
+    for name, (header, low, high, scale) in PLAUSIBLE.items():
+        values = data.columns.get(name, np.zeros(0))
+        odd = (values < low) | (values > high)
+        if odd.any():
+            row = int(np.argmax(odd))
+            raise DataError(
+                f"{data.source}:{data.line[row]}: column {header}: {scale * values[row]:g} cannot "
+                f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
+            )
     return check_u95(data)
 
 
@@ -305,6 +319,10 @@ def split(
     group = groups(data)
     poses = np.unique(group)
     count = round(holdout * len(poses))
+    if count == len(poses):
+        raise OptionError(
+            f"holdout {holdout:g} leaves none of {len(poses)} poses for training; give less"
+        )
     chosen = np.random.default_rng(seed).permutation(poses)[:count]
     held = np.isin(group, chosen)
     return data.take(~held), data.take(held), ()

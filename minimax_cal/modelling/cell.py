@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import json_of, read_text
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
@@ -163,15 +162,20 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
 
 
 def load_cell(path: Path | str) -> Cell:
-    """The calibrated cell of a file that `minimax-cal calibrate -o` wrote."""
+    """The calibrated cell of a file that `minimax-cal calibrate -o` wrote.
+
+    path: of the file.  Raises CalibrationError.
+
+    >>> mc.load_cell("fit.json").predict([[0, 0.3, 0.2, 0, 0.5, 0]])
+    """
     return cell_from_dict(saved_content(path), str(path))
 
 
 def saved_content(path: Path | str) -> Mapping[str, Any]:
     """The JSON of a saved calibration.  Raises NotSaved."""
     try:
-        content = json.loads(read_text(path, kind=NotSaved))
-    except (json.JSONDecodeError, RecursionError) as error:
+        content = json_of(read_text(path, kind=NotSaved))
+    except (ValueError, RecursionError) as error:
         raise NotSaved(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, Mapping):
         raise NotSaved(f"{path}: is not a saved calibration")
@@ -179,5 +183,11 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
 
 
 def evaluate(cell: Cell, data: Measurements) -> Accuracy:
-    """Accuracy of a calibrated cell on new measurements in the same measurement frame."""
+    """Accuracy of a calibrated cell on new measurements in the same measurement frame.
+
+    cell: of a fit, or of its file.  data: points, and the columns that effects look at; nothing is
+    fitted to them.  Errors of the result are in mm.  Raises DataError.
+
+    >>> print(mc.evaluate(fit.cell, mc.read_measurements("new_poses.csv")).rms_mm)
+    """
     return accuracy(cell.error(data))

@@ -21,6 +21,7 @@ from minimax_cal.reporting.html import (
     read_sources,
     render,
 )
+from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
 
 PAGES, PAPERS = (".html", ".htm"), (".pdf",)
@@ -49,6 +50,7 @@ def report(
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """
     check_writable(path, PAGES)
+    needed()
     if pdf is not None:
         check_writable(pdf, PAPERS)
     browser = find_browser() if pdf is not None else ""

@@ -7,17 +7,18 @@ import json
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.ground.files import json_text, read_text, write_whole
+from minimax_cal.ground.files import json_text, once, read_text, write_whole
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.urdf import is_urdf, load_urdf
@@ -29,6 +30,13 @@ RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
 Vector = tuple[Finite, Finite, Finite]
+
+
+def turning(ratio: float) -> float:
+    """A gear ratio; zero is none.  Raises ValueError."""
+    if ratio == 0.0:
+        raise ValueError("a gear ratio of zero turns nothing; leave the key out")
+    return ratio
 
 
 class UnitsSchema(BaseModel):
@@ -52,7 +60,7 @@ class JointSchema(BaseModel):
     type: Literal["revolute", "prismatic"] = "revolute"
     lower: Finite | None = None
     upper: Finite | None = None
-    ratio: Finite | None = None
+    ratio: Annotated[Finite, AfterValidator(turning)] | None = None
     mass_kg: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None
     com_mm: Vector | None = None
     name: str = ""
@@ -225,11 +233,27 @@ def builtin_robots() -> tuple[str, ...]:
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
 
 
+class WrittenOut(yaml.SafeLoader):
+    """YAML without aliases, which a few lines can make larger than any memory."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """A node.  Raises YAMLError for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            line = self.line + 1
+            raise yaml.YAMLError(f"line {line}: an alias (*name); write the value out")
+        return super().compose_node(parent, index)
+
+
+def written_out(text: str) -> Any:
+    """A YAML document.  Raises YAMLError."""
+    return yaml.load(text, WrittenOut)
+
+
 PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
-    ".json": (json.loads, json.JSONDecodeError),
+    ".json": (partial(json.loads, object_pairs_hook=once), json.JSONDecodeError),
     ".toml": (tomllib.loads, tomllib.TOMLDecodeError),
-    ".yaml": (yaml.safe_load, yaml.YAMLError),
-    ".yml": (yaml.safe_load, yaml.YAMLError),
+    ".yaml": (written_out, yaml.YAMLError),
+    ".yml": (written_out, yaml.YAMLError),
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import read_raw, read_text
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.transforms import from_rpy, transform
 
@@ -132,7 +132,7 @@ def parse_xml(raw: bytes, source: str) -> Element:
 def read_urdf(path: Path | str) -> Urdf:
     """The links and joints of a URDF file.  Raises RobotError."""
     read_text(path, kind=RobotError)  # says what is wrong with the file or its encoding
-    return parse_urdf(Path(path).read_bytes(), str(path))
+    return parse_urdf(read_raw(path, kind=RobotError), str(path))
 
 
 def parse_urdf(raw: bytes, source: str = "URDF") -> Urdf:

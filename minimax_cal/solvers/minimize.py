@@ -28,6 +28,19 @@ Constraint = LinearConstraint | NonlinearConstraint
 Function = Callable[[Array], Array]
 COMPLEX_STEP = 1e-30
 QP_TOLERANCE = 1e-9
+ESCAPES = 3  # from points where every gradient vanishes but better ones are near
+FLAT = 1e-6  # gradients below, of problems scaled to about one, count as none
+NEARBY = 1e-3  # how far a better point is looked for, relative to x
+FARTHER = (1.0, 1e2, 1e4, 1e6)  # times the way of a search that found no end
+MESSAGES = {
+    "converged": "optimal to the tolerance",
+    "iteration_limit": "the iteration limit was reached; raise maxiter, or give an exact jac",
+    "stalled": "no step lowers the largest function any more, yet the optimality test fails; give "
+    "an exact jac, another QP backend, or a larger tol",
+    "infeasible": "the constraints could not be met and may contradict each other; loosen them",
+    "failed": "fun or jac gave no finite numbers near the start; try another x0",
+    "unbounded": "the largest function falls without end; add bounds or constraints",
+}
 
 
 def minimize_max(
@@ -50,10 +63,10 @@ def minimize_max(
     bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint.
     qp: name of a QP backend, or a function from Problem to a verified Solution.
     args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
-    the larger of one and the largest gradient.  maxiter: QPs at most.  callback: called with fun,
-    nit, kkt after each QP.
+    the largest at x0.  maxiter: QPs at most.  callback: called with fun, nit, kkt after each QP.
 
-    Returns x, fun (the largest), values (m,), success, status, message, nit, nfev, njev,
+    Returns x, fun (the largest), values (m,), success, status (as in `Status`, or unbounded),
+    message, nit, nfev, njev,
     multipliers (m,) that sum to one, constraint_multipliers (one row a bound or constraint, > 0
     at the upper side and < 0 at the lower), kkt, violation, notes.
     Raises OptionError for arguments that do not fit together.
@@ -81,7 +94,46 @@ def minimize_max(
 
     settings = Sqp(tolerance=tol, iterations=maxiter, hessian="bfgs")
     best = minimax.solve(problem, x, solver, settings, tell)
-    return answer(best, function(best.x), problem.size, count)
+    for _ in range(ESCAPES):
+        lower = below(problem, best.x) if best.status is Status.CONVERGED else None
+        if lower is None:
+            break
+        best = minimax.solve(problem, lower, solver, settings, tell)
+    far = best.status is not Status.CONVERGED and falls_on(problem, x, best.x)
+    return answer(best, function(best.x), problem.size, count, endless=far)
+
+
+def falls_on(problem: MaxOfFunctions, start: Array, end: Array) -> bool:
+    """Whether the largest function falls on and on, the way from a start to an end gone farther."""
+    before, _ = problem.evaluate(start)
+    worst = float(before.max())
+    for far in FARTHER:
+        f, c = problem.evaluate(start + far * (end - start))
+        if not (np.all(c >= problem.lower) and np.all(c <= problem.upper) and f.max() < worst):
+            return False
+        worst = float(f.max())
+    return True
+
+
+def below(problem: MaxOfFunctions, x: Array) -> Array | None:
+    """A point near x that is better though every gradient vanishes at x, as on a hilltop.
+
+    None where there is none, or where the multipliers balance gradients that do not vanish.
+    """
+    here = problem.linearise(x)
+    worst = float(here.f.max())
+    active = here.f >= worst - FLAT * max(abs(worst), 1.0)
+    if np.abs(here.jacobian[active]).max(initial=0.0) > FLAT:
+        return None
+    reach = NEARBY * np.maximum(np.abs(x), 1.0)
+    steps = np.concatenate([np.diag(reach), -np.diag(reach)])
+    best, found = worst - FLAT**2 * max(abs(worst), 1.0), None
+    for step in steps:
+        f, c = problem.evaluate(x + step)
+        inside = np.all(c >= problem.lower) and np.all(c <= problem.upper)
+        if inside and np.all(np.isfinite(f)) and f.max() < best:
+            best, found = float(f.max()), x + step
+    return found
 
 
 def result(**fields: Any) -> OptimizeResult:
@@ -91,15 +143,18 @@ def result(**fields: Any) -> OptimizeResult:
     return out
 
 
-def answer(best: Optimum[Array], values: Array, size: float, count: Count) -> OptimizeResult:
+def answer(
+    best: Optimum[Array], values: Array, size: float, count: Count, *, endless: bool
+) -> OptimizeResult:
     """The result of a minimisation.  size: by which the functions were divided."""
+    status = "unbounded" if endless else str(best.status)
     return result(
         x=best.x,
         fun=float(values.max()),
         values=values,
-        success=best.status is Status.CONVERGED,
-        status=str(best.status),
-        message=best.status.advice or "optimal to the tolerance",
+        success=status == Status.CONVERGED,
+        status=status,
+        message=MESSAGES[status],
         nit=best.iterations,
         nfev=count.function,
         njev=count.jacobian,
@@ -260,12 +315,22 @@ class MaxOfFunctions:
 
     @staticmethod
     def at(x: Array, function: Function, jacobian: Function, rows: Rows) -> MaxOfFunctions:
-        """Divided by the largest gradient at x, if that is above one.  Raises OptionError."""
+        """Divided by the largest gradient at x, or of its size where that is flat.
+
+        Raises OptionError for functions, gradients or constraints that make no sense at x.
+        """
         first = function(x)
         if first.ndim != 1 or not np.all(np.isfinite(first)):
             raise OptionError("minimize_max: fun(x0) must be a vector of finite numbers")
-        size = max(1.0, float(np.abs(jacobian(x)).max(initial=0.0)))
-        return MaxOfFunctions(function, jacobian, rows, size)
+        slope = jacobian(x)
+        if slope.shape != (len(first), len(x)):
+            raise OptionError(
+                f"minimize_max: jac(x0) has shape {slope.shape}; {len(first)} functions of "
+                f"{len(x)} variables need {(len(first), len(x))}"
+            )
+        steep = float(np.abs(slope).max(initial=0.0))
+        size = steep if steep > FLAT * float(np.abs(first).max()) else float(np.abs(first).max())
+        return MaxOfFunctions(function, jacobian, rows, size if size > 0.0 else 1.0)
 
     @property
     def lower(self) -> Array:

@@ -257,3 +257,23 @@ def test_wrong_choices_are_refused(
     with pytest.raises(mc.CalibrationError) as caught:
         mc.calibrate(robot, noisy.data, **options)
     assert say in str(caught.value)
+
+
+def test_pose_after_a_search_over_base_rotations(robot: mc.Robot, noisy: Simulation) -> None:
+    """A joint's zero off by a right angle: the search ends with several members at once."""
+    off = robot.mdh.copy()
+    off[3, 2] += np.pi / 2
+    fit = mc.calibrate(robot.with_mdh(off), noisy.data, "pose")
+    assert fit.accuracy["holdout"].rms_mm < fit.accuracy["nominal"].rms_mm
+
+
+def test_a_holdout_that_leaves_nothing_is_refused(robot: mc.Robot, noisy: Simulation) -> None:
+    with pytest.raises(mc.OptionError, match="leaves none of 60 poses"):
+        mc.calibrate(robot, noisy.data, holdout=0.995)
+
+
+@pytest.mark.parametrize("objective", ["sum", "minimax", "point", "pose"])
+def test_exact_data_are_a_success(objective: str, robot: mc.Robot, clean: Simulation) -> None:
+    fit = mc.calibrate(robot, clean.data, objective)
+    assert fit.status == "converged"
+    assert fit.accuracy["holdout"].max_mm < 1e-6

@@ -229,3 +229,14 @@ def test_numbers_that_do_not_work_out_are_exit_1(
     monkeypatch.setattr(solve, "Sqp", few)
     assert run("tradeoff", "irb2600", csv, "--steps", 0) == 1
     assert "iteration limit" in capsys.readouterr().err
+
+
+def test_a_saved_fit_is_enough(robot: mc.Robot, tmp_path: Path) -> None:
+    data = small(robot)
+    mc.calibrate(robot, data, "point").save(tmp_path / "fit.json")
+    one = tradeoff(robot, data, 2)
+    other = tradeoff(mc.load_fit(tmp_path / "fit.json"), steps=2)
+    for a, b in zip(one.choices, other.choices, strict=True):
+        assert (a.train, a.holdout) == (b.train, b.holdout)
+    with pytest.raises(mc.OptionError, match="give the measurements too"):
+        tradeoff(robot)

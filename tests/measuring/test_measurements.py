@@ -133,3 +133,19 @@ def test_the_same_seed_gives_the_same_split() -> None:
     first, second, other = (split(data, 0.25, seed)[1].q for seed in (3, 3, 4))
     assert_array_equal(first, second)
     assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "says"),
+    [
+        ("temperature", -500.0, "column temperature_C: -500 cannot be"),
+        ("payload", -2.0, "column payload_kg: -2 cannot be"),
+        ("u95", 1e305, "column u95_mm: 1e\\+308 cannot be"),
+    ],
+)
+def test_what_cannot_be_is_refused(column: str, value: float, says: str) -> None:
+    q, y = np.random.default_rng(0).normal(size=(2, 6, 3))
+    values = np.full(6, 1.0 if column != "u95" else 1e-5)
+    values[3] = value
+    with pytest.raises(mc.DataError, match=f"4: {says}"):
+        mc.measurements(q, y, **{column: values})

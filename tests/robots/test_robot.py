@@ -133,3 +133,30 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     path.write_text("!!python/object/apply:os.system ['echo hacked']")
     with pytest.raises(mc.RobotError, match="cannot be parsed"):
         mc.load_robot(path)
+
+
+def test_yaml_that_grows_is_refused(tmp_path: Path) -> None:
+    """Nine levels of nine aliases each would be 387 million entries."""
+    lines = ["a0: &a0 {x: 1}"]
+    lines += [f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
+    path = tmp_path / "robot.yaml"
+    path.write_text("\n".join(lines))
+    with pytest.raises(mc.RobotError, match="line 3: an alias"):
+        mc.load_robot(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"name":', '"name": "twice", "name":', "the key 'name' stands twice"),
+        ('"sign": 1', '"sign": 1, "ratio": 0', "gear ratio of zero"),
+    ],
+)
+def test_json_that_could_mean_two_things_is_refused(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    path = tmp_path / "robot.json"
+    mc.load_robot("irb2600").save(path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(mc.RobotError, match=says):
+        mc.load_robot(path)

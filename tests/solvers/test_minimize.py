@@ -152,3 +152,38 @@ def test_a_wrong_gradient_is_not_called_optimal() -> None:
     )
     assert not found.success
     assert approx_fprime(found.x, lambda x: float(x @ x)) @ found.x >= 0
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1e-9, 1e-3, 1e6])
+def test_the_unit_of_the_functions_does_not_matter(factor: float) -> None:
+    """CB2 in another unit: the same point, to 1e-6."""
+
+    def cb2(x: np.ndarray) -> np.ndarray:
+        a, b = x
+        return np.array([a**2 + b**4, (2 - a) ** 2 + (2 - b) ** 2, 2 * np.exp(b - a)])
+
+    found = mc.minimize_max(lambda x: factor * cb2(x), [2.0, 2.0], jac="cs")
+    assert found.success
+    assert_allclose(found.fun / factor, 1.9522245, rtol=1e-7)
+    assert_allclose(found.x, mc.minimize_max(cb2, [2.0, 2.0], jac="cs").x, rtol=0, atol=1e-6)
+
+
+def test_a_hilltop_is_no_minimum() -> None:
+    found = mc.minimize_max(
+        lambda x: np.array([-x[0] ** 2]), [0.0], jac=lambda x: -2.0 * x[None],
+        bounds=Bounds([-1.0], [2.0]),
+    )  # fmt: skip
+    assert found.success
+    assert found.fun < -0.99  # at one of the bounds
+
+
+def test_what_has_no_minimum_is_said() -> None:
+    found = mc.minimize_max(lambda x: np.array([x[0], 2.0 * x[0]]), [0.0], jac="cs")
+    assert not found.success
+    assert found.status == "unbounded"
+    assert "falls without end" in found.message
+
+
+def test_a_jacobian_of_another_shape_is_said() -> None:
+    with pytest.raises(mc.OptionError, match=r"shape \(2, 2\); 2 functions of 1 variables"):
+        mc.minimize_max(lambda x: np.array([x[0], -x[0]]), [0.0], jac=lambda x: np.eye(2))

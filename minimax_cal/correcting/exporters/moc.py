@@ -17,6 +17,7 @@ import numpy as np
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import read_raw
 from minimax_cal.robots.transforms import inverse, link, to_rpy
 
 HEADER = "MOC:CFG_1.0:6:0::"
@@ -86,10 +87,7 @@ def real(text: str, key: str, section: Section) -> float:
 
 def read_moc(path: Path | str) -> Moc:
     """A controller's MOC.cfg, in UTF-8 or Latin-1.  Raises CalibrationError."""
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
+    raw = read_raw(path)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -10,10 +10,10 @@ import base64
 import gzip
 import hashlib
 import json
-from importlib import import_module, resources
+from importlib import resources
 from typing import Any
 
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Table
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.content import Block, Figure, Note, Report, View
@@ -24,18 +24,13 @@ UNSAFE = {letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"}
 
 def render(report: Report, *, paper: bool = False) -> str:
     """The page.  paper: for the printer, with its charts drawn while it is read, none to turn."""
-    try:
-        from jinja2 import Environment, StrictUndefined
-        from markupsafe import Markup
+    jinja, offline = needed()
+    from markupsafe import Markup
 
-        offline = import_module("plotly.offline")
-    except ModuleNotFoundError as error:
-        raise OptionError(
-            f"a report needs {error.name}: pip install minimax-cal[report]"
-        ) from error
-    pages = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
     own, plotly = part("page.js"), str(offline.get_plotlyjs())
-    return pages.from_string(part("page.html.jinja")).render(
+    template = pages.from_string(part("page.html.jinja"))
+    whole: str = template.render(
         report=report,
         policy=policy(own, plotly),
         style=Markup(part("page.css")),
@@ -48,6 +43,15 @@ def render(report: Report, *, paper: bool = False) -> str:
         still=lambda view: Markup(view.still),
         data=lambda figure: Markup(script_json(figure_data(figure))),
     )  # fmt: skip
+    return whole
+
+
+def needed() -> tuple[Any, Any]:
+    """The packages that draw the page: jinja2, plotly.offline.  Raises OptionError."""
+    jinja, offline = (
+        optional(name, "a report", "minimax-cal[report]") for name in ("jinja2", "plotly.offline")
+    )
+    return jinja, offline
 
 
 def part(name: str) -> str:

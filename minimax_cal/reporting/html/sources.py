@@ -16,6 +16,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import json_of, read_raw
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -176,22 +177,14 @@ def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> t
 
 def read_json(path: Path | str) -> tuple[dict[str, Any], str]:
     """A JSON object with its text cleaned, and the SHA-256 of the file."""
+    raw = read_raw(path)
     try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        content = clean(json.loads(raw, parse_constant=refuse))
+        content = clean(json_of(raw))
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: is neither a calibration nor a diagnosis")
     return content, hashlib.sha256(raw).hexdigest()
-
-
-def refuse(constant: str) -> float:
-    """NaN and Infinity are no JSON."""
-    raise ValueError(f"{constant} is not a number that JSON knows")
 
 
 def clean(value: Any) -> Any:

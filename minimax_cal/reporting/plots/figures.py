@@ -35,7 +35,17 @@ def new_figure(width: float, height: float) -> Figure:
 def save(figure: Figure, path: Path) -> None:
     """Write a figure whole; the suffix, one of PICTURES, chooses the format."""
     from matplotlib import rc_context
+    from matplotlib.text import Text
 
+    ticks = {
+        label
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for tick in (*axis.majorTicks, *axis.minorTicks)
+        for label in (tick.label1, tick.label2)
+    }
+    for words in figure.findobj(Text):
+        words.set_parse_math(words in ticks)  # a name may hold a dollar sign; ticks hold powers
     kind = path.suffix.lower().lstrip(".")
     stream = io.BytesIO()
     stamp = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": None}[kind]
