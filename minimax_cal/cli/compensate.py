@@ -1,189 +1,70 @@
-"""The command `compensate`: a file of joint targets in, a corrected one out."""
+"""The command `compensate`."""
 
 from __future__ import annotations
 
-import csv
-import io
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
-import numpy as np
 
-from minimax_cal.cli import options
-from minimax_cal.cli.options import FAILED, WIDTH
-from minimax_cal.correcting.compensate import FRAMES, Compensation, compensate
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import json_text, write_whole
-from minimax_cal.measuring.columns import (
-    JOINT,
-    TARGET,
-    TEXT,
-    UNITS,
-    Rows,
-    header_check,
-    near,
-    optional_kind,
-    read_rows,
-    whole_rows,
+from minimax_cal.cli import FAILED
+from minimax_cal.cli.options import (
+    FIT,
+    PATH,
+    WIDTH,
+    Output,
+    options_of,
+    result_options,
 )
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.correcting.compensate import compensate
+from minimax_cal.correcting.target_file import read_targets
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.options import Option
 from minimax_cal.robots.robot import load_robot
-
-ADDED = ("residual_mm", "residual_mrad", "status")
-USED = ("order", "temperature", "payload", "tau", "approach", "session")
-ANY_TARGET = ["smr1_x_mm", "smr1_y_mm", "smr1_z_mm"]  # the header's rules ask for one
-
-
-@dataclass(frozen=True, eq=False)
-class TargetFile:
-    """A file of joint targets: its cells as text, and what they mean."""
-
-    file: Rows
-    data: Measurements
-
-    def corrected(self, found: Compensation) -> str:
-        """The same file with other joints, and what remains at each target."""
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*self.file.header, *ADDED])
-        joints = {i: m for i, name in enumerate(self.file.header) if (m := JOINT.fullmatch(name))}
-        for k, row in enumerate(self.file.rows):
-            out = list(row)
-            for i, match in joints.items():
-                out[i] = f"{found.q[k, int(match[1]) - 1] / UNITS[match[2]]:.9f}"
-            left = (f"{1e3 * found.distance[k]:.6f}", f"{1e3 * found.angle[k]:.6f}")
-            writer.writerow([*out, *left, str(found.outcome[k])])
-        return stream.getvalue()
-
-
-def read_targets(path: Path | str) -> TargetFile:
-    """Joint columns as in a measurement file; payload, approach, order ... where there.
-
-    Raises DataError.
-    """
-    file = read_rows(path)
-    header = file.header
-    header_check(path, [name for name in header if not TARGET.fullmatch(name)] + ANY_TARGET)
-    done = [name for name in ADDED if name in header]
-    if done:
-        raise DataError(
-            f"{path}:1: column {done[0]}: these joints are corrected already, and would be twice; "
-            "give the targets as programmed"
-        )
-    file = whole_rows(file)
-    q, sliding = file.joints()
-    columns: dict[str, Array] = {}
-    notices = []
-    for name in header:
-        kind, match = optional_kind(name)
-        if kind in USED and kind in TEXT:
-            columns[name] = np.array(file.text(name))
-        elif kind in USED and match:
-            stem = name.removesuffix(f"_{match[1]}") if match.re.groups else name
-            columns[stem] = file.number(name, empty=True)
-        elif not (kind or JOINT.fullmatch(name) or TARGET.fullmatch(name)):
-            notices.append(f"{path}: column {name} is kept and not used{near(name)}")
-    data = Measurements(
-        q=q,
-        y=np.zeros((len(q), 0, 3)),
-        target_names=(),
-        sliding=sliding,
-        line=file.line,
-        columns=columns,
-        notices=tuple(notices),
-        source=str(path),
-    )
-    return TargetFile(file, data)
 
 
 @click.command(name="compensate")
-@click.argument("fit", type=click.Path(path_type=Path))
-@click.argument("targets", type=click.Path(path_type=Path))
+@FIT
+@click.argument("targets", type=PATH)
 @click.option(
     "--robot", help="Nominal robot of the controller, file or name [default: that of the fit]."
 )
-@click.option(
-    "--frame",
-    default=FRAMES[0],
-    show_default=True,
-    help="Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
-    "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
+@options_of(
+    compensate,
+    frame=Option(
+        "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
+        "them), flange (the base so, the flange as drawn), own (on the calibrated base)."
+    ),
+    tolerance=Option("What may remain of a target that counts as reached.", "mm"),
+    most_change=Option(
+        "Most that a joint may change (a slide 8.7 mm per degree).", "deg", flag="--max-change"
+    ),
+    lever=Option("What a radian counts as [default: the targets' own].", "mm"),
+    clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
 )
-@click.option(
-    "--tolerance",
-    type=float,
-    default=0.01,
-    show_default=True,
-    metavar="MM",
-    help="What may remain of a target that counts as reached.",
-)
-@click.option(
-    "--max-change",
-    type=float,
-    default=5.0,
-    show_default=True,
-    metavar="DEG",
-    help="Most that a joint may change (a slide 8.7 mm per degree).",
-)
-@click.option(
-    "--lever",
-    type=float,
-    metavar="MM",
-    help="What a radian counts as [default: the targets' own].",
-)
-@click.option(
-    "--clock",
-    type=float,
-    default=0.0,
-    show_default=True,
-    help="Effects of time: as at this moment of the calibration's session, 0 to 1.",
-)
-@options.JSON
-@options.output("the targets (CSV)")
-@options.QUIET
+@result_options("the targets (CSV)")
 def compensate_command(
-    fit: Path,
-    targets: Path,
-    robot: str | None,
-    frame: str,
-    tolerance: float,
-    max_change: float,
-    lever: float | None,
-    clock: float,
-    as_json: bool,
-    output: Path | None,
-    quiet: bool,
+    fit: Path, targets: Path, robot: str | None, to: Output, **chosen: Any
 ) -> int:
     """Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to go.
 
     FIT is what `calibrate -o` wrote.  Without -o the corrected file goes to stdout, its summary to
     stderr.
     """
-    options.writable(output)
     given = read_targets(targets)
-    found = compensate(
-        fit,
-        given.data,
-        None if robot is None else load_robot(robot),
-        frame=frame,
-        tolerance=tolerance * 1e-3,
-        most_change=float(np.radians(max_change)),
-        lever=float("nan") if lever is None else lever * 1e-3,
-        clock=clock,
-    )
-    options.notify(found.notices, quiet=quiet)
+    nominal = None if robot is None else load_robot(robot)
+    found = compensate(fit, given.data, nominal, **chosen)
+    to.notice(*found.notices)
     text = given.corrected(found)
-    if output:
-        write_whole(output, text)
-    if as_json:
+    if to.path:
+        write_whole(to.path, text)
+    if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
-    elif output:
+    elif to.path:
         click.echo(found.summary(WIDTH))
     else:
         click.echo(text, nl=False)
-        if not quiet:
+        if not to.quiet:
             click.echo(found.summary(WIDTH), err=True)
     if found.failed.any():
         click.echo(f"error: {found.complaint()}", err=True)

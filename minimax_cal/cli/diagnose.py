@@ -2,65 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
 from minimax_cal.cli import options
+from minimax_cal.cli.options import (
+    DATA,
+    JSON,
+    ROBOT,
+    SOME_DATA,
+    Output,
+    options_from,
+    options_of,
+    result_options,
+)
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import Option
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
-from minimax_cal.reporting.plots.figures import PICTURES
 from minimax_cal.reporting.tables import closing_tables, effects_list, effects_table, where_tables
 
 
 @click.command(name="diagnose")
-@options.ROBOT
-@options.DATA
-@options.HOLDOUT
-@options.SEED
-@click.option(
-    "--without",
-    multiple=True,
-    metavar="EFFECT",
-    help="Do not consider this effect; `minimax-cal effects` lists them.",
+@ROBOT
+@DATA
+@options_from(Options, "holdout", "seed")
+@options_of(
+    diagnose,
+    exclude=Option(
+        "Do not consider this effect; `minimax-cal effects` lists them.",
+        metavar="EFFECT",
+        flag="--without",
+        many=tuple,
+    ),
 )
-@options.figure_option("the gap and where it lies")
-@options.JSON
-@options.output("the diagnosis (JSON)")
-@options.QUIET
-def diagnose_command(
-    robot: str,
-    data: Path,
-    holdout: float,
-    seed: int,
-    without: Sequence[str],
-    figure: Path | None,
-    as_json: bool,
-    output: Path | None,
-    quiet: bool,
-) -> int:
+@result_options("the diagnosis (JSON)", figure="the gap and where it lies")
+def diagnose_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
-    options.writable(output)
-    options.writable(figure, kinds=PICTURES)
-    with options.stages(quiet=quiet) as progress:
-        found = diagnose(
-            robot,
-            data,
-            seed=seed,
-            holdout=holdout,
-            exclude=options.names_of(without),
-            progress=progress,
-        )
-    options.notify(found.notices, quiet=quiet)
-    if figure:
-        save_diagnosis(found, figure)
-    if options.deliver(found.json() if output or as_json else "", output, as_json=as_json):
+    with to.stages() as progress:
+        found = diagnose(robot, data, progress=progress, **chosen)
+    to.notice(*found.notices)
+    to.draw(save_diagnosis, found)
+    if to.deliver(found.json):
         options.terminal().print(found.headline() + "\n", markup=False)
         options.show(*found.tables(), *where_tables(found.where), *closing_tables(found))
     return options.exit_code(found.status)
@@ -68,8 +58,8 @@ def diagnose_command(
 
 @click.command(name="effects")
 @click.argument("robot", required=False)
-@click.argument("data", type=click.Path(path_type=Path), required=False)
-@options.JSON
+@SOME_DATA
+@JSON
 def effects_command(robot: str | None, data: Path | None, as_json: bool) -> int:
     """The library of effects; with ROBOT and DATA, where these measurements can test them."""
     scene = None

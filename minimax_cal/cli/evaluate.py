@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from minimax_cal.cli import options
+from minimax_cal.cli.options import DATA, FIT, Output, result_options, show
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.ground.files import json_text
 from minimax_cal.measuring import checks
@@ -16,14 +16,11 @@ from minimax_cal.modelling.cell import evaluate, load_cell
 
 
 @click.command(name="evaluate")
-@click.argument("fit", type=click.Path(path_type=Path))
-@options.DATA
-@options.JSON
-@options.output("the accuracy (JSON)")
-@options.QUIET
-def evaluate_command(fit: Path, data: Path, as_json: bool, output: Path | None, quiet: bool) -> int:
+@FIT
+@DATA
+@result_options("the accuracy (JSON)")
+def evaluate_command(fit: Path, data: Path, to: Output) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted."""
-    options.writable(output)
     cell, measured = load_cell(fit), read_measurements(data)
     found = evaluate(cell, measured)
     doubts = checks.outliers(measured, np.linalg.norm(cell.error(measured), axis=-1))
@@ -32,17 +29,15 @@ def evaluate_command(fit: Path, data: Path, as_json: bool, output: Path | None, 
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
-    options.notify((*measured.notices, *doubts), quiet=quiet)
-    text = json_text(
-        {
-            "schema": 1,
-            "kind": "evaluation",
-            "fit": str(fit),
-            "data": str(data),
-            "data_sha256": measured.digest,
-            "accuracy": found.to_dict(),
-        }
-    )
-    if options.deliver(text, output, as_json=as_json):
-        options.show(found.table(f"{cell.robot.name} on {data}", measured.target_names))
+    to.notice(*measured.notices, *doubts)
+    content = {
+        "schema": 1,
+        "kind": "evaluation",
+        "fit": str(fit),
+        "data": str(data),
+        "data_sha256": measured.digest,
+        "accuracy": found.to_dict(),
+    }
+    if to.deliver(lambda: json_text(content)):
+        show(found.table(f"{cell.robot.name} on {data}", measured.target_names))
     return 0

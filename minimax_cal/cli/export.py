@@ -2,49 +2,40 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import click
 
-from minimax_cal.cli import options
+from minimax_cal.cli.options import PATH, QUIET, Output, options_of, output, with_output
 from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.options import Option
 
 
 @click.command(name="export")
 @click.argument("fit")
-@click.option("--to", required=True, metavar="FORMAT", help=", ".join(EXPORTERS) + ".")
+@click.option("--to", "kind", required=True, metavar="FORMAT", help=", ".join(EXPORTERS) + ".")
 @click.option(
     "--urdf",
-    "original",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="ORIGINAL",
     help="Correct the joint origins of this URDF; all else stays, byte for byte.",
 )
-@click.option("--tip", default="", metavar="LINK", help="Last link of the chain in that URDF.")
-@click.option(
-    "--experimental",
-    is_flag=True,
-    help="Agree to a format whose frames its maker does not document (moc).",
+@options_of(
+    exported,
+    tip=Option("Last link of the chain in that URDF.", metavar="LINK"),
+    experimental=Option("Agree to a format whose frames its maker does not document (moc)."),
 )
-@options.output("the robot")
-@options.QUIET
-def export_command(
-    fit: str,
-    to: str,
-    original: Path | None,
-    tip: str,
-    experimental: bool,
-    output: Path | None,
-    quiet: bool,
-) -> int:
+@output("the robot")
+@QUIET
+@with_output
+def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     """Write the robot of FIT (a saved calibration or a robot) as a file others can load."""
-    options.writable(output)
-    made = exported(fit, to, urdf=original, tip=tip, experimental=experimental)
-    options.notify(made.notices, quiet=quiet)
-    if output:
-        write_whole(output, made.content)
+    made = exported(fit, kind, **chosen)
+    to.notice(*made.notices)
+    if to.path:
+        write_whole(to.path, made.content)
     else:
         click.echo(made.content, nl=False)
     return 0

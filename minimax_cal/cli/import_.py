@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
-from minimax_cal.cli import options
+from minimax_cal.cli.options import JSON, PATH, QUIET, Output, output, show, with_output
 from minimax_cal.ground.files import json_text
 from minimax_cal.measuring.importers import Imported, import_files, save
 from minimax_cal.measuring.measurements import read_measurements
-
-PATH = click.Path(path_type=Path)
 
 
 @click.command(name="import")
@@ -37,42 +36,32 @@ PATH = click.Path(path_type=Path)
     help="Of a file with several points a pose: which of them follow each other.",
 )
 @click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
-@options.JSON
-@options.QUIET
-@options.output("the measurements (CSV)")
+@JSON
+@QUIET
+@output("the measurements (CSV)")
+@with_output
 def import_command(
     files: Sequence[Path],
     joints: Path | None,
-    columns: str,
-    units: Sequence[str],
     layout: str | None,
     decimal: str | None,
-    as_json: bool,
-    quiet: bool,
-    output: Path | None,
+    to: Output,
+    **chosen: Any,
 ) -> int:
     """Read FILEs of a tracker or controller as they are, show what was understood, write CSV.
 
     Without -o nothing is written.
     """
-    options.writable(output)
-    found = import_files(
-        files,
-        joints,
-        columns=columns,
-        units=units,
-        layout=layout or "",
-        decimal=decimal or "",
-    )
-    if output:
-        save(output, found)
-        read_measurements(output)  # what was written can be read
-    options.notify(found.data.notices, quiet=quiet)
-    if as_json:
-        click.echo(json_text(content(found, output)), nl=False)
+    found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
+    if to.path:
+        save(to.path, found)
+        read_measurements(to.path)  # what was written can be read
+    to.notice(*found.data.notices)
+    if to.as_json:
+        click.echo(json_text(content(found, to.path)), nl=False)
         return 0
-    options.show(found.files(), *found.columns())
-    wrote = f"wrote {output}" if output else "nothing written; add -o FILE"
+    show(found.files(), *found.columns())
+    wrote = f"wrote {to.path}" if to.path else "nothing written; add -o FILE"
     click.echo(f"{found.headline()}\n{wrote}")
     return 0
 

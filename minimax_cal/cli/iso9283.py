@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
-from minimax_cal.cli.options import JSON, QUIET, deliver, notify, output, show, writable
+from minimax_cal.cli.options import FIT, SOME_DATA, Output, options_of, result_options, show
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import Option
 from minimax_cal.judging.standard import iso9283
 
 
@@ -24,40 +26,27 @@ def point_of(text: str) -> str | Sequence[float]:
 
 
 @click.command(name="iso9283")
-@click.argument("fit", type=click.Path(path_type=Path))
-@click.argument("data", type=click.Path(path_type=Path), required=False)
-@click.option(
-    "--nominal", default="", help="Robot before calibration, file or name [default: of the fit]."
-)
-@click.option(
-    "--tcp",
-    default="centroid",
-    show_default=True,
-    metavar="POINT",
-    help="centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+@FIT
+@SOME_DATA
+@options_of(
+    iso9283,
+    nominal=Option("Robot before calibration, file or name [default: of the fit]."),
+    tcp=Option(
+        "centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+        metavar="POINT",
+        read=point_of,
+    ),
 )
 @click.option("--poses", is_flag=True, help="A row for every pose, too.")
-@JSON
-@output("the values (JSON)")
-@QUIET
-def iso9283_command(
-    fit: Path,
-    data: Path | None,
-    nominal: str,
-    tcp: str,
-    poses: bool,
-    as_json: bool,
-    output: Path | None,
-    quiet: bool,
-) -> int:
+@result_options("the values (JSON)")
+def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **chosen: Any) -> int:
     """Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.
 
     FIT is what `calibrate -o` wrote, DATA the measurements [default: those of the fit].  Held-out
     poses stand apart from training poses.  Poses that were visited again give repeatability.
     """
-    writable(output)
-    found = iso9283(fit, data, nominal=nominal, tcp=point_of(tcp))
-    notify(found.notices, quiet=quiet)
-    if deliver(json_text(found.to_dict()), output, as_json=as_json):
+    found = iso9283(fit, data, **chosen)
+    to.notice(*found.notices)
+    if to.deliver(lambda: json_text(found.to_dict())):
         show(*found.tables(poses=poses))
     return 0

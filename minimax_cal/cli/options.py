@@ -1,63 +1,173 @@
-"""What the commands share: options, arguments, and how results reach the terminal."""
+"""What the commands share: options made from fields, and how results reach the terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import reduce, wraps
+from inspect import signature
+from math import isnan
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
 
+from minimax_cal.cli import FAILED
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
 from minimax_cal.solvers.status import Status
 
-FAILED, MISUSED = 1, 2  # exit codes of the contract
 WIDTH = 110  # of text that goes to no terminal
+Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
 
+PATH = click.Path(path_type=Path)
 ROBOT = click.argument("robot")
-DATA = click.argument("data", type=click.Path(path_type=Path))
+DATA = click.argument("data", type=PATH)
+SOME_DATA = click.argument("data", type=PATH, required=False)
+FIT = click.argument("fit", type=PATH)
 JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
 QUIET = click.option("--quiet", "-q", is_flag=True, help="No notices and no progress on stderr.")
-HOLDOUT = click.option(
-    "--holdout",
-    type=float,
-    default=0.2,
-    show_default=True,
-    help="Share of the poses kept out of the fit; a split column overrides it.",
-)
-SEED = click.option(
-    "--seed",
-    type=int,
-    default=0,
-    show_default=True,
-    help="Seed of the choice of held-out poses.",
-)
 
 
-def figure_option(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The option --figure."""
-    return click.option(
-        "--figure",
-        type=click.Path(path_type=Path),
-        help=f"Draw {what} to this PNG, SVG or PDF.",
+# ---- options from fields and arguments ---------------------------------------------------------
+
+
+def options_from(kind: Any, *names: str) -> Decorator:
+    """Options of a command from the fields of a dataclass that are made by `ground.options.option`.
+
+    The command gets their values as keywords of the fields' names, in SI.  names: which fields.
+    """
+    return stacked(
+        *(
+            option_of(field.name, field.default, field.metadata["option"])
+            for field in fields(kind)
+            if "option" in field.metadata and (not names or field.name in names)
+        )
     )
 
 
-def output(what: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def options_of(verb: Callable[..., object], **told: Option) -> Decorator:
+    """Options of a command from arguments of a function, whose defaults are theirs, in SI."""
+    known = signature(verb).parameters
+    return stacked(*(option_of(name, known[name].default, each) for name, each in told.items()))
+
+
+def stacked(*decorators: Decorator) -> Decorator:
+    """Several decorators as one, the first on top."""
+    return lambda command: reduce(lambda made, each: each(made), reversed(decorators), command)
+
+
+def option_of(name: str, default: Any, told: Option) -> Decorator:
+    """The click option of a field or argument, which is its default where it is not given."""
+    flag = told.flag or "--" + name.replace("_", "-")
+    kind, shown, metavar, read = kind_of(default, told, flag)
+
+    def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
+        if told.many:
+            return told.many(map(read, given) if told.read else names_of(given))
+        return default if given is None else read(given)
+
+    return click.option(
+        flag,
+        name,
+        type=kind,
+        is_flag=kind is bool,
+        default=shown,
+        show_default=shown is not None and kind is not bool,
+        metavar=told.metavar or metavar or None,
+        nargs=told.values,
+        multiple=told.many is not None,
+        callback=in_si,
+        help=told.help or None,
+    )
+
+
+def kind_of(default: Any, told: Option, flag: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
+    """Type of what people give, its default and metavar, and what it is in SI."""
+    scale = SI[told.unit]
+    if isinstance(default, tuple) and default:
+        low, high = (f"{end / scale:g}" for end in default)
+        return str, f"{low}:{high}", "LOW:HIGH", lambda text: pair(text, flag, scale)
+    if told.unit or isinstance(default, float):
+        shown = None if default is None or isnan(default) else round(default / scale, 9)
+        return float, shown, told.unit.upper(), lambda value: value * scale
+    if isinstance(default, bool | int | str) and default != "":
+        return type(default), default, "", told.read or type(default)
+    return str, None, "", told.read or (tuple if told.values > 1 else str)
+
+
+# ---- results -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a result goes, as --json, --output, --figure and --quiet say."""
+
+    path: Path | None
+    as_json: bool
+    figure: Path | None
+    quiet: bool
+
+    @contextmanager
+    def stages(self) -> Iterator[Callable[[str], None]]:
+        """To be told of each stage of long work, which a terminal shows on stderr."""
+        with Console(stderr=True, quiet=self.quiet, highlight=False).status("reading") as status:
+            yield status.update
+
+    def notice(self, *texts: str) -> None:
+        """Print notices on stderr, one a line."""
+        for text in () if self.quiet else texts:
+            click.echo(f"notice: {text}", err=True)
+
+    def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
+        """Save the picture of a result where it was asked for."""
+        if self.figure:
+            save(result, self.figure)
+
+    def deliver(self, text: Callable[[], str]) -> bool:
+        """Write the JSON of a result where it was asked for; whether people want to read it too."""
+        made = text() if self.path or self.as_json else ""
+        if self.path:
+            write_whole(self.path, made)
+        if self.as_json:
+            click.echo(made, nl=False)
+        return not self.as_json
+
+
+def with_output(command: Command) -> Command:
+    """Hand a command its `Output` as `to`, once its files are known to be writable."""
+
+    @wraps(command)
+    def handed(
+        *given: Any,
+        quiet: bool,
+        as_json: bool = False,
+        output: Path | None = None,
+        figure: Path | None = None,
+        **more: Any,
+    ) -> Any:
+        writable(output)
+        drawable(figure)
+        return command(*given, to=Output(output, as_json, figure, quiet), **more)
+
+    return handed
+
+
+def result_options(what: str, *, figure: str = "") -> Decorator:
+    """The options of a result.  what: what -o writes.  figure: what --figure draws, if anything."""
+    drawn = click.option("--figure", type=PATH, help=f"Draw {figure} to this PNG, SVG or PDF.")
+    return stacked(*([drawn] if figure else []), JSON, output(what), QUIET, with_output)
+
+
+def output(what: str) -> Decorator:
     """The option -o."""
-    return click.option(
-        "-o", "--output", type=click.Path(path_type=Path), help=f"Write {what} to this file."
-    )
-
-
-def names_of(texts: Sequence[str]) -> tuple[str, ...]:
-    """Names separated by commas, from an option that may be given several times."""
-    return tuple(name.strip() for text in texts for name in text.split(",") if name.strip())
+    return click.option("-o", "--output", type=PATH, help=f"Write {what} to this file.")
 
 
 def terminal() -> Console:
@@ -66,46 +176,28 @@ def terminal() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
 
 
-def show(*tables: Table) -> None:
-    """Print tables on stdout."""
+def show(*tables: Table, headline: str = "") -> None:
+    """Print tables on stdout, and what they come to."""
     console = terminal()
     for table in tables:
         console.print(table.rich())
+    if headline:
+        click.echo(f"\n{headline}")
 
 
-def writable(*paths: Path | None, kinds: tuple[str, ...] = ()) -> None:
+def writable(*paths: Path | None) -> None:
     """Raise an error, before any work, for an output that cannot be written."""
     for path in paths:
         if path:
-            check_writable(path, kinds)
+            check_writable(path)
 
 
-@contextmanager
-def stages(*, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """To be told of each stage of long work, which a terminal shows on stderr."""
-    with Console(stderr=True, quiet=quiet, highlight=False).status("reading") as status:
-        yield status.update
+def drawable(path: Path | None) -> None:
+    """Raise an error, before any work, for a picture that cannot be drawn."""
+    if path:
+        from minimax_cal.reporting.plots.figures import PICTURES
 
-
-def notify(notices: Iterable[str], *, quiet: bool) -> None:
-    """Print notices on stderr, one a line."""
-    for text in notices:
-        notice(text, quiet=quiet)
-
-
-def notice(text: str, *, quiet: bool) -> None:
-    """Print one notice on stderr."""
-    if not quiet:
-        click.echo(f"notice: {text}", err=True)
-
-
-def deliver(text: str, output: Path | None, *, as_json: bool) -> bool:
-    """Write the JSON of a result where it was asked for; whether people want to read it too."""
-    if output:
-        write_whole(output, text)
-    if as_json:
-        click.echo(text, nl=False)
-    return not as_json
+        check_writable(path, PICTURES)
 
 
 def exit_code(status: Status) -> int:

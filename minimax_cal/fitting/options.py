@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -11,10 +11,12 @@ import numpy as np
 import qp_backends
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
-from minimax_cal.fitting.robust import SQUARE, check_robust
+from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import METHODS
 from qp_backends import BackendError, Problem
@@ -22,6 +24,9 @@ from qp_backends import solve as solve_qp
 
 FALLBACK = "daqp"  # a required package
 TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
+UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
+LENGTHS = ("mm", "um", "m")
+
 
 Progress = Callable[[str], None]
 T = TypeVar("T")
@@ -29,6 +34,24 @@ T = TypeVar("T")
 
 def silent(message: str) -> None:
     """Say nothing."""
+
+
+def prior_of(text: str) -> tuple[str, float]:
+    """NAME=SIGMA with its unit, as ``a*=0.5mm`` or ``theta2=1mrad``."""
+    name, equals, size = text.partition("=")
+    kind = name.rstrip("0123456789*")
+    for unit in sorted(UNITS, key=len, reverse=True):
+        if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTHS):
+            what = "a length: give mm" if kind in "ad" else "an angle: give mrad or deg"
+            raise OptionError(f"--prior {text!r}: {name} is {what}")
+        if equals and name and size.endswith(unit):
+            try:
+                return name, float(size.removesuffix(unit)) * UNITS[unit]
+            except ValueError:
+                break
+    raise OptionError(
+        f"--prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad"
+    )
 
 
 @dataclass(frozen=True)
@@ -48,22 +71,50 @@ class Options:
     trim: at most this share of the points, those that stand out, is set aside.
     """
 
-    objective: str = "minimax"
-    qp: str = "daqp"
-    holdout: float = 0.2
-    seed: int = 0
-    fix: Sequence[str] = ()
-    free: Sequence[str] = ()
-    priors: Mapping[str, float] = field(default_factory=dict)
-    method: str = "snllm"
-    lever: float | None = None
-    hessian: str = "gauss-newton"
-    distance: str = "two-sided"
-    distance_tolerance: float | None = None
+    objective: str = option(
+        "minimax", "sum, minimax (worst target), point (worst point), pose, or one target: smr:K."
+    )
+    qp: str = option("daqp", "QP backend of minimax.")
+    holdout: float = option(
+        0.2, "Share of the poses kept out of the fit; a split column overrides it."
+    )
+    seed: int = option(0, "Seed of the choice of held-out poses.")
+    fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
+    free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)
+    priors: Mapping[str, float] = option(
+        dict,
+        "Known tolerance of a parameter about its nominal value, as a*=0.5mm.",
+        flag="--prior",
+        metavar="NAME=SIGMA",
+        read=prior_of,
+        many=dict,
+    )
+    effects: Sequence[str | Term] = option(
+        (),
+        "Fit these too, as joint_compliance:all,backlash:J6; `minimax-cal effects` lists them.",
+        metavar="NAME:PLACE",
+        many=tuple,
+    )
+    method: str = option("snllm", f"Least squares: {', '.join(METHODS)}.")
+    loss: str = option(
+        SQUARE, f"Of the distances, against outliers: {', '.join((SQUARE, *LOSSES))}."
+    )
+    trim: float = option(
+        0.0,
+        "Set at most this share of the points aside: those that stand out.",
+        metavar="SHARE",
+    )
+    hessian: str = option("gauss-newton", "Of the minimax SQP: gauss-newton or bfgs.")
+    distance: str = option(
+        "two-sided", "Form of the distance constraints: two-sided, squared or off."
+    )
+    lever: float | None = option(
+        None, "What a radian counts as in the pose objective [default: the targets' own].", "mm"
+    )
+    distance_tolerance: float | None = option(
+        None, "How far a distance between targets may be off [default: as measured].", "mm"
+    )
     resolution: float = identify.RESOLUTION
-    effects: Sequence[str | Term] = ()
-    loss: str = SQUARE
-    trim: float = 0.0
 
     def settings(self) -> dict[str, object]:
         """For the record, effects in their written form."""

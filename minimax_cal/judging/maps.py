@@ -19,6 +19,7 @@ from minimax_cal.fitting.uncertainty import FRAMES, Uncertainty, holding_radius,
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
+from minimax_cal.ground.options import option
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, Saved
@@ -63,11 +64,11 @@ class Grid:
     median height of the samples and a fifth of the arm's reach [m].
     """
 
-    samples: int = 100_000
-    bins: int = 40
-    height: float = np.nan
-    slab: float = np.nan
-    seed: int = 0
+    samples: int = option(100_000)
+    bins: int = option(40, "Along the wider side of a section.")
+    height: float = option(np.nan, "Of the horizontal section [default: the median].", "mm")
+    slab: float = option(np.nan, "Its thickness [default: a fifth of the reach].", "mm")
+    seed: int = option(0, "Of the samples.")
 
 
 @dataclass(frozen=True, eq=False)

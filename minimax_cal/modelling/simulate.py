@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
@@ -30,11 +31,18 @@ class Truth:
     span: most that a joint turns from 0, within its limits [rad].
     """
 
-    length: float = 0.5e-3
-    angle: float = 1.0e-3
-    compliance: float = 3.0e-7
-    noise: float = 10e-6
-    noise_per_metre: float = 2.5e-6
+    length: float = option(
+        0.5e-3, "Standard deviation of the errors of a and d.", "mm", flag="--length-error"
+    )
+    angle: float = option(
+        1.0e-3,
+        "Standard deviation of the errors of theta, alpha, beta.",
+        "mrad",
+        flag="--angle-error",
+    )
+    compliance: float = option(3.0e-7, "Turn of each joint under gravity's torque.", "urad/Nm")
+    noise: float = option(10e-6, "Standard deviation of a coordinate at the instrument.", "um")
+    noise_per_metre: float = option(2.5e-6, "Its growth with range.", "um/m")
     distance: float = 3.0
     circle: float = 0.1
     span: float = np.pi

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
+from minimax_cal.ground.options import SI, option, pair, triple
+from minimax_cal.planning.prospect import Instrument
+from minimax_cal.planning.result import MEANINGS, POWER
+from minimax_cal.planning.visibility import NORMALS
 from minimax_cal.robots.robot import Robot
 
 EFFORTS = ("none", "both")  # what is done about the side a pose is approached from
+JOINT = re.compile(r"[Jj]?(\d+)=(.+)")
+USUAL = Instrument()
 MOST_POSES, MOST_CANDIDATES, MOST_TARGETS = 1000, 50_000, 20
+
+
+def box(text: str) -> tuple[tuple[float, ...], ...]:
+    """LOW:HIGH of x, y and z in millimetres, as corners in metres.  Raises OptionError."""
+    axes = text.split(",")
+    if len(axes) != 3:
+        raise OptionError(f"--volume {text!r}: give x, y and z, as 700:1700,-500:500,300:1300")
+    limits = [pair(axis, "--volume", 1e-3) for axis in axes]
+    return tuple(low for low, _ in limits), tuple(high for _, high in limits)
 
 
 @dataclass(frozen=True)
@@ -31,28 +48,100 @@ class PlanOptions:
     approach: both for revisits from the other side.  revisit: how many.
     """
 
-    criterion: str = "I"
-    candidates: int = 2000
-    seed: int = 0
-    tracker: Sequence[float] = ()
-    targets: int = 3
-    spots: Sequence[Sequence[float]] = ()
-    normals: str = "flange"
-    acceptance: float = np.radians(30.0)
-    reach: tuple[float, float] = (0.5, 50.0)
-    elevation: tuple[float, float] = (np.radians(-50.0), np.radians(75.0))
-    joints: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    volume: Sequence[Sequence[float]] = ()
-    floor: float = 0.0
-    body: float | None = None
-    whole: bool = False
-    noise: float | None = None
-    per_metre: float | None = None
-    jitter: float | None = None
-    effects: Sequence[str] = ()
-    separate: Sequence[str] = ()
-    approach: str = "none"
-    revisit: int = 0
+    criterion: str = option(
+        "I", "; ".join(f"{name}: {said}" for name, said in MEANINGS.items() if name != POWER) + "."
+    )
+    effects: Sequence[str] = option(
+        (),
+        "Fitted too, as with `calibrate --effects`; unknown until then.",
+        metavar="NAME:PLACE",
+        many=tuple,
+    )
+    separate: Sequence[str] = option(
+        (),
+        "Instead: poses that tell two effects apart, as joint_compliance:J2 link_bending:L2.",
+        metavar="EFFECT RIVAL",
+        values=2,
+    )
+    tracker: Sequence[float] = option(
+        (),
+        "Where it stands, in base axes, mm [default: 3 m before the arm].",
+        metavar="X,Y,Z",
+        read=partial(triple, flag="--tracker"),
+    )
+    targets: int = option(3, "Reflectors on a circle of 100 mm radius about the flange's axis.")
+    spots: Sequence[Sequence[float]] = option(
+        (),
+        "A reflector in the flange's frame, mm; once for each.",
+        flag="--target",
+        metavar="X,Y,Z",
+        read=partial(triple, flag="--target"),
+        many=tuple,
+    )
+    normals: str = option("flange", f"Where reflectors look: {' or '.join(NORMALS)}.")
+    acceptance: float = option(
+        np.radians(30.0), "Half angle of a reflector's cone; 180: seen from anywhere.", "deg"
+    )
+    whole: bool = option(False, "Only poses at which all are seen.", flag="--all-targets")
+    reach: tuple[float, float] = option((0.5, 50.0), "Of the tracker, m.", "m", flag="--range")
+    elevation: tuple[float, float] = option(
+        (np.radians(-50.0), np.radians(75.0)), "Of the tracker, deg.", "deg"
+    )
+    joints: Mapping[int, tuple[float, float]] = option(
+        dict,
+        "Narrow a joint's limits, deg (slides: mm).",
+        flag="--joint",
+        metavar="J2=LOW:HIGH",
+        read=str,  # their unit depends on the robot: see `limits_of`
+        many=tuple,
+    )
+    volume: Sequence[Sequence[float]] = option(
+        (),
+        "Box in base axes that the flange must stay in, mm.",
+        metavar="X0:X1,Y0:Y1,Z0:Z1",
+        read=box,
+    )
+    floor: float = option(0.0, "Height of the floor above the base's origin.", "mm")
+    body: float | None = option(
+        None, "Radius of the arm's links [default: 4 % of its reach].", "mm"
+    )
+    noise: float | None = option(
+        None, f"Of a coordinate [default: as the data show it, else {1e6 * USUAL.noise:g}].", "um"
+    )
+    per_metre: float | None = option(
+        None,
+        f"Its growth with range [default: {1e6 * USUAL.per_metre:g}].",
+        "um/m",
+        flag="--noise-per-metre",
+    )
+    jitter: float | None = option(
+        None,
+        f"Of a joint that stops [default: as the data show it, else {1e6 * USUAL.jitter:g}].",
+        "urad",
+    )
+    revisit: int = option(0, "Go back to so many of the poses.", metavar="K")
+    approach: str = option(
+        "none", f"{' or '.join(EFFORTS)}: come to a revisited pose from its other side."
+    )
+    candidates: int = option(2000)
+    seed: int = option(0, "Of candidates and starts.")
+
+
+def limits_of(texts: Sequence[str], robot: Robot) -> dict[int, tuple[float, float]]:
+    """Limits by joint index, from what --joint was given.  Raises OptionError."""
+    return dict(joint(text, robot) for text in texts)
+
+
+def joint(text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
+    """J2=LOW:HIGH in degrees, slides in millimetres.  Raises OptionError."""
+    match = JOINT.fullmatch(text)
+    if not match:
+        raise OptionError(f"--joint {text!r}: write J2=-30:60, in degrees (slides: mm)")
+    index = int(match[1]) - 1
+    if not 0 <= index < robot.joints:
+        raise OptionError(f"--joint {text!r}: {robot.name} has joints 1 to {robot.joints}")
+    scale = 1e-3 if robot.prismatic[index] else SI["deg"]
+    return index, pair(match[2], f"--joint {text.partition('=')[0]}", scale)
 
 
 def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:

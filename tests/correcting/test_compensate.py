@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.cli import main
-from minimax_cal.cli.compensate import ADDED, compensate_command, read_targets
+from minimax_cal.cli.compensate import compensate_command
 from minimax_cal.correcting.compensate import (
     FRAMES,
     arm_of,
@@ -21,6 +21,7 @@ from minimax_cal.correcting.compensate import (
     path_of,
 )
 from minimax_cal.correcting.reach import Outcome, Reach, examine, motion
+from minimax_cal.correcting.target_file import ADDED, read_targets
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate

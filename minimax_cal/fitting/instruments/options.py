@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.options import Options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import METHODS
@@ -22,32 +23,6 @@ Known = tuple[str, str, float]
 
 def silent(message: str) -> None:
     """Say nothing."""
-
-
-@dataclass(frozen=True)
-class RelativeOptions:
-    """How to calibrate.
-
-    holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
-    ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
-    distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
-    file's own.  method: of the least squares.  resolution: relative singular value that counts as
-    not measured.
-    """
-
-    holdout: float = 0.2
-    seed: int = 0
-    fix: Sequence[str] = ()
-    free: Sequence[str] = ()
-    offset: bool = False
-    known_distances: Sequence[Known] = ()
-    lever: float | None = None
-    method: str = "snllm"
-    resolution: float = RESOLUTION
-
-    def settings(self) -> dict[str, object]:
-        """For the record."""
-        return {**vars(self), "known_distances": [list(known) for known in self.known_distances]}
 
 
 def known_of(text: str) -> Known:
@@ -62,20 +37,58 @@ def known_of(text: str) -> Known:
     raise OptionError(f"--known-distance {text!r}: write two sockets and a length, as A,B,500.02")
 
 
+@dataclass(frozen=True)
+class RelativeOptions:
+    """How to calibrate.
+
+    holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
+    ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
+    distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
+    file's own.  method: of the least squares.  resolution: relative singular value that counts as
+    not measured.
+    """
+
+    holdout: float = Options.holdout
+    seed: int = Options.seed
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    offset: bool = option(False, "Lengths: fit a constant offset of each wire (weakly determined).")
+    known_distances: Sequence[Known] = option(
+        (),
+        "Closures: the distance between two sockets' centres; gives the scale.",
+        flag="--known-distance",
+        metavar="A,B,MM",
+        read=known_of,
+        many=tuple,
+    )
+    lever: float | None = option(
+        None,
+        "Poses: what a radian counts as, linear over angular noise [default: of the columns "
+        "u95_mm and rotation_u95_rad, else 100].",
+        "mm",
+    )
+    method: str = Options.method
+    resolution: float = Options.resolution
+
+    def settings(self) -> dict[str, object]:
+        """For the record."""
+        return {**vars(self), "known_distances": [list(known) for known in self.known_distances]}
+
+
 def check_options(data: RelativeData, options: RelativeOptions) -> None:
     """Raise OptionError for a choice that does not exist or does not suit the data."""
     if options.method not in METHODS:
         raise OptionError(f"no method {options.method!r}; choose {', '.join(METHODS)}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
-    for kind, option, chosen in (
+    for kind, flag, chosen in (
         ("distances", "--offset", options.offset),
         ("closures", "--known-distance", bool(options.known_distances)),
         ("poses", "--lever", options.lever is not None),
     ):
         if chosen and data.kind != kind:
             raise OptionError(
-                f"{option} is for {kind}; {data.at.source} holds {data.kind}: leave it out"
+                f"{flag} is for {kind}; {data.at.source} holds {data.kind}: leave it out"
             )
     for first, second, distance in options.known_distances:
         said = f"--known-distance {first},{second},{1e3 * distance:g}"
