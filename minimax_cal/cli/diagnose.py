@@ -16,7 +16,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.plots.figures import PICTURES
-from minimax_cal.reporting.tables import closing_tables, effects_list, effects_table, where_tables
+from minimax_cal.reporting.tables import effects_list, effects_table, where_tables
 
 
 @click.command(name="diagnose")
@@ -62,7 +62,7 @@ def diagnose_command(
         save_diagnosis(found, figure)
     if options.deliver(found.json() if output or as_json else "", output, as_json=as_json):
         options.terminal().print(found.headline() + "\n", markup=False)
-        options.show(*found.tables(), *where_tables(found.where), *closing_tables(found))
+        options.show(*found.tables(), *where_tables(found.where))
     return options.exit_code(found.status)
 
 

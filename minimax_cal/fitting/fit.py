@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -16,7 +16,7 @@ import numpy as np
 
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
+from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.suspects import Suspect, table_of
@@ -38,12 +38,18 @@ from minimax_cal.solvers.status import Status
 
 PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
 ACCURACIES = (  # where accuracy is told: title, key
-    ("training, nominal", "nominal_train"),
-    ("training, calibrated", "train"),
     ("held out, nominal", "nominal"),
     ("held out, calibrated", "holdout"),
+    ("training, nominal", "nominal_train"),
+    ("training, calibrated", "train"),
+)
+NO_INTERVALS = (UNKNOWN, UNKNOWN)
+BETWEEN = (
+    "; from, to: 95 % intervals of the RMS over such poses, of the largest error of as many new "
+    "ones"
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
+NOT_IDENTIFIED = "not identified because"
 MILLI = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}  # how people read a parameter
 
 
@@ -69,9 +75,19 @@ class Parameter:
         """Factor and unit in which people read it: millimetres, milliradians."""
         return MILLI.get(self.unit, (1.0, self.unit))
 
+    @property
+    def written(self) -> tuple[float, str]:
+        """Factor and unit in files: only lengths are scaled, to millimetres."""
+        return (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+
+    @property
+    def why_not(self) -> str:
+        """Why it was not identified, empty where it was."""
+        return "" if self.identifiable else self.reason or "no reason was recorded"
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
-        scale, unit = (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        scale, unit = self.written
         out = {
             "name": self.name,
             "value": self.value * scale,
@@ -160,6 +176,17 @@ class Parameters(Sequence[Parameter]):
         )  # fmt: skip
 
 
+def parameter_table(parameters: Iterable[Parameter]) -> Table:
+    """Parameters of geometry with nominal value, change and sigma, in mm and mrad."""
+    rows = tuple(
+        (p.name, p.scale[1], p.nominal * p.scale[0], p.value * p.scale[0],
+         (p.value - p.nominal) * p.scale[0], p.sigma * p.scale[0], p.why_not)
+        for p in parameters
+    )  # fmt: skip
+    header = ("name", "unit", "nominal", "calibrated", "change", "sigma", NOT_IDENTIFIED)
+    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".4f", ""))
+
+
 @dataclass(frozen=True)
 class Provenance:
     """Where a result came from, so that it can be had again."""
@@ -206,13 +233,14 @@ class WorstCase:
     trace: tuple[Step, ...]
 
     def table(self) -> Table:
-        """Errors, multipliers, activity."""
+        """Errors of targets or points, multipliers (they sum to one), activity."""
         rows = tuple(
             (name, float(size), float(mu), "yes" if name in self.active else "")
             for name, size, mu in zip(self.functions, self.size, self.multiplier, strict=True)
         )
-        header = ("target", "F_i mm^2", "multiplier", "active")
-        return Table("worst target on the training poses", header, rows, ("", ".4f", ".4f", ""))
+        header = ("error of", "F_i mm^2, of a point mm", "multiplier", "is the worst")
+        return Table("what the worst error on the training poses rests on", header, rows,
+                     ("", ".4f", ".4f", ""))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -357,59 +385,43 @@ class Fit:
         return self.cell.predict(q)
 
     def accuracy_table(self) -> Table:
-        """Accuracy before and after, on the training and on the held-out poses."""
-        rows: list[tuple[TableCell, ...]] = [
-            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
+        """Accuracy before and after, held out and training, with intervals where they are known."""
+        known = [self.intervals.get(key, NO_INTERVALS) for _, key in ACCURACIES]
+        told = [
+            any(math.isfinite(end) for pair in known for end in vars(pair[i]).values())
+            for i in range(2)
         ]
+        spread, tails = (
+            (f"{kind} from mm", f"{kind} to mm") if here else ()
+            for kind, here in zip(("RMS", "max"), told, strict=True)
+        )
+        rows: list[tuple[TableCell, ...]] = []
+        for (title, key), pair in zip(ACCURACIES, known, strict=True):
+            a = self.accuracy[key]
+            rms, largest = (
+                (1e3 * interval.low, 1e3 * interval.high) if here else ()
+                for interval, here in zip(pair, told, strict=True)
+            )
+            rows.append((title, a.poses, a.rms_mm, *rms, a.mean_mm, a.max_mm, *largest,
+                         *a.by_target()))  # fmt: skip
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
-        return Table(
-            f"{self.robot.name}: position accuracy, objective {self.objective}",
-            ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
-            tuple(rows),
-            ("", "d", *[".4f"] * (3 + len(targets))),
-        )
+        header = ("poses", "count", "RMS mm", *spread, "mean mm", "max mm", *tails, *targets)
+        title = f"{self.robot.name}: position accuracy, objective {self.objective}"
+        return Table(f"{title}{BETWEEN if any(told) else ''}", header, tuple(rows),
+                     ("", "d", *[".4f"] * (len(header) - 2)))  # fmt: skip
 
-    def interval_rows(self) -> Table:
-        """95 % intervals of the held-out accuracy; empty where the poses are too few."""
-        rows = tuple(
-            (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
-             1e3 * largest.high)
-            for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
-            for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
-            if math.isfinite(rms.low)
-        )  # fmt: skip
-        return Table(
-            "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
-            "many new ones",
-            ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
-            rows,
-            ("", *[".4f"] * 6),
-        )
+    def parameter_table(self) -> Table:
+        """Every parameter of geometry."""
+        return parameter_table(p for p in self.parameters if not p.of_effect)
 
-    def parameter_rows(self) -> Table:
-        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
+    def effect_table(self) -> Table:
+        """The parameters of effects beyond geometry, as in the files; empty without any."""
         rows = tuple(
-            (p.name, p.scale[1], p.nominal * p.scale[0], (p.value - p.nominal) * p.scale[0],
-             p.sigma * p.scale[0], "" if p.identifiable else p.reason or "not identifiable")
-            for p in self.parameters
-            if not p.of_effect
-        )  # fmt: skip
-        return Table(
-            "parameters",
-            ("name", "unit", "nominal", "change", "sigma", "not identified because"),
-            rows,
-            ("", "", ".4f", "+.4f", ".4f", ""),
-        )
-
-    def effect_rows(self) -> Table:
-        """The parameters of effects beyond geometry, SI; empty without any."""
-        rows = tuple(
-            (p.name, p.unit, p.value, p.sigma, "" if p.identifiable else p.reason)
+            (p.name, p.written[1], p.value * p.written[0], p.sigma * p.written[0], p.why_not)
             for p in self.parameters
             if p.of_effect
         )
-        header = ("effect", "unit", "value", "sigma", "not identified because")
+        header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
         return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
 
     def headline(self) -> str:
@@ -431,12 +443,12 @@ class Fit:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table(), self.interval_rows()]
+        every = [self.accuracy_table()]
         if self.minimax and self.objective != "point":
             every.append(self.minimax.table())
         if self.certificate:
             every.append(self.certificate.table())
-        every += [self.effect_rows(), table_of(self.suspects), self.parameter_rows()]
+        every += [self.effect_table(), table_of(self.suspects), self.parameter_table()]
         return tuple(table for table in every if table.rows)
 
     def summary(self, width: int = 110) -> str:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.suspects import table_of
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283 import iso9283
@@ -20,18 +21,11 @@ from minimax_cal.reporting.html.error_charts import (
     over_time,
 )
 from minimax_cal.reporting.html.fit_tables import (
-    accuracy_table,
     correlation_table,
     cost_table,
     distance_table,
-    effect_parameters,
     iteration_table,
-    kept_table,
-    multiplier_table,
-    parameter_table,
-    suspect_table,
 )
-from minimax_cal.reporting.html.gap_tables import ladder_table
 from minimax_cal.reporting.html.more_charts import correlation_map, iterations
 from minimax_cal.reporting.html.scene import workspace
 from minimax_cal.reporting.html.sources import Sources
@@ -63,15 +57,11 @@ def accuracy_section(sources: Sources) -> Section:
     """How large the errors are, before and after, held out beside training."""
     blocks: list[Block] = []
     if sources.fit:
-        blocks.append(accuracy_table(sources.fit))
-        told = any(math.isfinite(rms.low) for rms, _ in sources.fit.intervals.values())
-        blocks.append(
-            text("From, to: 95 % intervals of the RMS and of the largest error.")
-            if told
-            else missing("95 % intervals of these numbers are not in the file.")
-        )
+        blocks.append(sources.fit.accuracy_table())
+        if not any(math.isfinite(rms.low) for rms, _ in sources.fit.intervals.values()):
+            blocks.append(missing("95 % intervals of these numbers are not in the file."))
     elif sources.gap:
-        blocks.append(ladder_table(sources.gap))
+        blocks.append(sources.gap.ladder_table())
     blocks.append(
         text(
             "An error is the distance between a measured target and where the model puts it. "
@@ -112,7 +102,7 @@ def parameter_section(sources: Sources) -> Section:
     """What was identified, how surely, and what was not."""
     if not (fit := sources.fit):
         return Section("parameters", "Parameters", (missing(NO_FIT),))
-    blocks: list[Block] = [parameter_table(fit), *filled(effect_parameters(fit))]
+    blocks: list[Block] = [fit.parameter_table(), *filled(fit.effect_table())]
     blocks.append(
         text(
             "Lengths in mm, angles in mrad. Sigma is the standard deviation that measurement noise "
@@ -121,7 +111,7 @@ def parameter_section(sources: Sources) -> Section:
             f"{fit.identification.condition:.3g}."
         )
     )
-    return Section("parameters", "Parameters", (*blocks, *filled(kept_table(fit)), *why_not(fit)))
+    return Section("parameters", "Parameters", (*blocks, *why_not(fit)))
 
 
 def correlation_section(sources: Sources) -> Section:
@@ -156,7 +146,7 @@ def solution_section(sources: Sources) -> Section:
         blocks.append(iterations(fit))
     blocks += filled(cost_table(fit))
     if worst := fit.minimax:
-        blocks += filled(iteration_table(worst), multiplier_table(worst), distance_table(worst))
+        blocks += filled(iteration_table(worst), worst.table(), distance_table(worst))
         ends = ", ".join(f"{name} {value:.1e}" for name, value in vars(worst.kkt).items())
         blocks.append(text(f"Conditions of optimality (Karush-Kuhn-Tucker) at the end: {ends}."))
     else:
@@ -194,7 +184,7 @@ def iso_tables(fit: Fit) -> tuple[Table, ...]:
 def suspects_section(sources: Sources) -> Section:
     """Points that do not fit the others."""
     suspects = sources.fit.suspects if sources.fit else ()
-    table = suspect_table(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
+    table = table_of(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
     note = text("The files name no suspect points.")
     what = caveat(
         "A suspect may be a wrong point, or a real effect that the fit lacks: no row should be "

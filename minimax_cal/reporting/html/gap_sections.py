@@ -6,16 +6,9 @@ import math
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.reporting.html.content import Block, Section, missing, text
-from minimax_cal.reporting.html.gap_tables import (
-    effect_parameters,
-    effects_table,
-    ladder_table,
-    place_tables,
-    rival_table,
-    untestable_table,
-)
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
 from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting.tables import where_tables
 
 NO_GAP = (
     "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
@@ -28,7 +21,7 @@ def gap_section(sources: Sources) -> Section:
     """How far the gap closes, rung by rung."""
     blocks: tuple[Block, ...] = (missing(NO_GAP),)
     if gap := sources.gap:
-        blocks = (waterfall(gap), ladder_table(gap), text(closing(gap)))
+        blocks = (waterfall(gap), gap.ladder_table(), text(closing(gap)))
     return Section("gap", "The gap, step by step", blocks)
 
 
@@ -56,11 +49,11 @@ def causes_section(sources: Sources) -> Section:
         return Section("causes", title, (missing(NO_GAP),))
     blocks: list[Block] = []
     if gap.findings:
-        blocks += [effects_table(gap), effect_parameters(gap)]
+        blocks += [gap.effects_table(), gap.parameter_table()]
     else:
         blocks.append(text("No effect beyond geometry was found."))
     blocks += [curve_chart(k, gap.curves[k], gap.held) for k in CURVES if k in gap.curves]
-    rivals = rival_table(gap)
+    rivals = gap.rival_table()
     if rivals.rows:
         blocks.append(rivals)
         blocks.append(
@@ -82,7 +75,7 @@ def untestable_section(sources: Sources) -> Section:
     """What is neither found nor excluded."""
     block: Block = missing(NO_GAP)
     if gap := sources.gap:
-        block = untestable_table(gap)
+        block = gap.untestable_table()
         if not block.rows:
             block = text("Every effect of the library could be tested with these data.")
     return Section("untestable", "What could not be tested", (block,))
@@ -94,7 +87,7 @@ def where_section(sources: Sources) -> Section:
     if not (sources.gap and sources.gap.where):
         return Section("where", title, (missing(NO_GAP),))
     where = sources.gap.where
-    blocks: list[Block] = [*place_tables(where)]
+    blocks: list[Block] = [*where_tables(where)]
     if worst := where["by_region"]["worst"]:
         blocks.append(text(f"Worst region: {worst}."))
     return Section("where", title, tuple(blocks))
