@@ -317,10 +317,17 @@ class Diagnosis:
             (f.term.effect, f.place, f.cause, 100.0 * f.share + 0.0, f.before, f.after, f.chance)
             for f in self.findings
         )
-        header = ("effect", "place", "cause", "share of gap %", "held-out RMS before mm",
-                  "after mm", "by chance")  # fmt: skip
-        return Table("effects found, the largest first", header, rows,
-                     ("", "", "", ".0f", ".4f", ".4f", ""))  # fmt: skip
+        header = (
+            "effect",
+            "place",
+            "cause",
+            "share of gap %",
+            "before mm",
+            "after mm",
+            "by chance",
+        )
+        return Table("effects found, the largest first; held-out RMS before and after", header,
+                     rows, ("", "", "", ".0f", ".4f", ".4f", ""))  # fmt: skip
 
     def parameter_table(self) -> Table:
         """The parameters of every effect found."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval
+from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.suspects import Suspect, table_of
@@ -42,11 +42,6 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("held out, calibrated", "holdout"),
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
-)
-NO_INTERVALS = (UNKNOWN, UNKNOWN)
-BETWEEN = (
-    "; from, to: 95 % intervals of the RMS over such poses, of the largest error of as many new "
-    "ones"
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 NOT_IDENTIFIED = "not identified because"
@@ -385,30 +380,35 @@ class Fit:
         return self.cell.predict(q)
 
     def accuracy_table(self) -> Table:
-        """Accuracy before and after, held out and training, with intervals where they are known."""
-        known = [self.intervals.get(key, NO_INTERVALS) for _, key in ACCURACIES]
-        told = [
-            any(math.isfinite(end) for pair in known for end in vars(pair[i]).values())
-            for i in range(2)
+        """Accuracy before and after, on the held-out and on the training poses."""
+        rows: list[tuple[TableCell, ...]] = [
+            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
+            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
         ]
-        spread, tails = (
-            (f"{kind} from mm", f"{kind} to mm") if here else ()
-            for kind, here in zip(("RMS", "max"), told, strict=True)
-        )
-        rows: list[tuple[TableCell, ...]] = []
-        for (title, key), pair in zip(ACCURACIES, known, strict=True):
-            a = self.accuracy[key]
-            rms, largest = (
-                (1e3 * interval.low, 1e3 * interval.high) if here else ()
-                for interval, here in zip(pair, told, strict=True)
-            )
-            rows.append((title, a.poses, a.rms_mm, *rms, a.mean_mm, a.max_mm, *largest,
-                         *a.by_target()))  # fmt: skip
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
-        header = ("poses", "count", "RMS mm", *spread, "mean mm", "max mm", *tails, *targets)
-        title = f"{self.robot.name}: position accuracy, objective {self.objective}"
-        return Table(f"{title}{BETWEEN if any(told) else ''}", header, tuple(rows),
-                     ("", "d", *[".4f"] * (len(header) - 2)))  # fmt: skip
+        return Table(
+            f"{self.robot.name}: position accuracy, objective {self.objective}",
+            ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
+            tuple(rows),
+            ("", "d", *[".4f"] * (3 + len(targets))),
+        )
+
+    def interval_table(self) -> Table:
+        """95 % intervals of the held-out accuracy; empty where the poses are too few."""
+        rows = tuple(
+            (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
+             1e3 * largest.high)
+            for title, key in (("nominal", "nominal"), ("calibrated", "holdout"))
+            for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
+            if math.isfinite(rms.low)
+        )  # fmt: skip
+        return Table(
+            "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
+            "many new ones",
+            ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
+            rows,
+            ("", *[".4f"] * 6),
+        )
 
     def parameter_table(self) -> Table:
         """Every parameter of geometry."""
@@ -443,7 +443,7 @@ class Fit:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table()]
+        every = [self.accuracy_table(), self.interval_table()]
         if self.minimax and self.objective != "point":
             every.append(self.minimax.table())
         if self.certificate:

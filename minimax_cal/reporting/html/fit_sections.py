@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
@@ -58,8 +56,8 @@ def accuracy_section(sources: Sources) -> Section:
     blocks: list[Block] = []
     if sources.fit:
         blocks.append(sources.fit.accuracy_table())
-        if not any(math.isfinite(rms.low) for rms, _ in sources.fit.intervals.values()):
-            blocks.append(missing("95 % intervals of these numbers are not in the file."))
+        unknown = missing("95 % intervals of these numbers are not in the file.")
+        blocks += filled(sources.fit.interval_table()) or (unknown,)
     elif sources.gap:
         blocks.append(sources.gap.ladder_table())
     blocks.append(
