@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from importlib.metadata import version
@@ -56,8 +56,8 @@ class Parameter:
     value: float
     nominal: float
     sigma: float
-    unit: str
-    identifiable: bool
+    unit: str = ""
+    identifiable: bool = True
     reason: str = ""
 
     @property
@@ -186,11 +186,11 @@ def parameter_table(parameters: Iterable[Parameter]) -> Table:
 class Provenance:
     """Where a result came from, so that it can be had again."""
 
-    robot: str
-    data: str
-    data_sha256: str
-    settings: Mapping[str, object]
-    versions: Mapping[str, str]
+    robot: str = ""
+    data: str = ""
+    data_sha256: str = ""
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
