@@ -9,7 +9,7 @@ from minimax_cal.fitting.suspects import table_of
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283 import iso9283
-from minimax_cal.reporting.html.content import Block, Section, caveat, missing, text
+from minimax_cal.reporting.html.content import Block, Blocks, caveat, missing, text
 from minimax_cal.reporting.html.error_charts import (
     Names,
     against_joints,
@@ -31,10 +31,6 @@ from minimax_cal.reporting.html.verdict import why_not
 
 SAME = 1e-6  # a file's own errors come back to this, or its effects need other columns [m]
 MOST_SUSPECTS = 50
-NO_FIT = (
-    "Not in this report: it was made without a calibration; give the file of `minimax-cal "
-    "calibrate -o` as well."
-)
 NO_POSES = (
     "The file holds no poses, so that nothing can be drawn; write it again with this version of "
     "minimax-cal."
@@ -51,7 +47,7 @@ def names_of(sources: Sources) -> Names:
     return ("nominal", "calibrated") if sources.fit else ("geometry alone", "with effects")
 
 
-def accuracy_section(sources: Sources) -> Section:
+def accuracy(sources: Sources) -> Blocks:
     """How large the errors are, before and after, held out beside training."""
     blocks: list[Block] = []
     if sources.fit:
@@ -72,34 +68,30 @@ def accuracy_section(sources: Sources) -> Section:
         blocks += [histogram(poses, names), cumulative(poses, names), boxes(poses, names)]
     else:
         blocks.append(missing(NO_POSES))
-    return Section("accuracy", "Accuracy", tuple(blocks))
+    return blocks
 
 
-def workspace_section(sources: Sources) -> Section:
+def errors_in_space(sources: Sources) -> Blocks:
     """Where in space the errors are."""
-    block: Block = missing(NO_POSES)
     if sources.poses and sources.cell:
-        block = workspace(sources.poses, sources.cell, names_of(sources))
-    return Section("workspace", "The errors in the workspace", (block,))
+        return [workspace(sources.poses, sources.cell, names_of(sources))]
+    return [missing(NO_POSES)]
 
 
-def joints_section(sources: Sources) -> Section:
+def joints(sources: Sources) -> Blocks:
     """What the errors go with."""
-    title, poses = "What the errors go with", sources.poses
-    if not poses:
-        return Section("joints", title, (missing(NO_POSES),))
+    if not (poses := sources.poses):
+        return [missing(NO_POSES)]
     names = names_of(sources)
     blocks: list[Block] = [against_joints(poses, names), *over_time(poses, names)]
     lacking = [name for name in ("time", "temperature") if name not in poses.data.columns]
     if lacking:
         blocks.append(missing(f"The measurements tell no {' and no '.join(lacking)}."))
-    return Section("joints", title, tuple(blocks))
+    return blocks
 
 
-def parameter_section(sources: Sources) -> Section:
+def parameters(fit: Fit) -> Blocks:
     """What was identified, how surely, and what was not."""
-    if not (fit := sources.fit):
-        return Section("parameters", "Parameters", (missing(NO_FIT),))
     blocks: list[Block] = [fit.parameter_table(), *filled(fit.effect_table())]
     blocks.append(
         text(
@@ -109,30 +101,23 @@ def parameter_section(sources: Sources) -> Section:
             f"{fit.identification.condition:.3g}."
         )
     )
-    return Section("parameters", "Parameters", (*blocks, *why_not(fit)))
+    return [*blocks, *why_not(fit)]
 
 
-def correlation_section(sources: Sources) -> Section:
+def correlated(fit: Fit) -> Blocks:
     """How the uncertainties hang together."""
-    title = "How the parameters hang together"
-    if not (fit := sources.fit):
-        return Section("correlations", title, (missing(NO_FIT),))
     if fit.uncertainty is None or not fit.uncertainty.active.any():
-        note = missing("The file holds no covariance of the parameters.")
-        return Section("correlations", title, (note,))
+        return [missing("The file holds no covariance of the parameters.")]
     note = text(
         "A correlation near 1 or -1 says that these poses tell the two parameters apart badly: "
         "each alone is uncertain, what they do together is not."
     )
     table = filled(correlation_table(fit.uncertainty))
-    return Section("correlations", title, (correlation_map(fit.uncertainty), *table, note))
+    return [correlation_map(fit.uncertainty), *table, note]
 
 
-def solution_section(sources: Sources) -> Section:
+def solution(fit: Fit) -> Blocks:
     """How the numbers came about."""
-    title = "How the fit was found"
-    if not (fit := sources.fit):
-        return Section("solution", title, (missing(NO_FIT),))
     blocks: list[Block] = [
         text(
             f"Objective {fit.objective}, QP backend {fit.qp or 'none'}: "
@@ -149,14 +134,11 @@ def solution_section(sources: Sources) -> Section:
         blocks.append(text(f"Conditions of optimality (Karush-Kuhn-Tucker) at the end: {ends}."))
     else:
         blocks.append(missing("This fit took no minimax steps: least squares alone."))
-    return Section("solution", title, tuple(blocks))
+    return blocks
 
 
-def iso_section(sources: Sources) -> Section:
+def iso_values(fit: Fit) -> Blocks:
     """Values by the formulas of ISO 9283."""
-    title = "Values by the formulas of ISO 9283"
-    if not (fit := sources.fit):
-        return Section("iso9283", title, (missing(NO_FIT),))
     caution = caveat(
         "These are values by the standard's formulas from calibration data, not a test by the "
         "standard: the last table says which of its conditions the data do not meet."
@@ -164,8 +146,8 @@ def iso_section(sources: Sources) -> Section:
     try:
         tables = iso_tables(fit)
     except CalibrationError as error:
-        return Section("iso9283", title, (missing(f"Not available: {error}."),))
-    return Section("iso9283", title, (caution, *tables) if tables else (missing(NO_POSES),))
+        return [missing(f"Not available: {error}.")]
+    return [caution, *tables] if tables else [missing(NO_POSES)]
 
 
 def iso_tables(fit: Fit) -> tuple[Table, ...]:
@@ -179,7 +161,7 @@ def iso_tables(fit: Fit) -> tuple[Table, ...]:
     return iso9283({"nominal": fit.nominal, "calibrated": fit.cell}, fit.data, fit.held).tables()
 
 
-def suspects_section(sources: Sources) -> Section:
+def suspect_points(sources: Sources) -> Blocks:
     """Points that do not fit the others."""
     suspects = sources.fit.suspects if sources.fit else ()
     table = table_of(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
@@ -188,4 +170,4 @@ def suspects_section(sources: Sources) -> Section:
         "A suspect may be a wrong point, or a real effect that the fit lacks: no row should be "
         "deleted before the diagnosis has been read."
     )
-    return Section("suspects", "Suspect points", (table, what) if table.rows else (note,))
+    return [table, what] if table.rows else [note]
