@@ -27,7 +27,7 @@ from minimax_cal.ground.options import Option
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
-from minimax_cal.reporting.tables import closing_tables, effects_list, effects_table, where_tables
+from minimax_cal.reporting.tables import effects_list, effects_table, where_tables
 
 
 @click.command(name="diagnose")
@@ -52,7 +52,7 @@ def diagnose_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
     to.draw(save_diagnosis, found)
     if to.deliver(found.json):
         options.terminal().print(found.headline() + "\n", markup=False)
-        options.show(*found.tables(), *where_tables(found.where), *closing_tables(found))
+        options.show(*found.tables(), *where_tables(found.where))
     return options.exit_code(found.status)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,7 +13,7 @@ from typing import Any
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.files import finite, json_text, number, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
@@ -20,11 +21,17 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
 from minimax_cal.modelling.cell import Cell, saved_content
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
-SHOWN = 4  # parameters of an effect in a table
+SURE = 1e-15  # a smaller chance is as good as none
+SHOWN_LINES = 12  # lines of a fault that are told one by one
+FAULTS = {
+    "outliers": "single points that are off",
+    "swapped_rows": "rows or targets that hold each other's points",
+    "readback": "joint values that were read back before the arm had settled",
+}
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -78,6 +85,37 @@ class Finding:
     def term(self) -> Term:
         """The effect and its place; of several lines the strongest."""
         return self.terms[0]
+
+    @property
+    def cause(self) -> str:
+        """What it is, in a few words."""
+        name = self.term.effect
+        return EFFECTS[name].cause if name in EFFECTS else FAULTS.get(name, name)
+
+    @property
+    def at(self) -> str:
+        """Where, in words."""
+        place = self.term.place
+        if place == "all":
+            return "of the whole arm"
+        return {"J": f"at joint {place[1:]}", "L": f"at link {place[1:]}"}.get(
+            place[0] if place[1:].isdigit() else "", f"at {place}"
+        )
+
+    @property
+    def place(self) -> str:
+        """Where, and the lines of the file that a fault of the data concerns."""
+        if not self.rows:
+            return self.at
+        more = len(self.rows) - SHOWN_LINES
+        named = ", ".join(map(str, self.rows[:SHOWN_LINES]))
+        return f"{self.at} (line {named}{f' and {more} more' if more > 0 else ''})"
+
+    @property
+    def chance(self) -> str:
+        """Its probability by accident, which may be too small to matter how small."""
+        p = self.p_value
+        return "-" if math.isnan(p) else f"< {SURE:g}" if p < SURE else f"{p:.1g}"
 
     def parameters(self) -> list[dict[str, Any]]:
         """Each with value, sigma and unit, for JSON: lengths in millimetres."""
@@ -276,31 +314,55 @@ class Diagnosis:
         )
 
     def effects_table(self) -> Table:
-        """The effects found, with their parameters and rivals."""
-        rows: list[tuple[TableCell, ...]] = []
-        for finding in self.findings:
-            others = ", ".join(f"{a.effect} {a.place}" for a in finding.alternatives)
-            each = [
-                f"{name} = {value:.3g}"
-                + (f" ± {sigma:.1g} {unit}" if sigma == sigma else f" {unit}")
-                for name, value, sigma, unit in zip(
-                    finding.names, finding.values, finding.sigmas, finding.units, strict=True
-                )
-            ]
-            more = [f"and {len(each) - SHOWN} more"] if len(each) > SHOWN else []
-            values = ", ".join([*each[:SHOWN], *more])
-            rows.append((finding.term.effect, finding.term.place, 100.0 * finding.share + 0.0,
-                         values, others))  # fmt: skip
-        return Table(
-            "effects found",
-            ("effect", "place", "share of gap %", "parameters", "these data cannot tell it from"),
-            tuple(rows),
-            ("", "", ".0f", "", ""),
+        """The effects found, with what each does for held-out poses."""
+        rows = tuple(
+            (f.term.effect, f.place, f.cause, 100.0 * f.share + 0.0, f.before, f.after, f.chance)
+            for f in self.findings
         )
+        header = (
+            "effect",
+            "place",
+            "cause",
+            "share of gap %",
+            "before mm",
+            "after mm",
+            "by chance",
+        )
+        return Table("effects found, the largest first; held-out RMS before and after", header,
+                     rows, ("", "", "", ".0f", ".4f", ".4f", ""))  # fmt: skip
+
+    def parameter_table(self) -> Table:
+        """The parameters of every effect found."""
+        rows = tuple(
+            (f.term.effect, f.term.place, p["name"], p["value"], number(p["sigma"]), p["unit"])
+            for f in self.findings
+            for p in f.parameters()
+        )
+        header = ("effect", "place", "parameter", "value", "sigma", "unit")
+        return Table("parameters of the effects", header, rows, ("", "", "", ".4g", ".2g", ""))
+
+    def rival_table(self) -> Table:
+        """What these data cannot tell from the effects found, and what would tell them apart."""
+        rows = tuple(
+            (f"{f.term.effect} {f.term.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
+             a.separate_with or "no measurement considered would")
+            for f in self.findings
+            for a in f.alternatives
+        )  # fmt: skip
+        header = ("named", "or rather", "likeness", "power", "fits worse by",
+                  "what to measure next")  # fmt: skip
+        return Table("rivals that these data do not rule out", header, rows,
+                     ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
+
+    def untestable_table(self) -> Table:
+        """Effects that are neither found nor excluded."""
+        return Table("not testable with these data", ("effect", "needs"), self.not_testable)
 
     def tables(self) -> tuple[Table, ...]:
-        """Every table of the result."""
-        return (self.ladder_table(), *((self.effects_table(),) if self.findings else ()))
+        """Every table of the result, but for those of where the errors lie."""
+        every = (self.ladder_table(), self.effects_table(), self.parameter_table(),
+                 self.rival_table(), self.untestable_table())  # fmt: skip
+        return tuple(table for table in every if table.rows)
 
     def headline(self) -> str:
         """The verdict in words."""

@@ -10,26 +10,16 @@ from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
-from minimax_cal.fitting.fit_file import ParameterPart, ProvenancePart, ScoresPart, measured_poses
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.fit_file import ScoresPart, TableParameter, in_si, measured_poses
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import numbers
-from minimax_cal.ground.records import AGAIN, UNKNOWN, Ends, Number, Part, checked
+from minimax_cal.ground.records import AGAIN, UNKNOWN, Ends, Number, Part, Recorded, checked
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
-
-
-class AlternativePart(Part):
-    """An effect that the data cannot tell from the one named."""
-
-    effect: str
-    place: str
-    rho2: Number = math.nan
-    power: Number = math.nan
-    loss: Number = math.nan
-    separate_with: str = ""
 
 
 class FallPart(Part):
@@ -47,29 +37,25 @@ class FindingPart(Part):
     share: Number = math.nan
     size: Number = Field(alias="lambda", default=math.nan)
     chance: Number = math.nan
-    parameters: tuple[ParameterPart, ...] = ()
+    parameters: tuple[TableParameter, ...] = ()
     fixed: dict[str, Number] = Field(default_factory=dict)
     holdout_rms_mm: FallPart = FallPart()
-    alternatives: tuple[AlternativePart, ...] = ()
+    alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
         own = [t for t in known if (t.effect, t.place) == (self.effect, self.place)]
-        scale = [1e-3 if p.unit == "mm" else 1.0 for p in self.parameters]
+        told = [in_si(p) for p in self.parameters]
         return Finding(
             terms=tuple(own) or (Term(self.effect, self.place),),
-            names=tuple(p.name for p in self.parameters),
-            units=tuple("m" if p.unit == "mm" else p.unit for p in self.parameters),
-            values=tuple(
-                p.value * factor for p, factor in zip(self.parameters, scale, strict=True)
-            ),
-            sigmas=tuple(
-                p.sigma * factor for p, factor in zip(self.parameters, scale, strict=True)
-            ),
+            names=tuple(p.name for p in told),
+            units=tuple(p.unit for p in told),
+            values=tuple(p.value for p in told),
+            sigmas=tuple(p.sigma for p in told),
             size=self.size,
             p_value=self.chance,
-            alternatives=tuple(Alternative(**dict(other)) for other in self.alternatives),
+            alternatives=self.alternatives,
             share=self.share,
             before=self.holdout_rms_mm.before,
             after=self.holdout_rms_mm.after,
@@ -159,7 +145,7 @@ class DiagnosisPart(Part):
     curves: dict[str, CurvePart] = Field(default_factory=dict)
     notices: tuple[str, ...] = ()
     seconds: Number = math.nan
-    provenance: ProvenancePart
+    provenance: Provenance
 
 
 def read(content: Mapping[str, Any], source: str) -> Diagnosis:
@@ -207,7 +193,7 @@ def assembled(
         where=part.where,
         not_testable=tuple((each.effect, each.needs) for each in part.not_testable),
         notices=part.notices,
-        provenance=part.provenance.provenance(),
+        provenance=part.provenance,
         seconds=part.seconds,
         data=data,
         held=held,

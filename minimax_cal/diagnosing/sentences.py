@@ -7,27 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.result import Finding, Step
-from minimax_cal.modelling.effects.table import EFFECTS
-
-FAULTS = {
-    "outliers": "single points that are off",
-    "swapped_rows": "rows or targets that hold each other's points",
-    "readback": "joint values that were read back before the arm had settled",
-}
-
-
-def cause(effect: str) -> str:
-    """What an effect is, in a few words."""
-    return EFFECTS[effect].cause if effect in EFFECTS else FAULTS.get(effect, effect)
-
-
-def at(place: str) -> str:
-    """Where, in words."""
-    if place == "all":
-        return "of the whole arm"
-    return {"J": f"at joint {place[1:]}", "L": f"at link {place[1:]}"}.get(
-        place[0] if place[1:].isdigit() else "", f"at {place}"
-    )
 
 
 def opening(ladder: Sequence[Step], floor: float) -> str:
@@ -47,9 +26,9 @@ def named(finding: Finding) -> str:
         share = amounts.get("explained", float("nan"))
         seen = f"; {100.0 * share:.0f} % of the rest lies along the last moves"
         seen = seen if np.isfinite(share) else ""
-        return f"{finding.term.effect}: {cause(finding.term.effect)}{seen}."
+        return f"{finding.term.effect}: {finding.cause}{seen}."
     text = (
-        f"{finding.term.effect} {at(finding.term.place)} ({cause(finding.term.effect)}) takes the "
+        f"{finding.term.effect} {finding.at} ({finding.cause}) takes the "
         f"error from {finding.before:.3f} to {finding.after:.3f} mm"
     )
     if finding.alternatives:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from importlib.metadata import version
@@ -38,12 +38,13 @@ from minimax_cal.solvers.status import Status
 
 PACKAGES = ("minimax-cal", "numpy", "scipy", "qpsolvers")
 ACCURACIES = (  # where accuracy is told: title, key
-    ("training, nominal", "nominal_train"),
-    ("training, calibrated", "train"),
     ("held out, nominal", "nominal"),
     ("held out, calibrated", "holdout"),
+    ("training, nominal", "nominal_train"),
+    ("training, calibrated", "train"),
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
+NOT_IDENTIFIED = "not identified because"
 MILLI = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}  # how people read a parameter
 
 
@@ -55,8 +56,8 @@ class Parameter:
     value: float
     nominal: float
     sigma: float
-    unit: str
-    identifiable: bool
+    unit: str = ""
+    identifiable: bool = True
     reason: str = ""
 
     @property
@@ -69,9 +70,19 @@ class Parameter:
         """Factor and unit in which people read it: millimetres, milliradians."""
         return MILLI.get(self.unit, (1.0, self.unit))
 
+    @property
+    def written(self) -> tuple[float, str]:
+        """Factor and unit in files: only lengths are scaled, to millimetres."""
+        return (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+
+    @property
+    def why_not(self) -> str:
+        """Why it was not identified, empty where it was."""
+        return "" if self.identifiable else self.reason or "no reason was recorded"
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
-        scale, unit = (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        scale, unit = self.written
         out = {
             "name": self.name,
             "value": self.value * scale,
@@ -160,15 +171,26 @@ class Parameters(Sequence[Parameter]):
         )  # fmt: skip
 
 
+def parameter_table(parameters: Iterable[Parameter]) -> Table:
+    """Parameters of geometry with nominal value, change and sigma, in mm and mrad."""
+    rows = tuple(
+        (p.name, p.scale[1], p.nominal * p.scale[0], p.value * p.scale[0],
+         (p.value - p.nominal) * p.scale[0], p.sigma * p.scale[0], p.why_not)
+        for p in parameters
+    )  # fmt: skip
+    header = ("name", "unit", "nominal", "calibrated", "change", "sigma", NOT_IDENTIFIED)
+    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".4f", ""))
+
+
 @dataclass(frozen=True)
 class Provenance:
     """Where a result came from, so that it can be had again."""
 
-    robot: str
-    data: str
-    data_sha256: str
-    settings: Mapping[str, object]
-    versions: Mapping[str, str]
+    robot: str = ""
+    data: str = ""
+    data_sha256: str = ""
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
@@ -206,13 +228,14 @@ class WorstCase:
     trace: tuple[Step, ...]
 
     def table(self) -> Table:
-        """Errors, multipliers, activity."""
+        """Errors of targets or points, multipliers (they sum to one), activity."""
         rows = tuple(
             (name, float(size), float(mu), "yes" if name in self.active else "")
             for name, size, mu in zip(self.functions, self.size, self.multiplier, strict=True)
         )
-        header = ("target", "F_i mm^2", "multiplier", "active")
-        return Table("worst target on the training poses", header, rows, ("", ".4f", ".4f", ""))
+        header = ("error of", "F_i mm^2, of a point mm", "multiplier", "is the worst")
+        return Table("what the worst error on the training poses rests on", header, rows,
+                     ("", ".4f", ".4f", ""))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -361,7 +384,7 @@ class Fit:
         return self.cell.predict(q)
 
     def accuracy_table(self) -> Table:
-        """Accuracy before and after, on the training and on the held-out poses."""
+        """Accuracy before and after, on the held-out and on the training poses."""
         rows: list[tuple[TableCell, ...]] = [
             (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
             for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
@@ -374,7 +397,7 @@ class Fit:
             ("", "d", *[".4f"] * (3 + len(targets))),
         )
 
-    def interval_rows(self) -> Table:
+    def interval_table(self) -> Table:
         """95 % intervals of the held-out accuracy; empty where the poses are too few."""
         rows = tuple(
             (title, a.rms_mm, 1e3 * rms.low, 1e3 * rms.high, a.max_mm, 1e3 * largest.low,
@@ -391,29 +414,18 @@ class Fit:
             ("", *[".4f"] * 6),
         )
 
-    def parameter_rows(self) -> Table:
-        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
-        rows = tuple(
-            (p.name, p.scale[1], p.nominal * p.scale[0], (p.value - p.nominal) * p.scale[0],
-             p.sigma * p.scale[0], "" if p.identifiable else p.reason or "not identifiable")
-            for p in self.parameters
-            if not p.of_effect
-        )  # fmt: skip
-        return Table(
-            "parameters",
-            ("name", "unit", "nominal", "change", "sigma", "not identified because"),
-            rows,
-            ("", "", ".4f", "+.4f", ".4f", ""),
-        )
+    def parameter_table(self) -> Table:
+        """Every parameter of geometry."""
+        return parameter_table(p for p in self.parameters if not p.of_effect)
 
-    def effect_rows(self) -> Table:
-        """The parameters of effects beyond geometry, SI; empty without any."""
+    def effect_table(self) -> Table:
+        """The parameters of effects beyond geometry, as in the files; empty without any."""
         rows = tuple(
-            (p.name, p.unit, p.value, p.sigma, "" if p.identifiable else p.reason)
+            (p.name, p.written[1], p.value * p.written[0], p.sigma * p.written[0], p.why_not)
             for p in self.parameters
             if p.of_effect
         )
-        header = ("effect", "unit", "value", "sigma", "not identified because")
+        header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
         return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
 
     def headline(self) -> str:
@@ -435,12 +447,12 @@ class Fit:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table(), self.interval_rows()]
+        every = [self.accuracy_table(), self.interval_table()]
         if self.minimax and self.objective != "point":
             every.append(self.minimax.table())
         if self.certificate:
             every.append(self.certificate.table())
-        every += [self.effect_rows(), table_of(self.suspects), self.parameter_rows()]
+        every += [self.effect_table(), table_of(self.suspects), self.parameter_table()]
         return tuple(table for table in every if table.rows)
 
     def summary(self, width: int = 110) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -30,9 +30,11 @@ from minimax_cal.ground.records import (
     UNKNOWN,
     Count,
     Ends,
+    Gaps,
     Number,
     Packed,
     Part,
+    Recorded,
     Square,
     checked,
     packed,
@@ -50,6 +52,7 @@ from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
+NO_KKT = Kkt(math.nan, math.nan, math.nan)
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
 
@@ -84,35 +87,7 @@ class AccuraciesPart(Part):
     nominal_train: ScoresPart
 
 
-class ParameterPart(Part):
-    """A parameter in its unit (mm, rad, or that of an effect)."""
-
-    name: str
-    unit: str = ""
-    value: Number
-    nominal: Number = math.nan
-    sigma: Number = math.nan
-    identifiable: bool = True
-    reason: str = ""
-
-
-class KktPart(Part):
-    """Residuals of the optimality conditions."""
-
-    stationarity: Number = math.nan
-    complementarity: Number = math.nan
-    violation: Number = math.nan
-
-
-class StepPart(Part):
-    """One step of the minimax; backend: the QP solver that answered."""
-
-    iteration: int
-    value: Number = math.nan
-    violation: Number = math.nan
-    kkt: Number = math.nan
-    length: Number = math.nan
-    backend: str = ""
+TableParameter = Annotated[Parameter, Gaps(required=("value",))]  # in its unit: mm, rad, ...
 
 
 class DistancePart(Part):
@@ -132,9 +107,9 @@ class MinimaxPart(Part):
     multipliers: tuple[Number, ...] = ()
     active: tuple[str, ...] = ()
     distances: tuple[DistancePart, ...] = ()
-    kkt: KktPart = KktPart()
+    kkt: Recorded[Kkt] = NO_KKT
     iterations: int = 0
-    trace: tuple[StepPart, ...] = ()
+    trace: tuple[Recorded[Step], ...] = ()
 
 
 class PointPart(Part):
@@ -151,7 +126,7 @@ class CertificatePart(Part):
 
     value_mm: Number
     bound_mm: Number
-    kkt: KktPart = KktPart()
+    kkt: Recorded[Kkt] = NO_KKT
     points: tuple[PointPart, ...] = ()
 
 
@@ -166,20 +141,6 @@ class SuspectPart(Part):
     together: bool = False
 
 
-class ProvenancePart(Part):
-    """Where a result came from."""
-
-    robot: str = ""
-    data: str = ""
-    data_sha256: str = ""
-    settings: dict[str, Any] = Field(default_factory=dict)
-    versions: dict[str, str] = Field(default_factory=dict)
-
-    def provenance(self) -> Provenance:
-        """As the code has it."""
-        return Provenance(self.robot, self.data, self.data_sha256, self.settings, self.versions)
-
-
 class FitPart(Part):
     """The file of `minimax-cal calibrate -o`."""
 
@@ -188,7 +149,7 @@ class FitPart(Part):
     status: Status
     iterations: int = 0
     seconds: Number = math.nan
-    parameters: tuple[ParameterPart, ...]
+    parameters: tuple[TableParameter, ...]
     accuracy: AccuraciesPart
     condition: Number = math.nan
     trace_mm2: tuple[Number, ...] = ()
@@ -198,7 +159,7 @@ class FitPart(Part):
     notices: tuple[str, ...] = ()
     loss: str = "square"
     widening: float = 1.0
-    provenance: ProvenancePart
+    provenance: Provenance
     arrays: dict[str, Packed] = Field(default_factory=dict)
 
 
@@ -382,7 +343,7 @@ def assembled(
         share=arrays.get("share", np.ones(k)),
         prior=arrays.get("prior", np.zeros(names.count)),
         widening=part.widening,
-        provenance=part.provenance.provenance(),
+        provenance=part.provenance,
         stated=intervals_of(part, arrays),
     )
 
@@ -509,26 +470,23 @@ def exactly(read: Array, exact: Array | None) -> Array:
     return np.where(same, exact, read)
 
 
+def in_si(p: Parameter) -> Parameter:
+    """A parameter of a file, its millimetres as metres."""
+    if p.unit != "mm":
+        return p
+    return replace(
+        p, value=1e-3 * p.value, nominal=1e-3 * p.nominal, sigma=1e-3 * p.sigma, unit="m"
+    )
+
+
 def parameters_of(part: FitPart, arrays: Mapping[str, Array]) -> tuple[Parameter, ...]:
     """The parameters in SI."""
-    every = part.parameters
-    scale = np.array([1e-3 if p.unit == "mm" else 1.0 for p in every])
+    every, keys = [in_si(p) for p in part.parameters], ("value", "nominal", "sigma")
     read = {
-        key: exactly(scale * np.array([getattr(p, key) for p in every]), arrays.get(key))
-        for key in ("value", "nominal", "sigma")
+        key: exactly(np.array([getattr(p, key) for p in every]), arrays.get(key)).tolist()
+        for key in keys
     }
-    return tuple(
-        Parameter(
-            name=p.name,
-            value=float(read["value"][i]),
-            nominal=float(read["nominal"][i]),
-            sigma=float(read["sigma"][i]),
-            unit="m" if p.unit == "mm" else p.unit,
-            identifiable=p.identifiable,
-            reason=p.reason,
-        )
-        for i, p in enumerate(every)
-    )
+    return tuple(replace(p, **{key: read[key][i] for key in keys}) for i, p in enumerate(every))
 
 
 def parameter_names(parameters: Parameters, cell: Cell) -> Names:
@@ -582,9 +540,9 @@ def minimax_of(part: FitPart) -> WorstCase | None:
             KeptDistance(d.pair, 1e-3 * d.measured_mm, 1e-3 * d.tolerance_mm, d.multiplier)
             for d in worst.distances
         ),
-        kkt=Kkt(**dict(worst.kkt)),
+        kkt=worst.kkt,
         iterations=worst.iterations,
-        trace=tuple(Step(**dict(step)) for step in worst.trace),
+        trace=worst.trace,
     )
 
 
@@ -597,7 +555,7 @@ def certificate_of(part: CertificatePart | None) -> Certificate | None:
         line=np.array([point.line for point in part.points], dtype=int),
         multiplier=np.array([point.multiplier for point in part.points]),
         distance=1e-3 * np.array([point.distance_mm for point in part.points]),
-        kkt=Kkt(**dict(part.kkt)),
+        kkt=part.kkt,
         value=1e-3 * part.value_mm,
         bound=1e-3 * part.bound_mm,
     )

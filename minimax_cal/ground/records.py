@@ -6,10 +6,20 @@ import base64
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+)
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_before_validator_function
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
@@ -40,6 +50,30 @@ class Part(BaseModel):
     """A part of a file, as it was written; what later versions add is left alone."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Numbers of a dataclass that are null in a file, or missing there unless required, are NaN."""
+
+    required: tuple[str, ...] = ()
+
+    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """That of the dataclass, its gaps filled first."""
+        floats = {field.name for field in fields(kind) if field.type in ("float", float)}
+        unknown = dict.fromkeys(floats.difference(self.required), math.nan)
+
+        def filled(value: object) -> object:
+            if not isinstance(value, Mapping):
+                return value
+            null = {key: math.nan for key in floats if value.get(key, 0.0) is None}
+            return {**unknown, **value, **null}
+
+        return no_info_before_validator_function(filled, handler(kind))
+
+
+Kind = TypeVar("Kind")
+Recorded = Annotated[Kind, Gaps()]  # a dataclass as it stands in a file, by its own annotations
 
 
 class Packed(Part):

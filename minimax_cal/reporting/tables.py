@@ -1,4 +1,4 @@
-"""The smaller tables of a diagnosis, and the library of effects as a table."""
+"""Where the errors of a diagnosis lie, and the library of effects as a table."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.diagnosing.where import triage_table
 from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
@@ -26,7 +25,7 @@ def numbers(entry: Mapping[str, Any], *keys: str) -> list[float]:
 
 
 def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
-    """What kind the geometric errors are, and how they spread over targets and joints.
+    """Where the geometric errors lie: kind, targets, joints, directions, regions, trends.
 
     where: as in the JSON of a diagnosis.
     """
@@ -35,43 +34,40 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         for entry in where["by_target"]
     )
     joints = tuple(
-        (
-            entry["joint"],
-            "mm" if "rms_mm" in entry else "mrad",
-            number(entry.get("rms_mm", entry.get("rms_mrad"))),
-            *numbers(entry, "share", "p"),
-        )
+        (entry["joint"], unit, *numbers(entry, f"rms_{unit}", "share", "p"))
         for entry in where["by_joint"]
+        for unit in ("mm" if "rms_mm" in entry else "mrad",)
     )
-    return (
-        triage_table(where["triage"]),
-        Table(
-            "what geometry leaves, by target",
-            ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
-            targets,
-            ("", "d", ".4f", ".4f", "+.4f"),
-        ),
-        Table(
-            "what geometry leaves, as turns of each joint",
-            ("joint", "unit", "RMS", "share that its own value explains", "p"),
-            joints,
-            ("", "", ".4f", ".2f", ".1g"),
-        ),
+    directions = tuple(
+        (name.removesuffix("_mm").replace("_", " "), number(value))
+        for name, value in where["by_direction"].items()
     )
-
-
-def closing_tables(diagnosis: Diagnosis) -> tuple[Table, ...]:
-    """What could not be tested, and which further measurement would tell rivals apart."""
-    rows = tuple(
-        (f"{f.term.effect} {f.term.place}", f"{a.effect} {a.place}", a.rho2, a.separate_with)
-        for f in diagnosis.findings
-        for a in f.alternatives
-        if a.separate_with
+    regions = tuple(
+        (cell["region"], *(1e-3 * number(v) for v in (*cell["radius_mm"], *cell["height_mm"])),
+         cell["points"], number(cell["rms_mm"]))
+        for cell in where["by_region"]["cells"]
+    )  # fmt: skip
+    trends = tuple(
+        ({"clock": "visit order"}.get(name, name), *numbers(trend, "share", "p"))
+        for name, trend in where["by_order"].items()
+        if trend
     )
-    needs = Table("not testable with these data", ("effect", "needs"), diagnosis.not_testable)
-    header = ("effect", "or rather", "likeness", "what would tell them apart")
-    further = Table("what to measure next", header, rows, ("", "", ".3f", ""))
-    return tuple(table for table in (needs, further) if table.rows)
+    parts = (
+        ("by target", ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
+         targets, ("", "d", ".4f", ".4f", "+.4f")),
+        ("as turns of each joint",
+         ("joint", "unit", "RMS", "share that its own value explains", "p"),
+         joints, ("", "", ".4f", ".2f", ".1g")),
+        ("by direction", ("direction", "RMS mm"), directions, ("", ".4f")),
+        ("by region", ("region", "from the base axis m", "to m", "height from m", "to m", "points",
+                       "RMS mm"), regions, ("", ".2f", ".2f", ".2f", ".2f", "d", ".4f")),
+        ("trends", ("against", "share explained", "p"), trends, ("", ".2f", ".1g")),
+    )  # fmt: skip
+    left = [Table(f"what geometry leaves, {by}", *rest) for by, *rest in parts]
+    shown = tuple(table for table in (triage_table(where["triage"]), *left) if table.rows)
+    for table in shown:
+        table.cells()  # an entry that is no number is found here, where its file is known
+    return shown
 
 
 def bare_scene() -> Scene:

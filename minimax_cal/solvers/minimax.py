@@ -121,7 +121,7 @@ class Step:
     violation: float
     kkt: float
     length: float
-    backend: str
+    backend: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -216,13 +216,18 @@ def test_tables_of_where_show_dashes_for_what_cannot_be_told() -> None:
             {"joint": "J1", "rms_mrad": 0.25, "share": 0.5, "p": 0.01},
             {"joint": "J2", "rms_mm": 0.75, "share": None, "p": None},
         ],
+        "by_direction": {"x_mm": 0.5, "along_sight_mm": None},
+        "by_region": {"cells": []},
+        "by_order": {"clock": {"share": 0.5, "p": None}, "temperature": None},
         "triage": {"noise": part, "shape": None, "repeat": None, "pose": part},
     }
-    kind, target, joint = tables.where_tables(where)
+    kind, target, joint, direction, trend = tables.where_tables(where)
     assert [row[1] for row in kind.cells()] == ["0.5000", "-", "-", "0.5000"]
     assert target.cells() == [["smr1", "4", "0.5000", "1.0000", "-"]]
     assert joint.cells() == [["J1", "mrad", "0.2500", "0.50", "0.01"],
                              ["J2", "mm", "0.7500", "-", "-"]]  # fmt: skip
+    assert direction.cells() == [["x", "0.5000"], ["along sight", "-"]]
+    assert trend.cells() == [["visit order", "0.50", "-"]]
 
 
 def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
@@ -234,7 +239,7 @@ def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
     other = Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
     first = replace(found.findings[0], alternatives=(other,))
     more = replace(found, findings=(first,), not_testable=(("settling", "the visit order"),))
-    needs, further = tables.closing_tables(more)
+    *_, further, needs = more.tables()
     assert needs.rows == (("settling", "the visit order"),)
-    assert further.rows[0][1:] == ("base_flex frame", 0.9, "ten poses stretched out")
-    assert tables.closing_tables(replace(more, findings=(), not_testable=())) == ()
+    assert further.rows[0][1:] == ("base_flex frame", 0.9, 3.0, 1.0, "ten poses stretched out")
+    assert len(replace(more, findings=(), not_testable=()).tables()) == 1  # the ladder

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter, Provenance
+from minimax_cal.fitting.fit import ACCURACIES, Parameter, Provenance, parameter_table
 from minimax_cal.fitting.fit_file import SCHEMA
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.ground.arrays import Array, rms
@@ -33,12 +33,6 @@ CAUTION = {
     "does not show in it. ",
     "poses": "",
 }
-ROWS = (
-    ("training, nominal", "nominal_train"),
-    ("training, calibrated", "train"),
-    ("held out, nominal", "nominal"),
-    ("held out, calibrated", "holdout"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +80,7 @@ class RelativeCalibration:
     def accuracy_table(self) -> Table:
         """Accuracy of what was measured, before and after, training and held out."""
         rows: list[tuple[Cell, ...]] = []
-        for title, key in ROWS:
+        for title, key in ACCURACIES:
             a, turned = self.accuracy[key], [1e3 * value for value in self.turns.get(key, ())]
             rows.append((title, a.poses, self.numbers[key], a.rms_mm, a.mean_mm, a.max_mm, *turned))
         turns = ("RMS mrad", "max mrad") if self.turns else ()
@@ -100,32 +94,19 @@ class RelativeCalibration:
     def parts_table(self) -> Table:
         """RMS errors wire by wire."""
         rows: tuple[tuple[Cell, ...], ...] = tuple(
-            (part, *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for _, key in ROWS))
+            (
+                part,
+                *(1e3 * rms(np.linalg.norm(self.errors[key][i], axis=-1)) for _, key in ACCURACIES),
+            )
             for i, part in enumerate(self.parts)
         )
-        header = ("RMS mm", *(title for title, _ in ROWS))
-        return Table("by wire", header, rows, ("", *[".4f"] * len(ROWS)))
-
-    def parameter_rows(self) -> Table:
-        """Every parameter with its nominal value, change and sigma, in mm and mrad."""
-        rows = tuple(
-            (
-                p.name,
-                "mm" if p.unit == "m" else "mrad",
-                p.nominal * 1e3,
-                (p.value - p.nominal) * 1e3,
-                p.sigma * 1e3,
-                "" if p.identifiable else p.reason,
-            )
-            for p in self.parameters
-        )
-        header = ("name", "unit", "nominal", "change", "sigma", "not identified because")
-        return Table("parameters", header, rows, ("", "", ".4f", "+.4f", ".4f", ""))
+        header = ("RMS mm", *(title for title, _ in ACCURACIES))
+        return Table("by wire", header, rows, ("", *[".4f"] * len(ACCURACIES)))
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         parts = (self.parts_table(),) if len(self.parts) > 1 else ()
-        return (self.accuracy_table(), *parts, self.parameter_rows())
+        return (self.accuracy_table(), *parts, parameter_table(self.parameters))
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""

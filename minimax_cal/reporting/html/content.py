@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +50,7 @@ class View(Figure):
 
 
 Block = Note | Table | Figure
+Blocks = Sequence[Block]
 
 
 @dataclass(frozen=True, eq=False)

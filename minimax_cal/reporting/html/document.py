@@ -3,48 +3,54 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.tables import Table
-from minimax_cal.reporting.html.content import Block, Note, Report, Section, text
-from minimax_cal.reporting.html.fit_sections import (
-    accuracy_section,
-    correlation_section,
-    iso_section,
-    joints_section,
-    parameter_section,
-    solution_section,
-    suspects_section,
-    workspace_section,
-)
+from minimax_cal.reporting.html import fit_sections, gap_sections
+from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
 from minimax_cal.reporting.html.fit_tables import glance_table, settings_table
-from minimax_cal.reporting.html.gap_sections import (
-    causes_section,
-    gap_section,
-    untestable_section,
-    where_section,
-)
 from minimax_cal.reporting.html.sources import Sources, visible
 from minimax_cal.reporting.html.verdict import fit_verdict, gap_verdict
 
-SECTIONS = (
-    accuracy_section,
-    workspace_section,
-    joints_section,
-    gap_section,
-    causes_section,
-    where_section,
-    untestable_section,
-    suspects_section,
-    parameter_section,
-    correlation_section,
-    iso_section,
-    solution_section,
+NO_FIT = (
+    "Not in this report: it was made without a calibration; give the file of `minimax-cal "
+    "calibrate -o` as well."
+)
+NO_GAP = (
+    "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
+    "-o` as well."
 )
 HEX = re.compile(r"[0-9a-f]{64}")
+
+
+def of_fit(blocks: Callable[[Fit], Blocks]) -> Callable[[Sources], Blocks]:
+    """What needs a calibration, or that there is none."""
+    return lambda sources: blocks(sources.fit) if sources.fit else [missing(NO_FIT)]
+
+
+def of_gap(blocks: Callable[[Diagnosis], Blocks]) -> Callable[[Sources], Blocks]:
+    """What needs a diagnosis, or that there is none."""
+    return lambda sources: blocks(sources.gap) if sources.gap else [missing(NO_GAP)]
+
+
+SECTIONS = (  # name, title, what it holds
+    ("accuracy", "Accuracy", fit_sections.accuracy),
+    ("workspace", "The errors in the workspace", fit_sections.errors_in_space),
+    ("joints", "What the errors go with", fit_sections.joints),
+    ("gap", "The gap, step by step", of_gap(gap_sections.gap_steps)),
+    ("causes", "Causes, and their rivals", of_gap(gap_sections.causes)),
+    ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
+    ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
+    ("suspects", "Suspect points", fit_sections.suspect_points),
+    ("parameters", "Parameters", of_fit(fit_sections.parameters)),
+    ("correlations", "How the parameters hang together", of_fit(fit_sections.correlated)),
+    ("iso9283", "Values by the formulas of ISO 9283", of_fit(fit_sections.iso_values)),
+    ("solution", "How the fit was found", of_fit(fit_sections.solution)),
+)
 
 
 @dataclass(frozen=True)
@@ -67,13 +73,13 @@ def compose(sources: Sources, wording: Wording) -> Report:
     facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
     facts += [("Measurements", told.data or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
-    sections = (verdict_section(sources), *(make(sources) for make in SECTIONS))
+    sections = (Section(name, title, tuple(made(sources))) for name, title, made in SECTIONS)
     return Report(
         title=visible(wording.title) or f"{both} of {sources.robot}",
         robot=sources.robot,
         facts=tuple(facts),
         signatures=signers(visible(wording.author), visible(wording.customer)),
-        sections=(*sections, provenance_section(sources)),
+        sections=(verdict_section(sources), *sections, provenance_section(sources)),
         digest=told.data_sha256 if HEX.fullmatch(told.data_sha256) else "",
     )  # fmt: skip
 

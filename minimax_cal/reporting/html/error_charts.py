@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ FAR = 100.0  # ratio of the largest to the smallest error that asks for a logari
 FINE = 1e-7  # errors below are rounding [mm]
 
 Names = tuple[str, str]
+Draw = Callable[[str, str, Array, int], dict[str, Any]]  # look, name, sizes (k, m), panel
+SIZE = "position error (mm)"
 HELD, TRAIN = "held-out poses", "training poses"
 
 
@@ -61,27 +64,48 @@ def known(values: Array) -> Array:
     return np.asarray(np.maximum(values[np.isfinite(values)], FINE))
 
 
+def every_size(poses: Poses) -> Array:
+    """All sizes of errors, before and after."""
+    return np.concatenate([known(values) for _, *pair in groups(poses) for values in pair])
+
+
 def histogram(poses: Poses, names: Names) -> Figure:
     """Shares of points by size of error, held-out and training poses each in a panel."""
-    found = groups(poses)
-    every = np.concatenate([known(v) for _, *pair in found for v in pair])
+    every = every_size(poses)
     edges = (
         np.geomspace(every.min(), every.max() * 1.001, BINS + 1)
         if is_wide(every, ratio=FAR)
         else np.linspace(0.0, every.max() * 1.001, BINS + 1)
     )
+
+    def area(look: str, name: str, values: Array, panel: int) -> dict[str, Any]:
+        count = np.histogram(known(values), edges)[0]
+        share = 100.0 * np.append(count, 0) / max(count.sum(), 1)
+        fill = {"fill": "tozeroy", "fillcolor": LOOKS[look][3], "showlegend": panel == 0}
+        return line(look, name, edges, share, panel=panel, step=True, **fill)
+
+    axes = (log_axis(SIZE, every, ratio=FAR), axis("points (%)"))
+    says = (
+        f"Histograms of the position error, {names[0]} and {names[1]}. "
+        f"{within(poses, names, 'half', 50.0)}"
+    )
+    return figure("histogram", "How large the errors are", says,
+                  *panels(poses, names, area, *axes))  # fmt: skip
+
+
+def panels(
+    poses: Poses, names: Names, draw: Draw, x: dict[str, Any], y: dict[str, Any], **more: Any
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Traces and layout of held-out and training poses side by side, on axes x and y."""
+    found = groups(poses)
     traces: list[dict[str, Any]] = []
-    layout = frame(annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)])
+    titles = [heading(name, i, len(found)) for i, (name, *_) in enumerate(found)]
+    layout = frame(annotations=titles, **more)
     for i, (_, *pair) in enumerate(found):
-        for look, name, values in zip(LOOKS, names, pair, strict=False):
-            count = np.histogram(known(values), edges)[0]
-            share = 100.0 * np.append(count, 0) / max(count.sum(), 1)
-            area = {"fill": "tozeroy", "fillcolor": LOOKS[look][3], "showlegend": i == 0}
-            traces.append(line(look, name, edges, share, panel=i, step=True, **area))
-        layout |= panel_axes(i, len(found), log_axis("position error (mm)", every, ratio=FAR),
-                             axis("points (%)" if i == 0 else ""))  # fmt: skip
-    says = f"Histograms of the position error, {names[0]} and {names[1]}. {medians(found, names)}"
-    return figure("histogram", "How large the errors are", says, traces, layout)
+        looks = zip(LOOKS, names, pair, strict=False)
+        traces += [draw(look, name, values, i) for look, name, values in looks]
+        layout |= panel_axes(i, len(found), x, y if i == 0 else {**y, "title": {"text": ""}})
+    return traces, layout
 
 
 def panel_axes(number: int, of: int, x: dict[str, Any], y: dict[str, Any]) -> dict[str, Any]:
@@ -93,59 +117,44 @@ def panel_axes(number: int, of: int, x: dict[str, Any], y: dict[str, Any]) -> di
     return {long_key("x", number): x, long_key("y", number): y}
 
 
-def medians(found: list[tuple[str, Array, Array]], names: Names) -> str:
-    """The medians in words."""
+def within(poses: Poses, names: Names, share: str, percent: float) -> str:
+    """Percentiles in words."""
     return " ".join(
-        f"On {name}, half of the points lie within {np.median(known(one)):.3f} mm ({names[0]}) and "
-        f"{np.median(known(other)):.3f} mm ({names[1]})."
-        for name, one, other in found
+        f"On {name}, {share} of the points lie within {np.percentile(known(one), percent):.3f} mm "
+        f"({names[0]}) and {np.percentile(known(other), percent):.3f} mm ({names[1]})."
+        for name, one, other in groups(poses)
     )
 
 
 def cumulative(poses: Poses, names: Names) -> Figure:
     """Which share of the points has less error than x."""
-    found = groups(poses)
-    every = np.concatenate([known(v) for _, *pair in found for v in pair])
-    traces: list[dict[str, Any]] = []
-    layout = frame(annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)])
-    for i, (_, *pair) in enumerate(found):
-        for look, name, values in zip(LOOKS, names, pair, strict=False):
-            size = np.sort(known(values))
-            at = np.unique(np.linspace(0, len(size) - 1, min(len(size), LEVELS)).astype(int))
-            share = 100.0 * (at + 1) / len(size)
-            traces.append(line(look, name, size[at], share, panel=i, step=True, showlegend=i == 0))
-        layout |= panel_axes(i, len(found), log_axis("position error (mm)", every, ratio=FAR),
-                             axis("points with less error (%)" if i == 0 else ""))  # fmt: skip
-    p95 = " ".join(
-        f"On {name}, 95 % of the points lie within {np.percentile(known(one), 95):.3f} mm "
-        f"({names[0]}) and {np.percentile(known(other), 95):.3f} mm ({names[1]})."
-        for name, one, other in found
-    )
-    says = f"Cumulative distribution of the position error. {p95}"
-    return figure("cumulative", "Which share of the points is better than a limit", says, traces,
-                  layout)  # fmt: skip
+
+    def steps(look: str, name: str, values: Array, panel: int) -> dict[str, Any]:
+        size = np.sort(known(values))
+        at = np.unique(np.linspace(0, len(size) - 1, min(len(size), LEVELS)).astype(int))
+        share = 100.0 * (at + 1) / len(size)
+        return line(look, name, size[at], share, panel=panel, step=True, showlegend=panel == 0)
+
+    axes = (log_axis(SIZE, every_size(poses), ratio=FAR), axis("points with less error (%)"))
+    says = f"Cumulative distribution of the position error. {within(poses, names, '95 %', 95.0)}"
+    return figure("cumulative", "Which share of the points is better than a limit", says,
+                  *panels(poses, names, steps, *axes))  # fmt: skip
 
 
 def boxes(poses: Poses, names: Names) -> Figure:
     """Quartiles and extremes of each target."""
-    found = groups(poses)
     targets = [label(name) for name in poses.data.target_names]
-    every = np.concatenate([known(v) for _, *pair in found for v in pair])
-    traces: list[dict[str, Any]] = []
-    layout = frame(
-        annotations=[heading(name, i, len(found)) for i, (name, *_) in enumerate(found)],
-        boxmode="group",
-    )
-    for i, (_, *pair) in enumerate(found):
-        for look, name, values in zip(LOOKS, names, pair, strict=False):
-            traces.append(box(look, name, targets, values, panel=i))
-        size = log_axis("position error (mm)" if i == 0 else "", every)
-        layout |= panel_axes(i, len(found), axis("") | {"type": "category"}, size)
+
+    def quartiles(look: str, name: str, values: Array, panel: int) -> dict[str, Any]:
+        return box(look, name, targets, values, panel=panel)
+
+    axes = (axis("") | {"type": "category"}, log_axis(SIZE, every_size(poses)))
     says = (
         f"Box charts of the position error of each target, {names[0]} and {names[1]}: median, "
         "quartiles, smallest and largest error."
     )
-    return figure("boxes", "Target by target", says, traces, layout)
+    return figure("boxes", "Target by target", says,
+                  *panels(poses, names, quartiles, *axes, boxmode="group"))  # fmt: skip
 
 
 def box(look: str, name: str, targets: list[str], values: Array, *, panel: int) -> dict[str, Any]:
@@ -196,9 +205,27 @@ def joint_values(poses: Poses) -> Array:
     return np.asarray(poses.data.q * np.where(poses.data.sliding, 1e3, 180.0 / np.pi))
 
 
+def sizes_of(poses: Poses) -> list[Array]:
+    """(m,) RMS of each pose before and after, rounding lifted [mm]."""
+    return [np.maximum(of_poses(error), FINE) for error in (poses.before, poses.after)]
+
+
+def cloud(poses: Poses, names: Names, x: Array, chosen: Array, panel: int = 0) -> list[Any]:
+    """The chosen poses against x (m,), and running medians of all."""
+    views = list(zip(LOOKS, names, sizes_of(poses), strict=False))
+    seen = np.isfinite(x)
+    lines = [
+        line(look, f"{name}, median", *trend(x[seen], size[seen]), panel=panel,
+             showlegend=panel == 0)
+        for look, name, size in views
+    ]  # fmt: skip
+    drawn = [(look, name, size[chosen]) for look, name, size in views]
+    text = hover(poses, chosen)
+    return two_looks(x[chosen], drawn, poses.held[chosen], panel=panel, text=text) + lines
+
+
 def against_joints(poses: Poses, names: Names) -> Figure:
     """The error of each pose against each joint."""
-    sizes = [np.maximum(of_poses(e), FINE) for e in (poses.before, poses.after)]
     chosen, cut = shown(poses)
     q, titles = joint_values(poses), joint_names(poses)
     columns = min(len(titles), COLUMNS)
@@ -207,17 +234,11 @@ def against_joints(poses: Poses, names: Names) -> Figure:
     layout = frame(grid={"rows": rows, "columns": columns, "pattern": "independent",
                          "xgap": 0.16, "ygap": 0.36})  # fmt: skip
     for j, title in enumerate(titles):
-        views = [(look, name, size[chosen])
-                 for look, name, size in zip(LOOKS, names, sizes, strict=False)]  # fmt: skip
-        traces += two_looks(q[chosen, j], views, poses.held[chosen], panel=j,
-                            text=hover(poses, chosen))  # fmt: skip
-        for look, name, size in zip(LOOKS, names, sizes, strict=False):
-            traces.append(line(look, f"{name}, median", *trend(q[:, j], size), panel=j,
-                               showlegend=j == 0))  # fmt: skip
+        traces += cloud(poses, names, q[:, j], chosen, j)
         more: dict[str, Any] = {"matches": "y"} if j else {}
         layout[long_key("x", j)] = axis(title, nticks=5)
         layout[long_key("y", j)] = log_axis(
-            "error (mm)" if j % columns == 0 else "", *sizes, **more
+            "error (mm)" if j % columns == 0 else "", *sizes_of(poses), **more
         )
     says = (
         "The error of each pose (RMS of its targets) against each joint; a line that rises or "
@@ -229,19 +250,13 @@ def against_joints(poses: Poses, names: Names) -> Figure:
 def against(poses: Poses, names: Names, what: tuple[str, str, str], x: Array) -> Figure:
     """The error of each pose against something else.  what: name, title, label of the axis."""
     name, title, xlabel = what
-    sizes = [np.maximum(of_poses(e), FINE) for e in (poses.before, poses.after)]
     chosen, cut = shown(poses)
-    views = [(look, n, s[chosen]) for look, n, s in zip(LOOKS, names, sizes, strict=False)]
-    traces = two_looks(x[chosen], views, poses.held[chosen], text=hover(poses, chosen))
-    seen = np.isfinite(x)
-    for look, view, size in zip(LOOKS, names, sizes, strict=False):
-        traces.append(line(look, f"{view}, median", *trend(x[seen], size[seen])))
-    layout = frame(xaxis=axis(xlabel), yaxis=log_axis("error of a pose (mm)", *sizes))
+    layout = frame(xaxis=axis(xlabel), yaxis=log_axis("error of a pose (mm)", *sizes_of(poses)))
     says = (
         f"The error of each pose (RMS of its targets) against {xlabel}. Lines are running "
         f"medians. {cut}"
     ).strip()
-    return figure(name, title, says, traces, layout)
+    return figure(name, title, says, cloud(poses, names, x, chosen), layout)
 
 
 def over_time(poses: Poses, names: Names) -> tuple[Figure, ...]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.suspects import table_of
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283 import iso9283
-from minimax_cal.reporting.html.content import Block, Section, caveat, missing, text
+from minimax_cal.reporting.html.content import Block, Blocks, caveat, missing, text
 from minimax_cal.reporting.html.error_charts import (
     Names,
     against_joints,
@@ -20,18 +19,11 @@ from minimax_cal.reporting.html.error_charts import (
     over_time,
 )
 from minimax_cal.reporting.html.fit_tables import (
-    accuracy_table,
     correlation_table,
     cost_table,
     distance_table,
-    effect_parameters,
     iteration_table,
-    kept_table,
-    multiplier_table,
-    parameter_table,
-    suspect_table,
 )
-from minimax_cal.reporting.html.gap_tables import ladder_table
 from minimax_cal.reporting.html.more_charts import correlation_map, iterations
 from minimax_cal.reporting.html.scene import workspace
 from minimax_cal.reporting.html.sources import Sources
@@ -39,10 +31,6 @@ from minimax_cal.reporting.html.verdict import why_not
 
 SAME = 1e-6  # a file's own errors come back to this, or its effects need other columns [m]
 MOST_SUSPECTS = 50
-NO_FIT = (
-    "Not in this report: it was made without a calibration; give the file of `minimax-cal "
-    "calibrate -o` as well."
-)
 NO_POSES = (
     "The file holds no poses, so that nothing can be drawn; write it again with this version of "
     "minimax-cal."
@@ -59,19 +47,15 @@ def names_of(sources: Sources) -> Names:
     return ("nominal", "calibrated") if sources.fit else ("geometry alone", "with effects")
 
 
-def accuracy_section(sources: Sources) -> Section:
+def accuracy(sources: Sources) -> Blocks:
     """How large the errors are, before and after, held out beside training."""
     blocks: list[Block] = []
     if sources.fit:
-        blocks.append(accuracy_table(sources.fit))
-        told = any(math.isfinite(rms.low) for rms, _ in sources.fit.intervals.values())
-        blocks.append(
-            text("From, to: 95 % intervals of the RMS and of the largest error.")
-            if told
-            else missing("95 % intervals of these numbers are not in the file.")
-        )
+        blocks.append(sources.fit.accuracy_table())
+        unknown = missing("95 % intervals of these numbers are not in the file.")
+        blocks += filled(sources.fit.interval_table()) or (unknown,)
     elif sources.gap:
-        blocks.append(ladder_table(sources.gap))
+        blocks.append(sources.gap.ladder_table())
     blocks.append(
         text(
             "An error is the distance between a measured target and where the model puts it. "
@@ -84,35 +68,31 @@ def accuracy_section(sources: Sources) -> Section:
         blocks += [histogram(poses, names), cumulative(poses, names), boxes(poses, names)]
     else:
         blocks.append(missing(NO_POSES))
-    return Section("accuracy", "Accuracy", tuple(blocks))
+    return blocks
 
 
-def workspace_section(sources: Sources) -> Section:
+def errors_in_space(sources: Sources) -> Blocks:
     """Where in space the errors are."""
-    block: Block = missing(NO_POSES)
     if sources.poses and sources.cell:
-        block = workspace(sources.poses, sources.cell, names_of(sources))
-    return Section("workspace", "The errors in the workspace", (block,))
+        return [workspace(sources.poses, sources.cell, names_of(sources))]
+    return [missing(NO_POSES)]
 
 
-def joints_section(sources: Sources) -> Section:
+def joints(sources: Sources) -> Blocks:
     """What the errors go with."""
-    title, poses = "What the errors go with", sources.poses
-    if not poses:
-        return Section("joints", title, (missing(NO_POSES),))
+    if not (poses := sources.poses):
+        return [missing(NO_POSES)]
     names = names_of(sources)
     blocks: list[Block] = [against_joints(poses, names), *over_time(poses, names)]
     lacking = [name for name in ("time", "temperature") if name not in poses.data.columns]
     if lacking:
         blocks.append(missing(f"The measurements tell no {' and no '.join(lacking)}."))
-    return Section("joints", title, tuple(blocks))
+    return blocks
 
 
-def parameter_section(sources: Sources) -> Section:
+def parameters(fit: Fit) -> Blocks:
     """What was identified, how surely, and what was not."""
-    if not (fit := sources.fit):
-        return Section("parameters", "Parameters", (missing(NO_FIT),))
-    blocks: list[Block] = [parameter_table(fit), *filled(effect_parameters(fit))]
+    blocks: list[Block] = [fit.parameter_table(), *filled(fit.effect_table())]
     blocks.append(
         text(
             "Lengths in mm, angles in mrad. Sigma is the standard deviation that measurement noise "
@@ -121,30 +101,23 @@ def parameter_section(sources: Sources) -> Section:
             f"{fit.identification.condition:.3g}."
         )
     )
-    return Section("parameters", "Parameters", (*blocks, *filled(kept_table(fit)), *why_not(fit)))
+    return [*blocks, *why_not(fit)]
 
 
-def correlation_section(sources: Sources) -> Section:
+def correlated(fit: Fit) -> Blocks:
     """How the uncertainties hang together."""
-    title = "How the parameters hang together"
-    if not (fit := sources.fit):
-        return Section("correlations", title, (missing(NO_FIT),))
     if fit.uncertainty is None or not fit.uncertainty.active.any():
-        note = missing("The file holds no covariance of the parameters.")
-        return Section("correlations", title, (note,))
+        return [missing("The file holds no covariance of the parameters.")]
     note = text(
         "A correlation near 1 or -1 says that these poses tell the two parameters apart badly: "
         "each alone is uncertain, what they do together is not."
     )
     table = filled(correlation_table(fit.uncertainty))
-    return Section("correlations", title, (correlation_map(fit.uncertainty), *table, note))
+    return [correlation_map(fit.uncertainty), *table, note]
 
 
-def solution_section(sources: Sources) -> Section:
+def solution(fit: Fit) -> Blocks:
     """How the numbers came about."""
-    title = "How the fit was found"
-    if not (fit := sources.fit):
-        return Section("solution", title, (missing(NO_FIT),))
     blocks: list[Block] = [
         text(
             f"Objective {fit.objective}, QP backend {fit.qp or 'none'}: "
@@ -156,19 +129,16 @@ def solution_section(sources: Sources) -> Section:
         blocks.append(iterations(fit))
     blocks += filled(cost_table(fit))
     if worst := fit.minimax:
-        blocks += filled(iteration_table(worst), multiplier_table(worst), distance_table(worst))
+        blocks += filled(iteration_table(worst), worst.table(), distance_table(worst))
         ends = ", ".join(f"{name} {value:.1e}" for name, value in vars(worst.kkt).items())
         blocks.append(text(f"Conditions of optimality (Karush-Kuhn-Tucker) at the end: {ends}."))
     else:
         blocks.append(missing("This fit took no minimax steps: least squares alone."))
-    return Section("solution", title, tuple(blocks))
+    return blocks
 
 
-def iso_section(sources: Sources) -> Section:
+def iso_values(fit: Fit) -> Blocks:
     """Values by the formulas of ISO 9283."""
-    title = "Values by the formulas of ISO 9283"
-    if not (fit := sources.fit):
-        return Section("iso9283", title, (missing(NO_FIT),))
     caution = caveat(
         "These are values by the standard's formulas from calibration data, not a test by the "
         "standard: the last table says which of its conditions the data do not meet."
@@ -176,8 +146,8 @@ def iso_section(sources: Sources) -> Section:
     try:
         tables = iso_tables(fit)
     except CalibrationError as error:
-        return Section("iso9283", title, (missing(f"Not available: {error}."),))
-    return Section("iso9283", title, (caution, *tables) if tables else (missing(NO_POSES),))
+        return [missing(f"Not available: {error}.")]
+    return [caution, *tables] if tables else [missing(NO_POSES)]
 
 
 def iso_tables(fit: Fit) -> tuple[Table, ...]:
@@ -191,13 +161,13 @@ def iso_tables(fit: Fit) -> tuple[Table, ...]:
     return iso9283({"nominal": fit.nominal, "calibrated": fit.cell}, fit.data, fit.held).tables()
 
 
-def suspects_section(sources: Sources) -> Section:
+def suspect_points(sources: Sources) -> Blocks:
     """Points that do not fit the others."""
     suspects = sources.fit.suspects if sources.fit else ()
-    table = suspect_table(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
+    table = table_of(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
     note = text("The files name no suspect points.")
     what = caveat(
         "A suspect may be a wrong point, or a real effect that the fit lacks: no row should be "
         "deleted before the diagnosis has been read."
     )
-    return Section("suspects", "Suspect points", (table, what) if table.rows else (note,))
+    return [table, what] if table.rows else [note]

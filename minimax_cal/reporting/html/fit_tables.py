@@ -3,53 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Fit, Parameter, WorstCase
-from minimax_cal.fitting.intervals import UNKNOWN
-from minimax_cal.fitting.suspects import Suspect
+from minimax_cal.fitting.fit import Fit, WorstCase
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.reporting.html.sources import Sources
 
-COMPARED = (  # held-out poses beside training poses, nominal beside calibrated
-    ("held out, nominal", "nominal"),
-    ("held out, calibrated", "holdout"),
-    ("training, nominal", "nominal_train"),
-    ("training, calibrated", "train"),
-)
-NO_INTERVALS = (UNKNOWN, UNKNOWN)
 STRONG = 0.5  # correlations from here on have a row of their own
 MOST_ROWS = 12
-
-
-def accuracy_table(fit: Fit) -> Table:
-    """Accuracy before and after, held out and training, with intervals where they are known."""
-    known = [fit.intervals.get(key, NO_INTERVALS) for _, key in COMPARED]
-    columns = [
-        (f"{kind} from mm", f"{kind} to mm")
-        if any(math.isfinite(end) for pair in known for end in vars(pair[i]).values())
-        else ()
-        for i, kind in enumerate(("RMS", "max"))
-    ]
-    rows: list[tuple[Cell, ...]] = []
-    for (name, key), ends in zip(COMPARED, known, strict=True):
-        a = fit.accuracy[key]
-        spread, tails = (
-            (1e3 * end.low, 1e3 * end.high) if column else ()
-            for end, column in zip(ends, columns, strict=True)
-        )
-        rows.append((name, a.poses, a.rms_mm, *spread, a.mean_mm, a.max_mm, *tails, *a.by_target()))
-    targets = tuple(f"{name} RMS mm" for name in fit.cell.target_names)
-    header = ("poses", "count", "RMS mm", *columns[0], "mean mm", "max mm", *columns[1], *targets)
-    formats = ("", "d", *[".4f"] * (len(header) - 2))
-    return Table("Position error (distance between measured and predicted points)", header,
-                 tuple(rows), formats)  # fmt: skip
 
 
 def glance_table(sources: Sources) -> Table:
@@ -81,53 +48,6 @@ def compared(name: str, one: Accuracy, other: Accuracy) -> list[tuple[Cell, ...]
     ]
 
 
-def parameter_table(fit: Fit) -> Table:
-    """Every parameter with its nominal value, change and sigma."""
-    rows = tuple(
-        (p.name, p.scale[1], p.nominal * p.scale[0], p.value * p.scale[0],
-         (p.value - p.nominal) * p.scale[0], p.sigma * p.scale[0],
-         "yes" if p.identifiable else "no")
-        for p in fit.parameters
-        if not p.of_effect
-    )  # fmt: skip
-    return Table(
-        "Parameters",
-        ("name", "unit", "nominal", "calibrated", "change", "sigma", "identified"),
-        rows,
-        ("", "", ".4f", ".4f", "+.4f", ".4f", ""),
-    )
-
-
-def effect_parameters(fit: Fit) -> Table:
-    """Parameters of effects beyond geometry; empty without any."""
-    rows = tuple(
-        (p.name, *as_written(p, (p.value, p.sigma)), "yes" if p.identifiable else "no")
-        for p in fit.parameters
-        if p.of_effect
-    )
-    header = ("effect", "unit", "value", "sigma", "identified")
-    return Table("Effects beyond geometry, fitted with it", header, rows,
-                 ("", "", ".4g", ".2g", ""))  # fmt: skip
-
-
-def as_written(p: Parameter, values: Sequence[float]) -> tuple[str, *tuple[float, ...]]:
-    """Unit and values as in the files: lengths in millimetres."""
-    scale, unit = (1e3, "mm") if p.unit == "m" else (1.0, p.unit)
-    return (unit, *(scale * value for value in values))
-
-
-def kept_table(fit: Fit) -> Table:
-    """What was not identified, and why."""
-    rows = tuple(
-        (p.name, p.value * p.scale[0], p.scale[1], p.reason or "no reason was recorded")
-        for p in fit.parameters
-        if not p.identifiable
-    )
-    return Table("Not identified: kept at the nominal value",
-                 ("parameter", "kept at", "unit", "because"), rows,
-                 ("", ".4f", "", ""))  # fmt: skip
-
-
 def correlations(known: Uncertainty) -> tuple[tuple[str, ...], Array]:
     """Names of the identified parameters, and their correlations; NaN without a variance."""
     place = np.flatnonzero(known.active)
@@ -148,16 +68,6 @@ def correlation_table(known: Uncertainty) -> Table:
     )
     return Table("Strongest correlations", ("parameter", "with", "correlation"), rows,
                  ("", "", "+.3f"))  # fmt: skip
-
-
-def multiplier_table(worst: WorstCase) -> Table:
-    """Which targets or points the minimax rests on."""
-    rows = tuple(
-        (name, mu, "yes" if name in worst.active else "no")
-        for name, mu in zip(worst.functions, worst.multiplier.tolist(), strict=True)
-    )
-    header = ("error of", "multiplier", "is the worst")
-    return Table("Multipliers of the minimax (they sum to one)", header, rows, ("", ".4f", ""))
 
 
 def distance_table(worst: WorstCase) -> Table:
@@ -185,16 +95,6 @@ def cost_table(fit: Fit) -> Table:
     """The cost at each iterate of the least squares."""
     rows = tuple((i, 1e6 * cost) for i, cost in enumerate(fit.trace))
     return Table("Least squares", ("iterate", "cost mm^2"), rows, ("d", ".6g"))
-
-
-def suspect_table(suspects: Sequence[Suspect]) -> Table:
-    """Points that do not fit the others."""
-    rows = tuple(
-        (s.line, s.target, 1e3 * s.distance, s.score, s.p_value, "yes" if s.together else "no")
-        for s in suspects
-    )
-    header = ("line of the file", "target", "distance mm", "score", "chance", "its whole pose")
-    return Table("Suspect points", header, rows, ("d", "", ".4f", ".1f", ".1g", ""))
 
 
 def settings_table(title: str, settings: Mapping[str, Any]) -> Table:

@@ -6,31 +6,16 @@ import math
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.records import reading
-from minimax_cal.reporting.html.content import Block, Section, missing, text
-from minimax_cal.reporting.html.gap_tables import (
-    effect_parameters,
-    effects_table,
-    ladder_table,
-    place_tables,
-    rival_table,
-    untestable_table,
-)
+from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
-from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting.tables import where_tables
 
-NO_GAP = (
-    "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
-    "-o` as well."
-)
 CURVES = ("residual", "order")
 
 
-def gap_section(sources: Sources) -> Section:
+def gap_steps(gap: Diagnosis) -> Blocks:
     """How far the gap closes, rung by rung."""
-    blocks: tuple[Block, ...] = (missing(NO_GAP),)
-    if gap := sources.gap:
-        blocks = (waterfall(gap), ladder_table(gap), text(closing(gap)))
-    return Section("gap", "The gap, step by step", blocks)
+    return [waterfall(gap), gap.ladder_table(), text(closing(gap))]
 
 
 def closing(gap: Diagnosis) -> str:
@@ -50,18 +35,15 @@ def closing(gap: Diagnosis) -> str:
     return out
 
 
-def causes_section(sources: Sources) -> Section:
+def causes(gap: Diagnosis) -> Blocks:
     """What was found, what else it could be, and what to measure next."""
-    title = "Causes, and their rivals"
-    if not (gap := sources.gap):
-        return Section("causes", title, (missing(NO_GAP),))
     blocks: list[Block] = []
     if gap.findings:
-        blocks += [effects_table(gap), effect_parameters(gap)]
+        blocks += [gap.effects_table(), gap.parameter_table()]
     else:
         blocks.append(text("No effect beyond geometry was found."))
     blocks += [curve_chart(k, gap.curves[k], gap.held) for k in CURVES if k in gap.curves]
-    rivals = rival_table(gap)
+    rivals = gap.rival_table()
     if rivals.rows:
         blocks.append(rivals)
         blocks.append(
@@ -76,27 +58,21 @@ def causes_section(sources: Sources) -> Section:
                            "tell them apart."))  # fmt: skip
     if not gap.curves:
         blocks.append(missing("The file holds no curves to draw."))
-    return Section("causes", title, tuple(blocks))
+    return blocks
 
 
-def untestable_section(sources: Sources) -> Section:
+def untestable(gap: Diagnosis) -> Blocks:
     """What is neither found nor excluded."""
-    block: Block = missing(NO_GAP)
-    if gap := sources.gap:
-        block = untestable_table(gap)
-        if not block.rows:
-            block = text("Every effect of the library could be tested with these data.")
-    return Section("untestable", "What could not be tested", (block,))
+    table = gap.untestable_table()
+    note = text("Every effect of the library could be tested with these data.")
+    return [table if table.rows else note]
 
 
-def where_section(sources: Sources) -> Section:
+def places(gap: Diagnosis) -> Blocks:
     """Where the errors lie before any cause is named."""
-    title = "Where geometry leaves errors"
-    if not (sources.gap and sources.gap.where):
-        return Section("where", title, (missing(NO_GAP),))
-    where = sources.gap.where
+    if not gap.where:
+        return [missing("The file does not tell where the errors lie.")]
     with reading("diagnosis", "where"):
-        blocks: list[Block] = [*place_tables(where)]
-        if worst := where["by_region"]["worst"]:
-            blocks.append(text(f"Worst region: {worst}."))
-    return Section("where", title, tuple(blocks))
+        worst = gap.where["by_region"]["worst"]
+        blocks: list[Block] = [*where_tables(gap.where)]
+    return [*blocks, *([text(f"Worst region: {worst}.")] if worst else [])]
