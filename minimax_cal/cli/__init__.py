@@ -10,6 +10,7 @@ import click
 
 from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
 from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.words import one_line
 
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130  # exit codes
 
@@ -64,5 +65,5 @@ def numerical(error: Exception) -> int:
 
 def complain(message: str, code: int = MISUSED) -> int:
     """One line on stderr."""
-    click.echo("error: " + " ".join(message.split()), err=True)
+    click.echo(f"error: {one_line(message)}", err=True)
     return code

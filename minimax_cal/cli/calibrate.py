@@ -37,10 +37,10 @@ def calibrate_command(
         fit = calibrate(robot, data, progress=progress, **chosen)
         more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
-    to.draw(save_errors, fit)
     if to.deliver(lambda: text_of(fit, *more)):
         tables = (*fit.tables(), *(found.table() for found in more))
         options.show(*tables, headline=fit.headline())
+    to.draw(save_errors, fit)
     return options.exit_code(fit.status)
 
 

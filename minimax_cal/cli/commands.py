@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections import UserDict
+from collections.abc import Callable
+from functools import wraps
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import click
+
+from minimax_cal.ground.errors import OptionError
 
 Entry = tuple[str, str]  # module in this folder, the first sentence of the command's help
 
@@ -89,7 +94,39 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         "backends": ("backends", "The QP backends that are installed, with their versions."),
     },
 }
+WRITTEN = ("output", "figure", "path", "pdf", "truth")  # parameters that name outputs
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
+
+
+def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
+    """The command, refusing an output that is one of its inputs, or a file called -."""
+
+    @wraps(command)  # type: ignore[arg-type]
+    def kept(*given: Any, **named: Any) -> Any:
+        outputs = [named[name] for name in WRITTEN if named.get(name) is not None]
+        inputs = [
+            part
+            for name, value in named.items()
+            if name not in WRITTEN
+            for part in (value if isinstance(value, list | tuple) else [value])
+            if isinstance(part, str | Path)
+        ]
+        for path in map(Path, outputs):
+            if str(path) == "-":
+                raise OptionError("-o -: name a file; --json prints to stdout")
+            if any(is_same(path, Path(part)) for part in inputs):
+                raise OptionError(f"{path}: is an input of this command; name another file")
+        return command(*given, **named)  # type: ignore[misc]
+
+    return kept
+
+
+def is_same(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file that is there."""
+    try:
+        return one.samefile(other)
+    except (OSError, ValueError):
+        return False
 
 
 class Commands(UserDict[str, Any]):
@@ -102,6 +139,7 @@ class Commands(UserDict[str, Any]):
             return found
         module = import_module(f"minimax_cal.cli.{found[0]}")
         command: click.Command = getattr(module, f"{name}_command")
+        command.callback = keeping_inputs(command.callback)
         self.data[name] = command
         return command
 

@@ -49,10 +49,10 @@ def diagnose_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
     with to.stages() as progress:
         found = diagnose(robot, data, progress=progress, **chosen)
     to.notice(*found.notices)
-    to.draw(save_diagnosis, found)
     if to.deliver(found.json):
         options.terminal().print(found.headline() + "\n", markup=False)
         options.show(*found.tables(), *where_tables(found.where))
+    to.draw(save_diagnosis, found)
     return options.exit_code(found.status)
 
 

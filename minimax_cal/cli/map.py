@@ -57,7 +57,7 @@ def map_command(fit: Path, data: Path | None, frame: str, to: Output, **chosen: 
     predict, said = predicted(saved, frame, str(fit))
     found = workspace_map(saved, predict, Grid(**chosen))
     to.notice(*saved.notices, *said, *found.notices)
-    to.draw(save_map, found)
     if to.deliver(lambda: json_text(found.to_dict())):
         show(found.table())
+    to.draw(save_map, found)
     return 0

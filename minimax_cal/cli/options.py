@@ -18,9 +18,11 @@ from minimax_cal.cli import FAILED
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import one_line, visible
 from minimax_cal.solvers.status import Status
 
 WIDTH = 110  # of text that goes to no terminal
+MOST_NOTICES = 50
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -122,8 +124,11 @@ class Output:
 
     def notice(self, *texts: str) -> None:
         """Print notices on stderr, one a line."""
-        for text in () if self.quiet else texts:
-            click.echo(f"notice: {text}", err=True)
+        shown = () if self.quiet else texts[:MOST_NOTICES]
+        for text in shown:
+            click.echo(f"notice: {one_line(text)}", err=True)
+        if shown and len(texts) > MOST_NOTICES:
+            click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
 
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
@@ -182,7 +187,7 @@ def show(*tables: Table, headline: str = "") -> None:
     for table in tables:
         console.print(table.rich())
     if headline:
-        click.echo(f"\n{headline}")
+        click.echo(f"\n{visible(headline)}")
 
 
 def writable(*paths: Path | None) -> None:

@@ -26,7 +26,7 @@ def tradeoff_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
     with to.stages() as progress:
         found = tradeoff(robot, data, progress=progress, **chosen)
     to.notice(*found.notices)
-    to.draw(save_tradeoff, found)
     if to.deliver(found.json):
         options.show(found.table(), headline=found.headline())
+    to.draw(save_tradeoff, found)
     return options.exit_code(found.status)

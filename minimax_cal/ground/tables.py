@@ -13,6 +13,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from minimax_cal.ground.words import visible
+
 Cell = str | float | int
 
 LATEX_ESCAPES = str.maketrans(
@@ -53,12 +55,17 @@ class Table:
     def rich(self) -> RichTable:
         """For a terminal.  Cells are literal text, never markup."""
         table = RichTable(
-            title=Text(self.title), title_justify="left", header_style="bold", box=box.SIMPLE
+            title=Text(visible(self.title)),
+            title_justify="left",
+            header_style="bold",
+            box=box.SIMPLE,
         )
         for name, right in zip(self.header, self.numeric(), strict=True):
-            table.add_column(Text(name), justify="right" if right else "left", overflow="fold")
+            table.add_column(
+                Text(visible(name)), justify="right" if right else "left", overflow="fold"
+            )
         for row in self.cells():
-            table.add_row(*map(Text, row))
+            table.add_row(*(Text(visible(cell)) for cell in row))
         return table
 
     def markdown(self) -> str:

@@ -223,3 +223,50 @@ def test_a_bootstrap_is_shown_and_saved(
     assert all(row["interval"][0] < row["interval"][1] for row in found["parameters"])
     assert run(*arguments, "1") == 2
     assert "1 replicates" in capsys.readouterr().err
+
+
+def test_inputs_are_never_overwritten(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = csv.read_bytes()
+    for arguments in (
+        ("calibrate", "irb2600", csv, "-o", csv),
+        ("calibrate", "irb2600", csv, "--figure", csv),
+        ("diagnose", "irb2600", csv, "-o", csv.parent / ".." / csv.parent.name / csv.name),
+    ):
+        assert run(*arguments) == 2
+        assert "is an input of this command" in capsys.readouterr().err
+    assert csv.read_bytes() == before
+    assert run("calibrate", "irb2600", csv, "-o", "-") == 2
+    assert "name a file" in capsys.readouterr().err
+    assert not Path("-").exists()
+
+
+def test_what_a_file_holds_moves_no_cursor(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Terminal codes in a header, and a cell of 200,000 digits."""
+    header, first, *rest = csv.read_text().splitlines()
+    odd = tmp_path / "odd.csv"
+    lines = [f"{header},\x1b]0;title\x07", f"{first},1", *(f"{row},2" for row in rest)]
+    odd.write_text("\n".join(lines))
+    assert run("calibrate", "irb2600", odd, "--objective", "sum") == 0
+    out, err = capsys.readouterr()
+    assert "title" in err
+    assert "\x1b" not in out + err
+    long = "7" * 200_000
+    odd.write_text("\n".join([header, first.replace(first.split(",")[0], long + "x"), *rest]))
+    assert run("calibrate", "irb2600", odd) == 2
+    assert len(capsys.readouterr().err) < 1100
+
+
+def test_results_are_written_before_pictures(
+    csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from minimax_cal.cli import calibrate
+
+    def broken(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(calibrate, "save_errors", broken)
+    out = tmp_path / "fit.json"
+    assert run("calibrate", "irb2600", csv, "-o", out, "--figure", tmp_path / "a.png") == 1
+    assert mc.load_fit(out).status == "converged"

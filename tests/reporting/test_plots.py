@@ -134,3 +134,9 @@ def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
         assert np.isfinite(values).all()
         assert np.ptp(values) > 0.0
         assert label.endswith(")")
+
+
+def test_a_name_may_hold_a_dollar(tmp_path: Path) -> None:
+    odd = replace(diagnosed("backlash"), robot="arm $x_{$")
+    diagnosis.save_diagnosis(odd, tmp_path / "gap.svg")
+    assert (tmp_path / "gap.svg").exists()

@@ -30,6 +30,7 @@ from minimax_cal.cli.report import report_command
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.words import visible
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.html import (
@@ -49,7 +50,7 @@ from minimax_cal.reporting.html.fit_tables import correlations
 from minimax_cal.reporting.html.page import script_json
 from minimax_cal.reporting.html.projection import flat
 from minimax_cal.reporting.html.scene import inside, magnification, skeleton, space_of
-from minimax_cal.reporting.html.sources import Sources, visible
+from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
 SECTIONS = [

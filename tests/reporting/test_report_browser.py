@@ -15,9 +15,9 @@ from conftest import run
 from test_report import NASTY, WORDING, hostile, results, write
 
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html import compose, read_sources, render
 from minimax_cal.reporting.html.content import Figure
-from minimax_cal.reporting.html.sources import visible
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 BROWSER = next(

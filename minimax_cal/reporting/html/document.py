@@ -10,10 +10,11 @@ from importlib.metadata import version
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html import fit_sections, gap_sections
 from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
 from minimax_cal.reporting.html.fit_tables import glance_table, settings_table
-from minimax_cal.reporting.html.sources import Sources, visible
+from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_verdict, gap_verdict
 
 NO_FIT = (

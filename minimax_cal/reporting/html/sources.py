@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +16,11 @@ from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
+from minimax_cal.ground.words import visible
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 
-HIDDEN = ("Cc", "Cs", "LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-REPLACED = "\N{REPLACEMENT CHARACTER}"
 AGAIN = "write it again with minimax-cal"
 
 Result = Fit | Diagnosis | Path | str
@@ -196,15 +194,3 @@ def clean(value: Any) -> Any:
     if isinstance(value, dict):
         return {visible(key): clean(part) for key, part in value.items()}
     return value
-
-
-def visible(text: str) -> str:
-    """Text without control characters, which could hide or reverse what a reader signs."""
-    if text.isascii() and text.isprintable():
-        return text
-    return "".join(
-        REPLACED
-        if unicodedata.category(letter) in HIDDEN or unicodedata.bidirectional(letter) in HIDDEN
-        else letter
-        for letter in text
-    )
