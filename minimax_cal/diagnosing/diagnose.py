@@ -18,6 +18,7 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import resemblances
+from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
@@ -91,6 +92,7 @@ def examined(
     if verdict == "none" and gap.shaky(noise):
         verdict = "not_repeatable"
     lies = located(study)
+    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
     settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
     told = reasons(
         verdict, gap.steps, gap.floor, findings, gap.closed, gap.closed_ci, structure_left
@@ -113,7 +115,7 @@ def examined(
         structure_in=structure_left[0],
         where=lies.to_dict(),
         not_testable=causes.untestable,
-        notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices),
+        notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
         provenance=Provenance.of(robot, given, settings),
         seconds=time.perf_counter() - began,
         data=clean.data,

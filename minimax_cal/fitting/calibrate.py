@@ -173,7 +173,7 @@ def judged(robot: Robot, options: Options, parts: Parts, solved: Solved, began: 
         cell=calibrated,
         nominal=nominal,
         objective=options.objective,
-        qp=options.qp,
+        qp=usable(options.qp)[0],  # the one that ran
         status=solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,

@@ -264,3 +264,12 @@ def test_read_back_joints_are_not_called_backlash() -> None:
     names = {f.term.effect for f in irb120(1, read_back=True).findings}
     assert names & {"readback", "settling"}
     assert "backlash" not in names
+
+
+def test_another_robots_file_is_said() -> None:
+    made = sealed(condition="none")
+    longer = made.robot.mdh.copy()
+    longer[1, 0] += 0.15  # the drawing of an arm that reaches farther
+    found = mc.diagnose(made.robot.with_mdh(longer), made.data)
+    assert any("is the robot" in note for note in found.notices)
+    assert not any("is the robot" in note for note in mc.diagnose(made.robot, made.data).notices)
