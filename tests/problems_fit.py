@@ -1,34 +1,15 @@
 """Fits that several tests start from."""
 
-import numpy as np
-
-import minimax_cal as mc
 from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import split
-from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS
-
-
-def identified(robot: mc.Robot, data: mc.Measurements) -> tuple[Model, State]:
-    """The model with its identified parameters free, and the nominal start."""
-    model = model_of(robot, data)
-    begin = start.fit_base(model, robot.mdh).state
-    found = identify.identify(
-        model,
-        begin,
-        identify.drop_order(robot, model.names),
-        allowed=model.active,
-        reference=identify.plenty_of_poses(robot, model),
-        known=np.zeros(model.names.count, dtype=bool),
-    )
-    return model.only(found.active), begin
 
 
 def solve(model: Model, begin: State, method: str = "snllm", **kw: object):  # type: ignore[no-untyped-def]

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import minimax_cal as mc
-from minimax_cal.fitting import identify, start
+from experiments.speed import identified
 from minimax_cal.fitting.robust import Robust, robust_fit
 from minimax_cal.fitting.trimmed import Fitter
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 from minimax_cal.solvers import least_squares
@@ -75,18 +75,7 @@ FITTER: Fitter = fit
 
 def case_of(robot: mc.Robot, made: Simulation, data: mc.Measurements, bad: Array) -> Case:
     """The identifiable parameters and the plain fit of some measurements.  bad: (m, k)."""
-    base = model_of(robot, data)
-    begin = start.fit_base(base, robot.mdh).state
-    every = np.ones(base.names.count, dtype=bool)
-    chosen = identify.identify(
-        base,
-        begin,
-        identify.drop_order(robot, base.names),
-        allowed=every,
-        reference=identify.plenty_of_poses(robot, base),
-        known=~every,
-    )
-    model, found = fit(base.only(chosen.active), begin)
+    model, found = fit(*identified(robot, data))
     return Case(robot, made, data, model, found, bad.T)
 
 

@@ -27,7 +27,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.accuracy import Accuracy, before_and_after
 from minimax_cal.measuring.measurements import Measurements, groups
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.joint_fit import extended
@@ -430,15 +430,11 @@ class Fit:
 
     def headline(self) -> str:
         """The result in a sentence or two."""
-        before, after = self.accuracy["nominal"], self.accuracy["holdout"]
-        where = f"on {after.poses} poses that were not used for the fit"
-        if not after.poses:
-            before, after = self.accuracy["nominal_train"], self.accuracy["train"]
-            where = f"on the {after.poses} poses of the fit itself (none was held out)"
+        before, after, where = before_and_after(self.accuracy)
         identified = sum(p.identifiable for p in self.parameters)
         text = (
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
-            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, {where}. "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. "
             f"{identified} of {len(self.parameters)} parameters identified "
             f"(condition {self.identification.condition:.3g}); {self.status} after "
             f"{self.iterations} iterations, {self.seconds:.2f} s."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,3 +82,13 @@ def accuracy(error: Array) -> Accuracy:
         counts=counts,
         worst=(int(pose), int(target)),
     )
+
+
+def before_and_after(accuracies: Mapping[str, Accuracy]) -> tuple[Accuracy, Accuracy, str]:
+    """Before and after a fit, at held-out poses where there are any, and which poses those are."""
+    held, train = accuracies["holdout"], accuracies["train"]
+    if held.poses:
+        where = f"{held.poses} poses that were not used for the fit"
+        return accuracies["nominal"], held, where
+    where = f"the {train.poses} poses of the fit itself (none was held out)"
+    return accuracies["nominal_train"], train, where

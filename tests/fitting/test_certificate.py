@@ -4,10 +4,11 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import identified, solve
+from problems_fit import solve
 
 import minimax_cal as mc
 from experiments import cones
+from experiments.speed import identified
 from experiments.worst_point import Case, by_cones, by_cvxpy, by_sqp, linear_optimum
 from minimax_cal.fitting.certificate import PointCones, certify
 from minimax_cal.fitting.minimax_problem import (

@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems_fit import identified, solve
+from problems_fit import solve
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from experiments.speed import identified
 from minimax_cal.fitting import start
 from minimax_cal.modelling.model import SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State

@@ -16,7 +16,7 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
@@ -110,15 +110,11 @@ class RelativeCalibration:
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
-        before, after = self.accuracy["nominal"], self.accuracy["holdout"]
-        where = f"at {after.poses} poses that were not used for the fit"
-        if not after.poses:
-            before, after = self.accuracy["nominal_train"], self.accuracy["train"]
-            where = f"at the {after.poses} poses of the fit itself (none was held out)"
+        before, after, where = before_and_after(self.accuracy)
         text = (
             f"{QUANTITY[self.kind].capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
-            f"{where}. {CAUTION[self.kind]}By the parameters' sigmas alone a position over the "
+            f"at {where}. {CAUTION[self.kind]}By the parameters' sigmas alone a position over the "
             f"joints' range is good to {1e3 * self.position_sigma:.3f} mm RMS once a base is "
             f"fitted. {self.identified} of {len(self.parameters)} parameters identified (condition "
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
