@@ -27,8 +27,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended
+from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, read_measurements, split
+from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot

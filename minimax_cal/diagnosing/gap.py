@@ -16,7 +16,8 @@ from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.faults import Fault
-from minimax_cal.measuring.measurements import Measurements, groups, split
+from minimax_cal.measuring.grouping import groups, split
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 

@@ -14,6 +14,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
@@ -28,7 +29,8 @@ from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, before_and_after
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.grouping import clusters, grouped
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
@@ -245,7 +247,8 @@ class Fit:
     cell: the calibrated robot with base and targets.  nominal: the nominal robot with its best
     base and targets, None where an old file does not tell it.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
-    poses.  uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
+    poses.  beyond: on whole parts that were left out.
+    uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
     minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
     data: all m poses, with their history where effects need it; none in an old file.
@@ -283,6 +286,7 @@ class Fit:
     prior: Array
     widening: float
     provenance: Provenance
+    beyond: Beyond
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
 
     def __repr__(self) -> str:
@@ -344,8 +348,8 @@ class Fit:
 
     @property
     def group(self) -> Array:
-        """(training poses,) rows with one number are one pose."""
-        return groups(self.train)
+        """(training poses,) rows with one number belong together: a pose, or a cluster of poses."""
+        return clusters(self.train)
 
     @cached_property
     def distances(self) -> Distances:
@@ -374,8 +378,12 @@ class Fit:
         if self.stated is not None:
             return self.stated
         rng = np.random.default_rng(self.options.seed)
+        group = grouped(self.data, self.options.holdout_by)[self.held]
         return {
-            key: (rms_interval(self.errors[key], rng=rng), max_interval(self.errors[key], rng=rng))
+            key: (
+                rms_interval(self.errors[key], group, rng=rng),
+                max_interval(self.errors[key], group, rng=rng),
+            )
             for key in ("nominal", "holdout")
         }
 
@@ -432,9 +440,10 @@ class Fit:
         """The result in a sentence or two."""
         before, after, where = before_and_after(self.accuracy)
         identified = sum(p.identifiable for p in self.parameters)
+        beyond = f"{self.beyond.sentence()} " if self.beyond.worst else ""
         text = (
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
-            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {beyond}"
             f"{identified} of {len(self.parameters)} parameters identified "
             f"(condition {self.identification.condition:.3g}); {self.status} after "
             f"{self.iterations} iterations, {self.seconds:.2f} s."
@@ -443,7 +452,7 @@ class Fit:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table(), self.interval_table()]
+        every = [self.accuracy_table(), self.interval_table(), self.beyond.table()]
         if self.minimax and self.objective != "point":
             every.append(self.minimax.table())
         if self.certificate:

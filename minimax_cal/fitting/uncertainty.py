@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -137,7 +138,7 @@ class Poses:
             seen=model.seen,
         )
 
-    @property
+    @cached_property
     def bread(self) -> Array:
         """(p, p) H."""
         flat = [a.reshape(-1, a.shape[-1]) for a in (self.jacobian, self.weighted)]
@@ -150,12 +151,12 @@ class Poses:
         count = 3.0 * np.count_nonzero(self.seen)
         return float((self.error**2).sum()) / max(count - paid, 1.0)
 
-    @property
+    @cached_property
     def gram(self) -> Array:
         """(m, p, p) J'A J of each pose."""
         return np.asarray(np.swapaxes(self.jacobian, -1, -2) @ self.weighted)
 
-    @property
+    @cached_property
     def score(self) -> Array:
         """(m, p) J'A e of each pose."""
         return np.asarray(np.einsum("mrp,mr->mp", self.weighted, self.error))
