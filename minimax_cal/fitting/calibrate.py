@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
+from minimax_cal.fitting.claims import bad_rows, beyond_of, contradiction, unseen_suspects
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.options import (
     Options,
@@ -25,19 +25,17 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
-from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.grouping import groups, parts, split, with_groups
+from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import NOTHING, Term
-from minimax_cal.modelling.joint_fit import fitted, refitted
-from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
@@ -171,19 +169,23 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
     calibrated = Cell.of(robot, solved.state, data.target_names, solved.effects)
     nominal = Cell.of(robot, solved.nominal, data.target_names)
     before, after = nominal.error(data), calibrated.error(data)
+    suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    wrong = contradiction(robot, data, after, held, suspects)
     notices = (
         *poses.notices,
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *doubts(robot, solved, before[:, ~held]),
+        *bad_rows(suspects, data.source),
+        *([wrong] if wrong else []),
     )
     return Fit(
         cell=calibrated,
         nominal=nominal,
         objective=options.objective,
         qp=usable(options.qp)[0],  # the one that ran
-        status=solved.status,
+        status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
         parameters=parameter_table(robot, solved),
@@ -204,35 +206,14 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         error=after,
         notices=notices,
         loss=options.loss,
-        suspects=solved.robust.suspects,
+        suspects=suspects,
         weights=solved.robust.weights,
         share=solved.estimator.share,
         prior=solved.estimator.model.prior.weight,
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
-        beyond=beyond_of(robot, options, data, held, solved),
+        beyond=beyond_of(robot, options, data, held, solved, suspects),
     )
-
-
-def beyond_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Beyond:
-    """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
-    terms, k = solved.effects.terms, len(data.target_names)
-    scene = Cell.of(robot, solved.state, data.target_names).scene(data)
-
-    def error_of(state: State, rows: Array) -> Array:
-        effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
-        return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
-
-    geometric = None
-    if terms:
-        train = data.take(~held)
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
-        geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
-    found = parts(data, options.holdout_by)
-    return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
 
 
 def remarks(options: Options, poses: Parts) -> Iterator[str]:
