@@ -99,7 +99,7 @@ def beyond_of(
     if terms:
         train = data.take(~held)
         active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
+        state = refitted(robot, train, solved.state, active)
         geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
     found = parts(data, options.holdout_by)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
