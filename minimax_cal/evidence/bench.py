@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import solve_triangular
+from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Library
 from minimax_cal.evidence.noise import Noise
@@ -188,7 +188,7 @@ class Bench:
         d = len(one.candidate.main)
         free = max(self.dof - d, 1)
         ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d
-        return float(min(1.0, stats.f.sf(ratio, d, free) * self.tries * one.candidate.tries))
+        return float(min(1.0, fdtrc(d, free, ratio) * self.tries * one.candidate.tries))
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -272,20 +272,20 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     noise, dof = products.noise(main), products.dof(main)
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
-    p = products.columns.fixed - 1
-    across, whole = products.across(ratios, index)
-    turn = block_diag(products.span, np.eye(len(index)))
-    fixed = turn.T @ np.delete(across, p, axis=1)
-    gram = fixed[:, :, np.concatenate([np.arange(p), p + 1 + index])] @ turn
-    r = products.span.shape[1] + len(main)
-    gram[:, range(r, len(turn.T)), range(r, len(turn.T))] += ridge * noise.variance  # a prior
+    p, fit = products.columns.fixed - 1, products.span.shape[1]
+    fixed, error, whole = products.across(ratios, index)
+    gram = np.concatenate(
+        [products.told_apart(fixed[:, :, :p], axis=2), fixed[:, :, p + 1 + index]], axis=2
+    )
+    r = fit + len(main)
+    gram[:, range(r, r + len(loose)), range(r, r + len(loose))] += ridge * noise.variance  # a prior
     factors = triangles(gram)
     part = np.stack([
         solve_triangular(factor, lines[:, p:], lower=True, check_finite=False).T
         for factor, lines in zip(factors, fixed, strict=True)
     ])  # fmt: skip
     before, part = part[:, 0], part[:, 1:]
-    square = across[:, p, p]
+    square = error[:, p]
     total = np.maximum(square - (before**2).sum(axis=1), ROUNDING * square + 1e-300)
     size = np.einsum("sff->sf", factors)[:, :r]
     spread = np.log1p(ratios[:, None] * lib.rows.variance_ratio[products.kept]).sum(axis=1)
@@ -293,13 +293,14 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         ratios=ratios,
         part=part,
         before=before,
-        pull=across[:, p, p + 1 :] - (part @ before[..., None])[..., 0],
+        pull=error[:, p + 1 :] - (part @ before[..., None])[..., 0],
         total=total,
         whole=whole,
         logs=spread + 2.0 * np.log(size).sum(axis=1),
         own=lambda index: products.among(ratios, index),
     )
-    rows = turn.T @ np.concatenate([products.columns.clear[:p], products.clear(index)])
+    geometry = products.told_apart(products.columns.clear[:p], axis=0)
+    rows = np.concatenate([geometry, products.clear(index)])
     weights = products.kept / (1.0 + np.outer(ratios, lib.rows.variance_ratio))
     held = Fixed(rows, factors, weights, before, lib.rows.error)
     return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.count))

@@ -129,10 +129,9 @@ class Library:
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""
         products, count = self.products, self.products.columns.count
-        across, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
-        fixed = products.columns.fixed
+        across, _, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
         own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
-        left = own - ((products.span.T @ across[0, : fixed - 1, fixed:]) ** 2).sum(axis=0)
+        left = own - (across[0, :, products.columns.fixed :] ** 2).sum(axis=0)
         clear = left > FAINT * whole[0]
         shown = tuple(c for c in self.candidates if clear[c.main].all())
         gone = {c.term.effect for c in self.candidates} - {c.term.effect for c in shown}

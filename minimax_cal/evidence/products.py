@@ -271,17 +271,28 @@ class Products:
 
         return likeliest(grams, rows, dof, self.kept)
 
-    def across(self, ratios: Array, index: Array) -> tuple[Array, Array]:
-        """(s, f, p + 1 + D) products of the geometry, the error, and some candidates' columns with
-        all, and (s, D) squares of the candidates' columns as they are.
+    def told_apart(self, lines: Array, axis: int) -> Array:
+        """The geometry's columns along an axis, as the combinations that the rows tell apart."""
+        if self.all is None:
+            return lines
+        return np.asarray(np.moveaxis(np.moveaxis(lines, axis, -1) @ self.span, -1, axis))
+
+    def across(self, ratios: Array, index: Array) -> tuple[Array, Array, Array]:
+        """Products of the geometry and of some candidates' columns with all (s, f, p + 1 + D), of
+        the error with all (s, p + 1 + D), and squares of the candidates' as they are (s, D).
         """
-        fixed = np.concatenate([np.arange(self.columns.fixed), self.columns.fixed + index])
+        p = self.columns.fixed - 1
+        fixed = np.concatenate([np.arange(p), p + 1 + index, [p]])
         out = np.empty((len(ratios), len(fixed), len(self.columns.clear)))
         whole = np.empty((len(ratios), self.columns.count))
         for _, here, summed, combined in self.parts(ratios, 1):
             out[here] = np.moveaxis(combined @ summed.across(fixed), 1, 0)
             whole[here] = combined @ summed.squares().T
-        return out, whole
+        lines, error = out[:, :-1], out[:, -1]
+        if self.all is not None:
+            geometry = self.told_apart(lines[:, :p], axis=1)
+            lines = np.concatenate([geometry, lines[:, p:]], axis=1)
+        return lines, error, whole
 
     def among(self, ratios: Array, index: Array) -> Array:
         """(s, c, d, d) products within sets of candidates' columns (c, d)."""
