@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
 from minimax_cal.evidence.library import Candidate, Library
-from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
@@ -50,11 +50,22 @@ class Choice:
         """(N, q) their columns."""
         return self.library.columns[:, columns_of(self.chosen)[0]]
 
+    @property
+    def left(self) -> Array:
+        """(N,) what geometry and effects, fitted to the poses that count, leave of all rows [m].
+
+        `Rows.back` gives it as errors of points: those of poses that do not count are predicted.
+        """
+        rows = self.library.rows
+        weight = self.noise.weights(rows) * self.library.products.kept
+        return remaining(rows, weight, self.known)
+
 
 def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
-    ripple: whether to look for lines of gears besides.
+    lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
+    at.  most: effects at most.  ripple: whether to look for lines of gears besides.
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
