@@ -40,7 +40,7 @@ def fold_of(study: Study, rows: Array, state: State, exclude: Sequence[str]) -> 
     fit = replace(study.fit, state=state)
     small = studied(study.robot, study.data.take(rows), fit)
     _, choice = chosen(small, exclude)
-    effects = tuple(effects_of(small, choice))
+    effects = tuple(effects_of(choice))
     return Fold(effects, climbed(small, effects, choice.noise))
 
 
