@@ -4,8 +4,8 @@ from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import split
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import least_squares

@@ -103,6 +103,15 @@ def by_weight(choice: Choice) -> list[int]:
     return order
 
 
+def effects_of(study: Study, choice: Choice) -> list[tuple[Term, ...]]:
+    """The terms of each effect selected, the weightiest first, all lines of a joint together."""
+    out: dict[tuple[str, str], list[Term]] = {}
+    for number in by_weight(study, choice):
+        term = choice.fits[number].candidate.term
+        out.setdefault((term.effect, term.place), []).append(term)
+    return [tuple(terms) for terms in out.values()]
+
+
 def finding(study: Study, choice: Choice, number: int) -> Finding:
     """An effect with its rivals, and what would tell the nearest of them apart."""
     one, table = choice.fits[number], choice.benches[number]

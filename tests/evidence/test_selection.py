@@ -15,8 +15,8 @@ from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import split
 from minimax_cal.modelling.effects.table import Term
 
 
