@@ -106,7 +106,7 @@ def by_weight(choice: Choice) -> list[int]:
 def effects_of(study: Study, choice: Choice) -> list[tuple[Term, ...]]:
     """The terms of each effect selected, the weightiest first, all lines of a joint together."""
     out: dict[tuple[str, str], list[Term]] = {}
-    for number in by_weight(study, choice):
+    for number in by_weight(choice):
         term = choice.fits[number].candidate.term
         out.setdefault((term.effect, term.place), []).append(term)
     return [tuple(terms) for terms in out.values()]
