@@ -26,7 +26,7 @@ from minimax_cal.modelling.parameters import State
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
 PREPARE = {"more": 0.0, "late": 5.0, "side": 5.0, "load": 15.0, "foot": 20.0}  # once [min]
-OF_BASE = frozenset({"base_flex", "frame_drift"})  # what moves the robot's foot
+OF_BASE = frozenset({"base_flex", "frame_drift", "session_jump"})  # what moves the robot's foot
 GOLDEN = 0.6180339887498949
 COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]

@@ -25,16 +25,19 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
+from minimax_cal.fitting.stations import jumps, pose_of, stationed, steps_of
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.faults import session_jumps
 from minimax_cal.measuring.grouping import groups, parts, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.stations import Frames, Sessions, seen_from
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import NOTHING, Term
-from minimax_cal.modelling.joint_fit import fitted, refitted
+from minimax_cal.modelling.effects.table import NOTHING, Term, of_sessions
+from minimax_cal.modelling.joint_fit import extended, fitted, refitted
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
@@ -153,6 +156,8 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
     data = with_groups(data)
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
+    data = stationed(robot, data, np.isin(data.line, train.line))
+    train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
@@ -167,15 +172,17 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
 
 def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: float) -> Fit:
     """The fit with its accuracy on training and on held-out poses."""
-    data, held = poses.data, np.isin(poses.data.line, poses.held.line)
-    calibrated = Cell.of(robot, solved.state, data.target_names, solved.effects)
-    nominal = Cell.of(robot, solved.nominal, data.target_names)
+    held, names = np.isin(poses.data.line, poses.held.line), poses.data.target_names
+    data = seen_from(poses.data, solved.frames)
+    calibrated = Cell.of(robot, solved.state, names, solved.effects, Sessions.of(data))
+    nominal = Cell.of(robot, solved.nominal, names, NOTHING, Sessions.of(poses.data))
     before, after = nominal.error(data), calibrated.error(data)
     notices = (
         *poses.notices,
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
+        *(fault.text for fault in session_jumps(data, after)),
         *doubts(robot, solved, before[:, ~held]),
     )
     return Fit(
@@ -186,7 +193,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         status=solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
-        parameters=parameter_table(robot, solved),
+        parameters=parameter_table(robot, solved, poses.data.frames),
         accuracy={
             "nominal": accuracy(before[:, held]),
             "train": accuracy(after[:, ~held]),
@@ -218,19 +225,24 @@ def beyond_of(
     robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
 ) -> Beyond:
     """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
-    terms, k = solved.effects.terms, len(data.target_names)
-    scene = Cell.of(robot, solved.state, data.target_names).scene(data)
+    every, free = solved.effects.terms, of_sessions(data.frames)
+    names, sessions = data.target_names, Sessions.of(data)
+    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
 
     def error_of(state: State, rows: Array) -> Array:
-        effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
-        return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
+        terms = free if len(state.effects) == steps_of(data.frames) else every
+        effects = fitted(terms, scene, state.effects)
+        return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
 
     geometric = None
-    if terms:
+    if every != free:
         train = data.take(~held)
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
-        geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
+        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
+        state, _ = refitted(robot, train, solved.state, active, free, np.zeros(0))
+        model = model_of(robot, train).only(active)
+        if free:
+            model, _ = extended(model, robot, train, state, free)
+        geometric = Estimator(model, np.ones(len(names))), state
     found = parts(data, options.holdout_by)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
 
@@ -269,25 +281,28 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
-def parameter_table(robot: Robot, solved: Solved) -> Parameters:
+def parameter_table(robot: Robot, solved: Solved, start: Frames) -> Parameters:
     """Every parameter, link by link.
 
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
+    Those of `session_jump` tell where it stands in a further session (`stations.jumps`).  start:
+    the frames of the sessions for the nominal robot.
     """
     names, n = solved.names, robot.joints
     known = solved.identification.active
     sigma = solved.uncertainty.sigma
-    axes = solved.nominal.rotation
+    axes, more = solved.nominal.rotation, len(solved.units)
 
-    def values(x: State) -> Array:
+    def values(x: State, frames: Frames) -> Array:
         turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
         parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
-        effects = x.effects if len(x.effects) else np.zeros(len(solved.units))
-        return np.concatenate([*parts, effects])
+        stood = jumps(frames, pose_of(x))
+        effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))
+        return np.concatenate([*parts, stood, effects])
 
-    before = values(solved.nominal)
-    value = np.where(known, values(solved.state), before)
+    before = values(solved.nominal, start)
+    value = np.where(known, values(solved.state, solved.frames), before)
     order = [kind * n + joint for joint in range(n) for kind in range(5)]
     every = tuple(
         Parameter(

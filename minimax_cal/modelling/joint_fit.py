@@ -35,13 +35,14 @@ def extended(
 ) -> tuple[Model, State]:
     """The geometric model with the effects' columns at a state, and the state with their values.
 
-    Columns are constant; what finite turns add to them is taken from the state's values, so that
-    a second pass at the fit of the first is exact to second order.
+    Parameters that the state does not hold yet, the last ones, are zero.  Columns are constant;
+    what finite turns add to them is taken from the state's values, so that a second pass at the fit
+    of the first is exact to second order.
     """
     scene = scene_of(robot, data, model, state)
     fields = fields_of(terms, scene)
     names, _ = names_of(terms, scene)
-    values = state.effects if len(state.effects) else np.zeros(len(names))
+    values = np.pad(state.effects, (0, len(names) - len(state.effects)))
     moved = np.zeros((0, 0, 0))
     if values.any():
         exact = fitted(terms, scene, values).points(scene)
@@ -80,7 +81,7 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     )
     if not cell.effects.terms:
         return model, cell.state
-    hidden = replace(poses, target_names=cell.target_names)
+    hidden = cell.placed(replace(poses, target_names=cell.target_names))
     return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 

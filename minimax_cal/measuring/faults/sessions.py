@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import stats
@@ -11,8 +13,10 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
 from minimax_cal.measuring.faults.limits import FALSE_ALARM
-from minimax_cal.measuring.history import sessions
+from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
+
+CLEAR = 1.1  # times the squares that a jump leaves: what less explains is of no account
 
 
 def mixed_units(data: Measurements) -> tuple[Fault, ...]:
@@ -52,47 +56,104 @@ def strange_ratios(
 
 
 def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
-    """A notice if the residual of a fit moves as a whole from session to session.
+    """Moments from which on the residual of a fit has moved as a whole: jumps of base or instrument.
 
-    The mean error of each pose's targets is explained by one small displacement (6) for all poses
-    or one for each session (F-test).
+    The mean errors of the poses' targets, as visited, are explained by one small displacement (6)
+    for all, or by another one from some pose on: the best such pose is tried against chance (F-test
+    times the poses tried), and so are both sides in their turn.
     """
-    session = sessions(data)
-    if not len(error) or session.max() == 0:
+    if not len(error):
         return ()
-    count = np.maximum(np.isfinite(error[..., 0]).sum(axis=0), 1)[:, None]
-    mean = np.nansum(error, axis=0) / count
-    place = np.nansum(np.where(np.isfinite(error), np.moveaxis(data.y, 1, 0), np.nan), axis=0)
-    known = np.isfinite(error[..., 0]).any(axis=0)
-    rows, label = np.flatnonzero(known), session[known]
-    many = np.bincount(label)
-    if len(many) < 2 or many[many > 0].min() < FEWEST:
+    known = np.isfinite(error[..., 0])
+    order = visits(data)
+    order = order[known.any(axis=0)[order]]
+    count = known.sum(axis=0)[order, None]
+    mean = np.nansum(error[:, order], axis=0) / count
+    place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
+    poses = Rigid.of(place, mean)
+    starts = sorted(jumps_in(poses, 0, len(order)))
+    if not starts:
         return ()
-    place = (place / count)[rows]
-    place = place - place.mean(axis=0)
-    lever = max(float(np.sqrt((place**2).mean())), FAINT)
-    turn = np.cross(np.eye(3)[None], place[:, None] / lever)  # a turn about each axis, in levers
-    design = np.concatenate([np.broadcast_to(np.eye(3), turn.shape), turn], axis=1)
-    design = np.swapaxes(design, 1, 2)
-    value = mean[rows].reshape(-1)
-    one = design.reshape(-1, 6)
-    each = np.concatenate(
-        [np.where((label == s)[:, None, None], design, 0.0) for s in np.unique(label)], axis=2
-    ).reshape(len(value), -1)
-    left = [float(((value - a @ np.linalg.lstsq(a, value)[0]) ** 2).sum()) for a in (one, each)]
-    dof, more = len(value) - each.shape[1], each.shape[1] - 6
-    ratio = (left[0] - left[1]) / more / max(left[1] / dof, 1e-30)
-    if stats.f.sf(ratio, more, dof) > 0.1 * FALSE_ALARM or left[0] < 1.1 * left[1]:
-        return ()
-    jump = float(np.sqrt(max(left[0] - left[1], 0.0) / len(rows)))
+    edges = [0, *starts, len(order)]
+    step = [poses.fitted(a, b) for a, b in pairwise(edges)]
+    sizes = [poses.size(later - earlier) for earlier, later in pairwise(step)]
+    told = ", ".join(
+        f"line {data.line[order[at]]} on by {1e3 * size:.3g} mm"
+        for at, size in zip(starts, sizes, strict=True)
+    )
     return (
         Fault(
             "session_jump",
             "frame",
-            "the whole robot stands elsewhere from session to session (about "
-            f"{1e3 * jump:.3g} mm): was the instrument or the base moved, or is the workspace "
-            "another one?",
-            rows[label > label[0]],
-            parameters=(Amount("size", jump, "m"),),
+            f"{data.source}: all targets stand elsewhere from {told}: was the instrument or the "
+            "base moved, or another workspace measured? name the sessions in a column `session`, "
+            "or free the jump (--effects session_jump)",
+            order[starts[0] :],
+            parameters=tuple(Amount("size", size, "m") for size in sizes),
         ),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """Small displacements of poses as one body, summed up pose by pose.
+
+    design: (m, 3, 6) motion of each pose's mean point along and about the axes, turns in levers.
+    value: (m, 3) its error [m].  gram: (m + 1, 6, 6), pull: (m + 1, 6), square: (m + 1,) sums over
+    the poses before.
+    """
+
+    design: Array
+    value: Array
+    gram: Array
+    pull: Array
+    square: Array
+
+    @staticmethod
+    def of(place: Array, value: Array) -> Rigid:
+        """Of poses in their order.  place: (m, 3) mean point, value: (m, 3) mean error [m]."""
+        place = place - place.mean(axis=0)
+        lever = max(float(np.sqrt((place**2).mean())), FAINT)
+        turn = np.cross(np.eye(3)[None], place[:, None] / lever)
+        shift = np.broadcast_to(np.eye(3), turn.shape)
+        design = np.swapaxes(np.concatenate([shift, turn], axis=1), 1, 2)
+        parts = (
+            np.swapaxes(design, 1, 2) @ design,
+            np.einsum("mij,mi->mj", design, value),
+            (value**2).sum(axis=1),
+        )
+        sums = [np.concatenate([0.0 * part[:1], np.cumsum(part, axis=0)]) for part in parts]
+        return Rigid(design, value, *sums)
+
+    def left(self, first: Array, last: Array) -> Array:
+        """(...) squares that one displacement for the poses first to last - 1 leaves [m^2]."""
+        gram, pull = self.gram[last] - self.gram[first], self.pull[last] - self.pull[first]
+        gram = gram + 1e-9 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] * np.eye(6)
+        explained = np.einsum("...i,...i", pull, np.linalg.solve(gram, pull[..., None])[..., 0])
+        return np.asarray(self.square[last] - self.square[first] - explained)
+
+    def fitted(self, first: int, last: int) -> Array:
+        """(6,) the displacement of some poses."""
+        gram, pull = self.gram[last] - self.gram[first], self.pull[last] - self.pull[first]
+        return np.asarray(np.linalg.lstsq(gram, pull, rcond=1e-9)[0])
+
+    def size(self, step: Array) -> float:
+        """RMS motion of all poses by a displacement [m]."""
+        return float(np.sqrt(((self.design @ step) ** 2).sum(axis=1).mean()))
+
+
+def jumps_in(poses: Rigid, first: int, last: int) -> list[int]:
+    """Where the poses first to last - 1 jump, in no order."""
+    at = np.arange(first + FEWEST, last - FEWEST + 1)
+    dof = 3 * (last - first) - 12
+    if not len(at) or dof < 1:
+        return []
+    ends = np.full(at.shape, first), np.full(at.shape, last)
+    apart = poses.left(ends[0], at) + poses.left(at, ends[1])
+    best = int(np.argmin(apart))
+    whole, two = float(poses.left(np.array(first), np.array(last))), float(apart[best])
+    ratio = (whole - two) / 6.0 / max(two / dof, 1e-30)
+    if stats.f.sf(ratio, 6, dof) * len(at) > 0.1 * FALSE_ALARM or whole < CLEAR * two:
+        return []
+    here = int(at[best])
+    return [here, *jumps_in(poses, first, here), *jumps_in(poses, here, last)]
