@@ -59,7 +59,17 @@ def causes_of(
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
     """The library and what it explains."""
     library = selection.library(study.scene, study.rows, exclude)
+    if "session_jump" not in exclude:
+        library = with_jumps(library, study)
     return library, selection.select(library, ripple="gear_ripple" not in exclude)
+
+
+def with_jumps(library: Library, study: Study) -> Library:
+    """The library with the jumps at the moments that the errors show."""
+    tries = float(study.data.poses)
+    terms = [(Term("session_jump", "frame", {"since": t}), tries) for t in study.moments.tolist()]
+    wider, found = library.with_terms(terms)
+    return replace(wider, candidates=(*library.candidates, *found))
 
 
 def read_back_fault(study: Study, choice: Choice) -> list[Fault]:

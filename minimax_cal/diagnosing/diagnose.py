@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +23,14 @@ from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
+from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended
-from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.faults import Fault, find_faults, in_lines, jumps, mended
+from minimax_cal.measuring.grouping import held_out, split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -77,6 +77,8 @@ def examined(
     """The diagnosis of checked measurements.  began: when the work did [s]."""
     progress("data faults")
     raw = with_history(given)
+    seen, _ = held_out(raw, holdout, seed)
+    raw = stationed(robot, raw, ~seen)
     clean = cleaned(robot, raw, seed, holdout, progress)
     train, held, notices = split(clean.data, holdout, seed)
     if not held.poses:
@@ -84,6 +86,7 @@ def examined(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
+    study = replace(study, moments=clean.moments)
     causes = causes_of(study, clean.faults, exclude, progress)
     progress("gap ladder")
     gap = gap_of(study, raw, clean.data, held, causes, seed, holdout)
@@ -119,7 +122,7 @@ def examined(
         notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
         provenance=Provenance.of(robot, given, settings),
         seconds=time.perf_counter() - began,
-        data=clean.data,
+        data=study.geometric.placed(clean.data),
         held=np.isin(clean.data.line, held.line),
         cells=gap.cells,
     )
@@ -147,13 +150,14 @@ class Clean:
     """Measurements with rows and points put right or left out.
 
     faults: their rows as lines of the file.  remarks: on them, for people.  fit: the geometric fit
-    of the training poses, where it is that of the clean data.
+    of the training poses, where it is that of the clean data.  moments: as `Study` has them.
     """
 
     data: Measurements
     faults: tuple[Fault, ...]
     remarks: tuple[str, ...]
     fit: Solved | None
+    moments: Array
 
 
 def cleaned(
@@ -167,7 +171,8 @@ def cleaned(
     train, _, _ = split(sound, holdout, seed)
     progress("geometry")
     fit = fit_cell(robot, train, SUM, progress)
-    error = Cell.of(robot, fit.state, sound.target_names).error(sound)
+    cell = fit.cell(robot, sound)
+    error = cell.error(sound)
     more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
     faults = (
         *exchanged,
@@ -175,9 +180,11 @@ def cleaned(
         *in_lines(sound, more, "outliers"),
     )
     sound = mended(sound, more)
+    jumped, _ = jumps(cell.placed(sound), cell.error(sound))
+    moments = sound.columns["clock"][jumped]
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
-    return Clean(sound, faults, remarks, None if more else fit)
+    return Clean(sound, faults, remarks, None if more else fit, moments)
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:

@@ -99,9 +99,7 @@ def geometric_steps(
         return [nominal, step_of("geometric", geometric, train, held)], geometric.error(held)
     first, rest, _ = split(raw, holdout, seed)
     fit = fit_cell(study.robot, first, SUM, silent)
-    start, wrong = (
-        Cell.of(study.robot, state, raw.target_names) for state in (fit.nominal, fit.state)
-    )
+    start, wrong = fit.nominal_cell(study.robot, raw), fit.cell(study.robot, raw)
     steps = [
         step_of("nominal", start, first, rest),
         step_of("geometric", wrong, first, rest),
@@ -195,7 +193,9 @@ def blocked(study: Study, data: Measurements, cell: Cell) -> dict[str, float | N
 
     A random choice of held-out poses does not show what drifts; this does.
     """
-    terms, values = cell.effects.terms, np.concatenate([np.zeros(0), *cell.effects.values])
+    own = len(study.fit.effects.terms)  # frames of sessions are free anyway
+    terms, found = cell.effects.terms[own:], cell.effects.values[own:]
+    values = np.concatenate([np.zeros(0), *found])
     clock = data.columns["clock"]
     late = clock > np.quantile(clock, 0.8)
     first, last = data.take(~late), data.take(late)

@@ -19,7 +19,7 @@ from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import Term, fields_of, of_sessions
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
@@ -128,6 +128,8 @@ class Site:
             y=np.zeros((k, 3, m)),
             weight=self.plan.weight,
         )
+        if free := of_sessions(self.plan.data.frames):
+            model = replace(model, fields=fields_of(free, self.whole))
         return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1), (0, 3)))
 
     def lines(self, poses: slice) -> slice:

@@ -28,9 +28,8 @@ from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.stations import jumps, pose_of, stationed, steps_of
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring import checks
+from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.faults import session_jumps
 from minimax_cal.measuring.grouping import groups, parts, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -44,6 +43,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
+JUMP = ("session_jump", "session_jump:frame")  # without its moment
 NAMED = 5  # implausible changes that are told one by one
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
@@ -124,6 +124,7 @@ def calibrate(
     check(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
+    options = with_jump(robot, poses, options, progress)
     solved = fit_cell(robot, poses.train, options, progress)
     return judged(robot, options, poses, solved, began)
 
@@ -170,30 +171,47 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     return Parts(data, train, held, notices)
 
 
+def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) -> Options:
+    """The options with the moment of a jump that was asked for without one.
+
+    That of the largest in the errors of the geometry, on all poses: held-out ones between the last
+    training pose before it and the first one after could not be placed otherwise.
+    """
+    if not any(text in JUMP for text in options.effects):
+        return options
+    plain = replace(options, effects=(), objective="sum")
+    cell = fit_cell(robot, poses.train, plain, progress).cell(robot, poses.data)
+    rows, sizes = faults.jumps(cell.placed(poses.data), cell.error(poses.data))
+    if not len(rows):
+        return options
+    since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
+    found = Term("session_jump", "frame", {"since": since})
+    return replace(options, effects=[found if e in JUMP else e for e in options.effects])
+
+
 def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: float) -> Fit:
     """The fit with its accuracy on training and on held-out poses."""
-    held, names = np.isin(poses.data.line, poses.held.line), poses.data.target_names
-    data = seen_from(poses.data, solved.frames)
-    calibrated = Cell.of(robot, solved.state, names, solved.effects, Sessions.of(data))
-    nominal = Cell.of(robot, solved.nominal, names, NOTHING, Sessions.of(poses.data))
-    before, after = nominal.error(data), calibrated.error(data)
+    held = np.isin(poses.data.line, poses.held.line)
+    cell, nominal = solved.cell(robot, poses.data), solved.nominal_cell(robot, poses.data)
+    data = cell.placed(poses.data)
+    before, after = nominal.error(data), cell.error(data)
     notices = (
         *poses.notices,
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
-        *(fault.text for fault in session_jumps(data, after)),
+        *(fault.text for fault in faults.session_jumps(data, after)),
         *doubts(robot, solved, before[:, ~held]),
     )
     return Fit(
-        cell=calibrated,
+        cell=cell,
         nominal=nominal,
         objective=options.objective,
         qp=usable(options.qp)[0],  # the one that ran
         status=solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
-        parameters=parameter_table(robot, solved, poses.data.frames),
+        parameters=parameter_table(robot, solved),
         accuracy={
             "nominal": accuracy(before[:, held]),
             "train": accuracy(after[:, ~held]),
@@ -281,13 +299,12 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
-def parameter_table(robot: Robot, solved: Solved, start: Frames) -> Parameters:
+def parameter_table(robot: Robot, solved: Solved) -> Parameters:
     """Every parameter, link by link.
 
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
-    Those of `session_jump` tell where it stands in a further session (`stations.jumps`).  start:
-    the frames of the sessions for the nominal robot.
+    Those of `session_jump` tell where it stands in a further session (`stations.jumps`).
     """
     names, n = solved.names, robot.joints
     known = solved.identification.active
@@ -301,7 +318,7 @@ def parameter_table(robot: Robot, solved: Solved, start: Frames) -> Parameters:
         effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))
         return np.concatenate([*parts, stood, effects])
 
-    before = values(solved.nominal, start)
+    before = values(solved.nominal, solved.start)
     value = np.where(known, values(solved.state, solved.frames), before)
     order = [kind * n + joint for joint in range(n) for kind in range(5)]
     every = tuple(

@@ -24,7 +24,8 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.grouping import clusters, groups
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.stations import Frames, seen_from
+from minimax_cal.measuring.stations import Frames, Sessions, seen_from
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Fitted, Term, names_of, of_sessions
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
@@ -69,7 +70,7 @@ class Solved:
     trace: cost at each iterate of the least squares [m^2].
     effects: those asked for, with their values; units: of each value.
     robust: the weights of the points, and which stand out.
-    frames: of the sessions, where there are several.
+    start, frames: of the sessions, where there are several, for the nominal and for this robot.
     """
 
     nominal: State
@@ -87,7 +88,18 @@ class Solved:
     effects: Fitted
     units: tuple[str, ...]
     robust: Robust
+    start: Frames = field(default_factory=dict)
     frames: Frames = field(default_factory=dict)
+
+    def cell(self, robot: Robot, data: Measurements) -> Cell:
+        """The calibrated robot in its place.  data: all poses of the fit, held out or not."""
+        sessions = Sessions.of(seen_from(data, self.frames))
+        return Cell.of(robot, self.state, data.target_names, self.effects, sessions)
+
+    def nominal_cell(self, robot: Robot, data: Measurements) -> Cell:
+        """The same of the nominal robot."""
+        sessions = Sessions.of(seen_from(data, self.start))
+        return Cell.of(robot, self.nominal, data.target_names, sessions=sessions)
 
     @property
     def names(self) -> Names:
@@ -198,7 +210,7 @@ def fit_cell(
 
     data: with the points of all sessions in one frame (`stations.stationed`).
     """
-    task = prepared(robot, data, options)
+    task, begun = prepared(robot, data, options), data.frames
     mix = NO_MIX
     if options.objective == "pose":
         check_poses(data)
@@ -236,6 +248,7 @@ def fit_cell(
         effects=fitted(stage.terms, scene, state.effects),
         units=names_of(stage.terms, scene)[1],
         robust=stage.robust,
+        start=begun,
         frames=data.frames,
     )
 

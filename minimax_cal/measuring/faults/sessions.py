@@ -11,7 +11,7 @@ from scipy import stats
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
-from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
+from minimax_cal.measuring.faults.fault import NO_ERROR, NONE, Amount, Fault
 from minimax_cal.measuring.faults.limits import FALSE_ALARM
 from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
@@ -56,30 +56,13 @@ def strange_ratios(
 
 
 def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
-    """Moments from which on the residual of a fit has moved as a whole: jumps of base or instrument.
-
-    The mean errors of the poses' targets, as visited, are explained by one small displacement (6)
-    for all, or by another one from some pose on: the best such pose is tried against chance (F-test
-    times the poses tried), and so are both sides in their turn.
-    """
-    if not len(error):
+    """A notice if the residual of a fit moves as a whole from some pose on; see `jumps`."""
+    rows, sizes = jumps(data, error) if len(error) else (NONE, np.zeros(0))
+    if not len(rows):
         return ()
-    known = np.isfinite(error[..., 0])
-    order = visits(data)
-    order = order[known.any(axis=0)[order]]
-    count = known.sum(axis=0)[order, None]
-    mean = np.nansum(error[:, order], axis=0) / count
-    place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
-    poses = Rigid.of(place, mean)
-    starts = sorted(jumps_in(poses, 0, len(order)))
-    if not starts:
-        return ()
-    edges = [0, *starts, len(order)]
-    step = [poses.fitted(a, b) for a, b in pairwise(edges)]
-    sizes = [poses.size(later - earlier) for earlier, later in pairwise(step)]
     told = ", ".join(
-        f"line {data.line[order[at]]} on by {1e3 * size:.3g} mm"
-        for at, size in zip(starts, sizes, strict=True)
+        f"line {line} on by {1e3 * size:.3g} mm"
+        for line, size in zip(data.line[rows], sizes, strict=True)
     )
     return (
         Fault(
@@ -88,10 +71,31 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
             f"{data.source}: all targets stand elsewhere from {told}: was the instrument or the "
             "base moved, or another workspace measured? name the sessions in a column `session`, "
             "or free the jump (--effects session_jump)",
-            order[starts[0] :],
-            parameters=tuple(Amount("size", size, "m") for size in sizes),
+            rows,
+            parameters=tuple(Amount("size", float(size), "m") for size in sizes),
         ),
     )
+
+
+def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
+    """Rows (j,) from which on, as visited, all targets have moved as one body, and how far [m].
+
+    The mean errors of the poses' targets are explained by one small displacement (6) for all, or
+    by another one from some pose on: the best such pose is tried against chance (F-test times the
+    poses tried), and so are both sides in their turn.  error: (k, m, 3) of a fit, in the axes of
+    the data [m].
+    """
+    known = np.asarray(np.isfinite(error[..., 0]))
+    order = visits(data)
+    order = order[known.any(axis=0)[order]]
+    count = known.sum(axis=0)[order, None]
+    mean = np.nansum(error[:, order], axis=0) / count
+    place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
+    poses = Rigid.of(place, mean)
+    starts = sorted(jumps_in(poses, 0, len(order)))
+    steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(order)])]
+    sizes = [poses.size(later - earlier) for earlier, later in pairwise(steps)]
+    return order[np.array(starts, dtype=int)], np.array(sizes)
 
 
 @dataclass(frozen=True, eq=False)
