@@ -10,16 +10,28 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import causes_of, explained, fault_findings, judged
-from minimax_cal.diagnosing.gap import blocked, gap_of, with_shares
-from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
+from minimax_cal.diagnosing.folds import beyond_of
+from minimax_cal.diagnosing.gap import (
+    FAULTS,
+    Judges,
+    Ladder,
+    climbed,
+    closed_share,
+    shaky,
+    valued,
+    with_shares,
+)
+from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.where import Where, where
-from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import resemblances
+from minimax_cal.evidence.library import library
+from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
-from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
+from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
@@ -27,12 +39,15 @@ from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import Fault, find_faults, in_lines, jumps, mended
-from minimax_cal.measuring.grouping import held_out, split
+from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
+from minimax_cal.measuring.floor import floor_of
+from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot
+
+NOT_ASKED = Beyond(reason="not asked for")
 
 
 def diagnose(
@@ -41,14 +56,18 @@ def diagnose(
     *,
     seed: int = 0,
     holdout: float = 0.2,
+    holdout_by: str | None = None,
     exclude: Sequence[str] = (),
+    quick: bool = False,
     progress: Progress = silent,
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
     robot, data: loaded, or a name or path.  seed, holdout: of the poses kept out of the fit, and
-    their share.  exclude: effects that are not to be considered.  progress: called with a word on
-    each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
+    their share; holdout_by: a column (session, group ...) or region, whose poses are held out
+    together.  exclude: effects that are not to be considered.  quick: leave no parts of the poses
+    out in turn, so that there is no claim beyond the measured poses.  progress: called with a
+    word on each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
     CalibrationError for wrong input.
 
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
@@ -61,71 +80,137 @@ def diagnose(
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
     checks.check_joints(robot, given)
     checks.check_spread(given)
-    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
-        return examined(robot, given, seed, holdout, exclude, progress, began)
-
-
-def examined(
-    robot: Robot,
-    given: Measurements,
-    seed: int,
-    holdout: float,
-    exclude: Sequence[str],
-    progress: Progress,
-    began: float,
-) -> Diagnosis:
-    """The diagnosis of checked measurements.  began: when the work did [s]."""
-    progress("data faults")
-    raw = with_history(given)
-    seen, _ = held_out(raw, holdout, seed)
-    raw = stationed(robot, raw, ~seen)
-    clean = cleaned(robot, raw, seed, holdout, progress)
-    train, held, notices = split(clean.data, holdout, seed)
-    if not held.poses:
+    options = DiagnosisOptions(seed, holdout, holdout_by, tuple(exclude), quick)
+    raw = with_groups(with_history(given))
+    held, notices = held_out(raw, holdout, seed, holdout_by)
+    if not held.any():
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
+    raw = stationed(robot, raw, ~held)
+    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
+        return examined(Asked(robot, raw, held, options), notices, progress, began)
+
+
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """Arguments of `diagnose`."""
+
+    seed: int
+    holdout: float
+    holdout_by: str | None
+    exclude: tuple[str, ...]
+    quick: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be diagnosed.  held: (m,) of the poses as given, True for those no fit may see."""
+
+    robot: Robot
+    data: Measurements
+    held: Array
+    options: DiagnosisOptions
+
+    def train(self, data: Measurements) -> Measurements:
+        """Of some of the rows those that fits may see."""
+        return data.take(~np.isin(data.line, self.data.line[self.held]))
+
+
+def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: float) -> Diagnosis:
+    """The diagnosis of checked measurements.  began: when the work did [s]."""
+    progress("data faults")
+    robot, options = asked.robot, asked.options
+    clean = cleaned(asked, progress)
+    train = asked.train(clean.data)
+    judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
-    causes = causes_of(study, clean.faults, exclude, progress)
-    progress("gap ladder")
-    gap = gap_of(study, raw, clean.data, held, causes, seed, holdout)
-    findings = with_shares([*fault_findings(causes.faults), *causes.effects], gap.steps, gap.floor)
-    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
-    if verdict == "none" and gap.shaky(noise):
-        verdict = "not_repeatable"
-    lies = located(study)
-    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
-    settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
-    told = reasons(
-        verdict, gap.steps, gap.floor, findings, gap.closed, gap.closed_ci, structure_left
+    progress("gap ladder")
+    ladder = climbed(study, [finding.terms for finding in causes.effects], noise)
+    steps = steps_of(asked, study, judges, causes, ladder)
+    floor = floor_of(
+        clean.data,
+        ladder.last.cell.error(clean.data),
+        robot.repeatability,
+        min(noise_mm(study.rows, noise), ladder.last.train.rms_mm),
     )
+    closed, interval = closed_share(ladder, judges, floor, options.seed)
+    effects = valued(causes.effects, ladder)
+    findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
+    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    if verdict == "none" and shaky(floor, noise, steps[-1]):
+        verdict = "not_repeatable"
+    beyond = NOT_ASKED
+    if not options.quick:
+        beyond = beyond_of(study, judges, options.exclude, progress)
+    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
+    settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=told,
+        reasons=reasons(verdict, steps, floor, findings, closed, interval, structure_left, beyond),
         findings=tuple(findings),
-        ladder=gap.steps,
-        floor=gap.floor,
-        floor_from=gap.floor_from,
-        closed=gap.closed,
-        closed_ci=gap.closed_ci,
-        blocked=blocked(study, clean.data, gap.cells[-1]),
+        ladder=tuple(steps),
+        floor=floor,
+        closed=closed,
+        closed_ci=interval,
+        beyond=beyond,
         noise=float(np.sqrt(noise.variance)),
         jitter=noise.jitter,
         structure=structure_left[1],
         structure_in=structure_left[0],
-        where=lies.to_dict(),
+        where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
-        provenance=Provenance.of(robot, given, settings),
+        notices=(*asked.data.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
+        provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
-        held=np.isin(clean.data.line, held.line),
-        cells=gap.cells,
+        held=~np.isin(clean.data.line, train.line),
+        cells=tuple(fit.cell for fit in ladder.fits),
     )
+
+
+def steps_of(
+    asked: Asked, study: Study, judges: Judges, causes: Causes, ladder: Ladder
+) -> list[Step]:
+    """The rungs, each judged: faults of the data first, by what they do to a fit."""
+    steps = [judges.step("nominal", study.nominal)]
+    spoilt = dict.fromkeys(f.effect for f in causes.faults if f.effect in FAULTS)
+    first = ladder.fits[0].cell
+    if spoilt:
+        train = asked.train(asked.data)
+        fit = fit_cell(asked.robot, train, SUM, silent)
+        whole = replace(judges, train=train)
+        steps = [
+            whole.step("nominal", fit.nominal_cell(asked.robot, train)),
+            whole.step("geometric", fit.cell(asked.robot, train)),
+        ]
+    steps.append(judges.step(f"without {' and '.join(spoilt)}" if spoilt else "geometric", first))
+    for number, wider in zip(ladder.taken, ladder.fits[1:], strict=True):
+        term = causes.effects[number].term
+        steps.append(judges.step(f"+ {term.effect} {term.place}", wider.cell))
+    return steps
+
+
+def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
+    """Who judges: every held-out point as measured, those that stand out marked."""
+    held = asked.data.take(asked.held)
+    right = dict(zip(clean.given.line, clean.given.y, strict=True))
+    held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
+    sound = dict(zip(clean.data.line, clean.data.seen, strict=True))
+    nothing = np.zeros(len(held.target_names), dtype=bool)
+    kept = np.array([sound.get(line, nothing) for line in held.line]).T
+    return Judges(train, held, held.seen.T & ~kept)
+
+
+def noise_mm(rows: Rows, noise: Noise) -> float:
+    """RMS distance that a fit takes for noise [mm]."""
+    spread = noise.variance * (1.0 + noise.ratio * rows.variance_ratio).sum() / max(rows.count, 1)
+    return 1e3 * float(np.sqrt(3.0 * spread))
 
 
 def located(study: Study) -> Where:
@@ -149,28 +234,28 @@ def located(study: Study) -> Where:
 class Clean:
     """Measurements with rows and points put right or left out.
 
-    faults: their rows as lines of the file.  remarks: on them, for people.  fit: the geometric fit
-    of the training poses, where it is that of the clean data.  moments: as `Study` has them.
+    given: as measured, but for points that stood in each other's rows.  faults: their rows as lines
+    of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
+    it is that of the clean data.  moments: as `Study` has them.
     """
 
     data: Measurements
+    given: Measurements
     faults: tuple[Fault, ...]
     remarks: tuple[str, ...]
     fit: Solved | None
     moments: Array
 
 
-def cleaned(
-    robot: Robot, data: Measurements, seed: int, holdout: float, progress: Progress
-) -> Clean:
+def cleaned(asked: Asked, progress: Progress) -> Clean:
     """The data without the faults that can be mended."""
-    data, exchanged = in_order(robot, data)
+    robot = asked.robot
+    data, exchanged = in_order(robot, asked.data)
     found = find_faults(data)
     sound = mended(data, found)
     check_plausible(robot, sound)
-    train, _, _ = split(sound, holdout, seed)
     progress("geometry")
-    fit = fit_cell(robot, train, SUM, progress)
+    fit = fit_cell(robot, asked.train(sound), SUM, progress)
     cell = fit.cell(robot, sound)
     error = cell.error(sound)
     more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
@@ -180,11 +265,13 @@ def cleaned(
         *in_lines(sound, more, "outliers"),
     )
     sound = mended(sound, more)
-    jumped, _ = jumps(cell.placed(sound), cell.error(sound))
-    moments = sound.columns["clock"][jumped]
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
-    remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
-    return Clean(sound, faults, remarks, None if more else fit, moments)
+    jumped = session_jumps(cell.placed(sound), cell.error(sound))
+    told = (*found, *more, *jumped)
+    remarks = tuple(fault.text for fault in told if fault.effect != "target_shift")
+    rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
+    moments = sound.columns["clock"][rows]
+    return Clean(sound, data, faults, remarks, None if more else fit, moments)
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:
@@ -212,4 +299,4 @@ def resemblance(
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)
     moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
-    return resemblances(selection.library(study.scene, study.rows), moved)
+    return resemblances(library(study.scene, study.rows), moved)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,19 +9,16 @@ import numpy as np
 from minimax_cal.evidence.noise import Rows, linearised
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
-from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.stations import Sessions, seen_from
+from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
-from minimax_cal.modelling.joint_fit import extended, refitted, scene_of
+from minimax_cal.modelling.joint_fit import extended, scene_of
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.robots.robot import Robot
 
 SUM = Options(objective="sum")
-ANY: Array = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +35,7 @@ class Study:
     fit: Solved
     scene: Scene
     rows: Rows
-    moments: Array = field(default_factory=lambda: ANY)
-
-    def cell(self, data: Measurements, terms: Sequence[Term] = (), usual: Array = ANY) -> Cell:
-        """Geometry and effects fitted to some poses, from the fit of the training poses.
-
-        usual: (e,) size of the effects' parameters, where the poses may not tell them.
-        """
-        start, active = self.fit.state, self.fit.identification.active[: self.model.names.geometric]
-        data, free = seen_from(data, self.data.frames), self.fit.effects.terms
-        if len(usual):
-            usual = np.concatenate([np.full(steps_of(data.frames), np.inf), usual])
-        state, effects = refitted(self.robot, data, start, active, (*free, *terms), usual)
-        return Cell.of(self.robot, state, data.target_names, effects, Sessions.of(self.data))
+    moments: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def geometric(self) -> Cell:

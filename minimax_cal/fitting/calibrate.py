@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
+from minimax_cal.fitting.claims import bad_rows, beyond_of, contradiction, unseen_suspects
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.options import (
     Options,
@@ -25,21 +25,18 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
-from minimax_cal.fitting.stations import jumps, pose_of, stationed, steps_of
-from minimax_cal.fitting.uncertainty import Estimator
+from minimax_cal.fitting.stations import jumps, pose_of, stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.grouping import groups, parts, split, with_groups
+from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.measuring.stations import Frames, Sessions, seen_from
-from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import NOTHING, Term, of_sessions
-from minimax_cal.modelling.joint_fit import extended, fitted, refitted
-from minimax_cal.modelling.model import model_of
+from minimax_cal.measuring.stations import Frames, seen_from
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
@@ -195,6 +192,8 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
     cell, nominal = solved.cell(robot, poses.data), solved.nominal_cell(robot, poses.data)
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
+    suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    wrong = contradiction(robot, data, after, held, suspects)
     notices = (
         *poses.notices,
         *solved.notices,
@@ -202,13 +201,15 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *(fault.text for fault in faults.session_jumps(data, after)),
         *doubts(robot, solved, before[:, ~held]),
+        *bad_rows(suspects, data.source),
+        *([wrong] if wrong else []),
     )
     return Fit(
         cell=cell,
         nominal=nominal,
         objective=options.objective,
         qp=usable(options.qp)[0],  # the one that ran
-        status=solved.status,
+        status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
         parameters=parameter_table(robot, solved),
@@ -229,40 +230,14 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         error=after,
         notices=notices,
         loss=options.loss,
-        suspects=solved.robust.suspects,
+        suspects=suspects,
         weights=solved.robust.weights,
         share=solved.estimator.share,
         prior=solved.estimator.model.prior.weight,
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
-        beyond=beyond_of(robot, options, data, held, solved),
+        beyond=beyond_of(robot, options, data, held, solved, suspects),
     )
-
-
-def beyond_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Beyond:
-    """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
-    every, free = solved.effects.terms, of_sessions(data.frames)
-    names, sessions = data.target_names, Sessions.of(data)
-    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
-
-    def error_of(state: State, rows: Array) -> Array:
-        terms = free if len(state.effects) == steps_of(data.frames) else every
-        effects = fitted(terms, scene, state.effects)
-        return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
-
-    geometric = None
-    if every != free:
-        train = data.take(~held)
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
-        state, _ = refitted(robot, train, solved.state, active, free, np.zeros(0))
-        model = model_of(robot, train).only(active)
-        if free:
-            model, _ = extended(model, robot, train, state, free)
-        geometric = Estimator(model, np.ones(len(names))), state
-    found = parts(data, options.holdout_by)
-    return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
 
 
 def remarks(options: Options, poses: Parts) -> Iterator[str]:

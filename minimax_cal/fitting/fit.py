@@ -20,7 +20,7 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.suspects import Suspect, table_of
+from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
@@ -28,7 +28,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import Accuracy, before_and_after
+from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
@@ -318,6 +318,11 @@ class Fit:
         }
 
     @property
+    def trusted(self) -> Accuracy:
+        """On the held-out points that do not stand out."""
+        return accuracy(aside(self.error, self.data, self.suspects)[:, self.held])
+
+    @property
     def covariance(self) -> Array:
         """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
         return self.known.covariance
@@ -391,11 +396,18 @@ class Fit:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
+        """What the table of accuracy tells, with titles."""
+        for title, key in ACCURACIES:
+            yield title, self.accuracy[key]
+            if key == "holdout" and any(one.held for one in self.suspects):
+                yield f"{title}, without suspects", self.trusted
+
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
         rows: list[tuple[TableCell, ...]] = [
             (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
+            for title, a in self.accuracies()
         ]
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(

@@ -11,7 +11,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of
+from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of, of_sessions
 from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
@@ -85,29 +85,16 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 
-def refitted(
-    robot: Robot,
-    data: Measurements,
-    start: State,
-    active: Array,
-    terms: Sequence[Term],
-    usual: Array,
-) -> tuple[State, Fitted]:
-    """Least squares from a fit that is near: geometry on some poses, jointly with effects.
+def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> tuple[Model, State]:
+    """Geometry alone by least squares, from a fit that is near, and where it ends.
 
-    start: of the geometry.  active: (p,) the geometric parameters that are free.  usual: (e,) size
-    of the effects' parameters, a prior where the poses do not tell them; empty for none.
+    active: (p,) the geometric parameters that are free; so are the frames of further sessions.
     """
-    model, state = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    model, begin = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    if free := of_sessions(data.frames):
+        model, begin = extended(model, robot, data, begin, free)
     points, method = float(model.counts.sum()), least_squares.METHODS["snllm"]
-    for _ in range(2 if terms else 1):
-        wide, begin = extended(model, robot, data, state, terms) if terms else (model, state)
-        if len(usual):
-            spread = float(model.cost(replace(state, effects=np.zeros(0))).sum()) / (3.0 * points)
-            weight = np.concatenate([np.zeros(len(active)), spread / np.maximum(usual, 1e-30) ** 2])
-            wide = wide.with_prior(Prior(np.zeros(len(weight)), weight))
-        found = least_squares.solve(
-            SumOfSquares(wide), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
-        )
-        state = found.x.take(np.array(0))
-    return state, fitted(terms, scene_of(robot, data, model, state), state.effects)
+    found = least_squares.solve(
+        SumOfSquares(model), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
+    )
+    return model, found.x.take(np.array(0))

@@ -85,9 +85,9 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
     poses tried), and so are both sides in their turn.  error: (k, m, 3) of a fit, in the axes of
     the data [m].
     """
-    known = np.asarray(np.isfinite(error[..., 0]))
+    known = np.isfinite(error[..., 0])
     order = visits(data)
-    order = order[known.any(axis=0)[order]]
+    order = order[np.asarray(known.any(axis=0))[order]]
     count = known.sum(axis=0)[order, None]
     mean = np.nansum(error[:, order], axis=0) / count
     place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
