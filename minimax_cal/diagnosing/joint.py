@@ -117,7 +117,7 @@ def joint(study: Study, terms: Sequence[Term], noise: Noise) -> Joint:
     The frames of further sessions are the first of its effects.
     """
     robot, data, free = study.robot, study.data, study.fit.effects.terms
-    terms = (*free, *(term for term in terms if term not in free))
+    terms = (*free, *(term for term in terms if not term.frees_frames))
     base = study.model.only(study.fit.identification.active)
     weight = weights(study, noise)
     allowed = bounds(study.scene, terms)

@@ -100,7 +100,7 @@ def beyond_of(
         return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
 
     geometric = None
-    if every != free:
+    if len(every) > len(free):
         train = data.take(~held)
         active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
         model, state = refitted(robot, train, solved.state, active)

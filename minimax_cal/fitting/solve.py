@@ -347,7 +347,8 @@ def with_effects(task: Task, stage: Stage) -> tuple[Task, Stage]:
     """The fit with the frames of further sessions, and then the effects, beside the geometry."""
     if free := of_sessions(task.data.frames):
         task, stage = jointly(task, stage, free)
-    if not (asked := [term for term in task.options.effects if term not in free]):
+    asked = [e for e in task.options.effects if not (isinstance(e, Term) and e.frees_frames)]
+    if not asked:
         return task, stage
     robust = stage.robust
     scene = scene_of(task.robot, task.data, robust.plain, stage.state)

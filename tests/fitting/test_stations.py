@@ -103,7 +103,9 @@ def test_a_fit_of_stations_is_as_good_a_source_as_any(
     saved: tuple[mc.Fit, Path],
 ) -> None:
     fit, path = saved
-    found = mc.bootstrap(again(fit, objective="sum"), 20)
+    other = again(fit, objective="sum")
+    assert len(other.parameters) == len(fit.parameters)
+    found = mc.bootstrap(other, 20)
     assert found.lost == 0
     said: list[object] = []
     mc.export(path, "dh-csv", notify=said.append)

@@ -12,7 +12,6 @@ from minimax_cal.fitting.fit import Fit, opened
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
-from minimax_cal.modelling.effects.table import of_sessions
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
@@ -81,8 +80,7 @@ def job_of(fit: Fit | Cell, source: str) -> Job:
         raise OptionError(f"{source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell = fit if isinstance(fit, Cell) else fit.cell
     nominal = fit.nominal if isinstance(fit, Fit) else None
-    frames = of_sessions(cell.sessions.frames)  # where the instrument stood: of no robot
-    labels = tuple(term.label for term in cell.effects.terms if term not in frames)
+    labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
     before = nominal.robot if nominal else cell.robot
     known = nominal is not None
     return Job(cell.robot, before, source, labels, compliance_of(cell), fitted=known)

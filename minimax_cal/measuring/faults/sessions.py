@@ -16,7 +16,8 @@ from minimax_cal.measuring.faults.limits import FALSE_ALARM
 from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
 
-CLEAR = 1.1  # times the squares that a jump leaves: what less explains is of no account
+ROUNDS = 10  # of asking each jump again
+CLEAR = 0.1  # of the squares that all poses as one body leave: a jump explains so much, or is none
 
 
 def mixed_units(data: Measurements) -> tuple[Fault, ...]:
@@ -82,17 +83,17 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
 
     The mean errors of the poses' targets are explained by one small displacement (6) for all, or
     by another one from some pose on: the best such pose is tried against chance (F-test times the
-    poses tried), and so are both sides in their turn.  error: (k, m, 3) of a fit, in the axes of
+    poses tried), and so are both sides (`jumps_in`).  error: (k, m, 3) of a fit, in the axes of
     the data [m].
     """
-    known = np.isfinite(error[..., 0])
+    known = np.isfinite(error[..., 0]) & data.seen.T
     order = visits(data)
     order = order[np.asarray(known.any(axis=0))[order]]
     count = known.sum(axis=0)[order, None]
-    mean = np.nansum(error[:, order], axis=0) / count
+    mean = np.where(known[..., None], error, 0.0).sum(axis=0)[order] / count
     place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
     poses = Rigid.of(place, mean)
-    starts = sorted(jumps_in(poses, 0, len(order)))
+    starts = jumps_in(poses, len(order))
     steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(order)])]
     sizes = [poses.size(later - earlier) for earlier, later in pairwise(steps)]
     return order[np.array(starts, dtype=int)], np.array(sizes)
@@ -146,18 +147,40 @@ class Rigid:
         return float(np.sqrt(((self.design @ step) ** 2).sum(axis=1).mean()))
 
 
-def jumps_in(poses: Rigid, first: int, last: int) -> list[int]:
-    """Where the poses first to last - 1 jump, in no order."""
+def jumps_in(poses: Rigid, count: int) -> list[int]:
+    """Where the poses jump: parts are split while one clearly does; then each jump is asked again.
+
+    Between its neighbours a jump may turn out to stand elsewhere, or nowhere.
+    """
+    found, waiting = [0, count], [(0, count)]
+    while waiting:
+        first, last = waiting.pop()
+        at = jump_between(poses, first, last)
+        if at:
+            found.append(at)
+            waiting += [(first, at), (at, last)]
+    found.sort()
+    for _ in range(ROUNDS):
+        before = list(found)
+        for old in before[1:-1]:
+            i = found.index(old)
+            at = jump_between(poses, found[i - 1], found[i + 1])
+            found[i : i + 1] = [at] if at else []
+        if found == before:
+            break
+    return found[1:-1]
+
+
+def jump_between(poses: Rigid, first: int, last: int) -> int:
+    """The best place for a jump among the poses first to last - 1; 0 where none is clear."""
     at = np.arange(first + FEWEST, last - FEWEST + 1)
     dof = 3 * (last - first) - 12
     if not len(at) or dof < 1:
-        return []
-    ends = np.full(at.shape, first), np.full(at.shape, last)
-    apart = poses.left(ends[0], at) + poses.left(at, ends[1])
+        return 0
+    apart = poses.left(np.full_like(at, first), at) + poses.left(at, np.full_like(at, last))
     best = int(np.argmin(apart))
     whole, two = float(poses.left(np.array(first), np.array(last))), float(apart[best])
     ratio = (whole - two) / 6.0 / max(two / dof, 1e-30)
-    if stats.f.sf(ratio, 6, dof) * len(at) > 0.1 * FALSE_ALARM or whole < CLEAR * two:
-        return []
-    here = int(at[best])
-    return [here, *jumps_in(poses, first, here), *jumps_in(poses, here, last)]
+    chance = stats.f.sf(ratio, 6, dof) * len(at)
+    clear = whole - two > CLEAR * poses.left(np.array(0), np.array(len(poses.value)))
+    return int(at[best]) if clear and chance < 0.1 * FALSE_ALARM else 0

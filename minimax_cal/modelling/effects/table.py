@@ -80,6 +80,11 @@ class Term:
         return f"{self.effect}:{self.place}"
 
     @property
+    def frees_frames(self) -> bool:
+        """Whether it is that of `of_sessions`, which says nothing of the robot."""
+        return "sessions" in self.choice
+
+    @property
     def text(self) -> str:
         """As gear_error:J2:turns=2.0, with the whole choice."""
         return ":".join([self.label, *(f"{k}={float(v)!r}" for k, v in self.choice.items())])
