@@ -112,7 +112,7 @@ def by_weight(choice: Choice) -> list[int]:
     return order
 
 
-def effects_of(study: Study, choice: Choice) -> list[tuple[Term, ...]]:
+def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     """The terms of each effect selected, the weightiest first, all lines of a joint together."""
     out: dict[tuple[str, str], list[Term]] = {}
     for number in by_weight(choice):

@@ -17,7 +17,7 @@ from minimax_cal.diagnosing.gap import (
     Judges,
     Ladder,
     climbed,
-    closed_share,
+    closed,
     shaky,
     valued,
     with_shares,
@@ -25,6 +25,7 @@ from minimax_cal.diagnosing.gap import (
 from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
@@ -137,7 +138,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         robot.repeatability,
         min(noise_mm(study.rows, noise), ladder.last.train.rms_mm),
     )
-    closed, interval = closed_share(ladder, judges, floor, options.seed)
+    share, interval = closed(ladder, judges, floor, options.seed)
     effects = valued(causes.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
     verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
@@ -152,11 +153,11 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=reasons(verdict, steps, floor, findings, closed, interval, structure_left, beyond),
+        reasons=reasons(verdict, steps, floor, findings, share, interval, structure_left, beyond),
         findings=tuple(findings),
         ladder=tuple(steps),
         floor=floor,
-        closed=closed,
+        closed=share,
         closed_ci=interval,
         beyond=beyond,
         noise=float(np.sqrt(noise.variance)),
@@ -259,10 +260,12 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     cell = fit.cell(robot, sound)
     error = cell.error(sound)
     more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
+    wrong = wrong_rows(data, Cell.of(robot, fit.state, data.target_names).error(data))
+    points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (
         *exchanged,
-        *in_lines(data, found, "swapped_rows", "outliers"),
-        *in_lines(sound, more, "outliers"),
+        *in_lines(data, found, "swapped_rows"),
+        *(one for one in points if are_wrong(one, wrong, data.line)),
     )
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))

@@ -41,7 +41,7 @@ def fold_of(study: Study, rows: Array, state: State, exclude: Sequence[str]) -> 
     small = studied(study.robot, study.data.take(rows), fit)
     small = replace(small, moments=study.moments)
     _, choice = chosen(small, exclude)
-    effects = tuple(effects_of(small, choice))
+    effects = tuple(effects_of(choice))
     return Fold(effects, climbed(small, effects, choice.noise))
 
 

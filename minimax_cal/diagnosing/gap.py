@@ -23,9 +23,12 @@ from minimax_cal.modelling.parameters import State
 
 SHAKY = 3.0  # times what the instrument alone would show between visits
 RESAMPLES = 1000
+FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
 FAULTS = ("outliers", "swapped_rows")
+
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +109,12 @@ class Judges:
 
     def step(self, name: str, cell: Cell) -> Step:
         """A rung: the accuracy of a cell."""
-        error = cell.error(self.held)
-        trusted = accuracy(self.sound(error))
-        return Step(name, accuracy(cell.error(self.train)), accuracy(error), trusted)
+        every, trusted = cell.error(self.held), self.errors(cell)
+        return Step(name, accuracy(cell.error(self.train)), accuracy(every), accuracy(trusted))
 
-    def sound(self, error: Array) -> Array:
-        """Errors (k, m, 3) of held-out poses without what stands out."""
-        return np.where(self.far[..., None], np.nan, error)
+    def errors(self, cell: Cell) -> Array:
+        """(k, m, 3) of a cell at the held-out poses, NaN for what stands out [m]."""
+        return np.where(self.far[..., None], np.nan, cell.error(self.held))
 
 
 def both(one: Measurements, other: Measurements) -> Measurements:
@@ -160,38 +162,47 @@ def shaky(floor: Floor, noise: Noise, last: Step) -> bool:
 # ---- how much is closed ------------------------------------------------------------------------
 
 
+def closed(ladder: Ladder, judges: Judges, floor: Floor, seed: int) -> tuple[float, Ends]:
+    """Share of the gap that a ladder closes on held-out poses, and its 95 % interval."""
+    before, after = (judges.errors(fit.cell) for fit in (ladder.fits[0], ladder.last))
+    variance, rng = spared(ladder, judges, floor), np.random.default_rng(seed)
+    return closed_share(before, after, clusters(judges.held), floor, variance, rng)
+
+
 def closed_share(
-    ladder: Ladder, judges: Judges, floor: Floor, seed: int
-) -> tuple[float, tuple[float, float]]:
-    """Share of the gap that is closed on held-out poses, and its 95 % interval.
+    before: Array,
+    after: Array,
+    group: Array,
+    floor: Floor,
+    variance: float,
+    rng: np.random.Generator,
+) -> tuple[float, Ends]:
+    """Share of the gap that is closed, and its 95 % interval.
 
     1 - (after^2 - floor^2) / (before^2 - floor^2) of the RMS distances; NaN where there is no gap.
-    Held-out groups of poses and the floor are drawn anew; what other training poses would change
-    is the jackknife over `SPARED` sets of their groups.
+    Groups of poses and the floor are drawn anew; what other poses of the fit would change is the
+    variance.  before, after: (k, m, 3) errors of the same poses [m].  group: (m,).
     """
-    first, last = ladder.fits[0], ladder.last
-    pair = [sums(judges, fit.cell) for fit in (first, last)]
-    share = share_of([part.sum(axis=1) for part in pair], np.array([floor.least]))[0]
+    pair = [sums(error) for error in (before, after)]
+    share = float(share_of([part.sum(axis=1) for part in pair], np.array([floor.least]))[0])
     if not np.isfinite(share):
-        return float("nan"), (float("nan"), float("nan"))
-    rng = np.random.default_rng(seed)
-    group = np.unique(clusters(judges.held), return_inverse=True)[1].reshape(-1)
+        return share, (share, share)
+    group = np.unique(group, return_inverse=True)[1].reshape(-1)
     count = int(group.max()) + 1
     whole = [np.stack([np.bincount(group, row, count) for row in part]) for part in pair]
     rows = rng.integers(0, count, (RESAMPLES, count))
     drawn = share_of([part[:, rows].sum(axis=-1) for part in whole], floor.drawn(RESAMPLES, rng))
     drawn = drawn[np.isfinite(drawn)]
-    wider = spared(ladder, judges, floor)
+    if len(drawn) < FEWEST:
+        return share, (float("nan"), float("nan"))
     middle = float(np.median(drawn))
-    ends = np.quantile(drawn, (0.025, 0.975))
-    grow = np.sqrt(1.0 + wider / max(float(np.var(drawn)), 1e-300))
-    low, high = middle + grow * (ends - middle)
-    return float(share), (float(min(low, share)), float(max(high, share)))
+    grow = np.sqrt(1.0 + variance / max(float(np.var(drawn)), 1e-300))
+    low, high = middle + grow * (np.quantile(drawn, (0.025, 0.975)) - middle)
+    return share, (float(min(low, share)), float(max(high, share)))
 
 
-def sums(judges: Judges, cell: Cell) -> Array:
-    """(2, m) sum of squares [mm^2] and number of points of each held-out pose."""
-    error = judges.sound(cell.error(judges.held))
+def sums(error: Array) -> Array:
+    """(2, m) sum of squares [mm^2] and number of points of each pose.  error: (k, m, 3) [m]."""
     squares = np.nansum(1e6 * (error**2).sum(axis=-1), axis=0)
     return np.stack([squares, np.isfinite(error[..., 0]).sum(axis=0)])
 
@@ -212,7 +223,7 @@ def spared(ladder: Ladder, judges: Judges, floor: Floor) -> float:
         if states[0] is None or states[1] is None:
             continue
         pair = [
-            sums(judges, fit.with_state(state)).sum(axis=1)
+            sums(judges.errors(fit.with_state(state))).sum(axis=1)
             for fit, state in zip((ladder.fits[0], ladder.last), states, strict=True)
             if isinstance(state, State)
         ]

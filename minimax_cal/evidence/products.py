@@ -112,7 +112,8 @@ class Sums:
     def form(self, index: Array) -> None:
         """Form the products of some columns with all that are there."""
         width = len(self.columns.clear)
-        short = sorted((self.width(i), int(i)) for i in index if self.width(i) < width)
+        once = {int(i) for i in index}  # two of the chosen may share a column
+        short = sorted((self.width(i), i) for i in once if self.width(i) < width)
         for start, group in groupby(short, key=lambda one: one[0]):
             members = [i for _, i in group]
             new = self.between(members, start)

@@ -14,6 +14,7 @@ from experiments.gap_cases import Case, Cause, Sealed, make
 from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
 from minimax_cal.fitting.checks import misplaced, put_right
+from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.modelling.simulate import Simulation
 
 
@@ -32,7 +33,7 @@ def test_nothing_is_named_on_a_sound_arm() -> None:
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.verdict == "none"
     assert found.findings == ()
-    assert abs(found.floor / (1e3 * made.floor) - 1.0) < 0.1
+    assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
     assert "no effect is named" in found.headline()
 
 
@@ -147,13 +148,15 @@ def test_outliers_and_swapped_rows_are_named_and_mended() -> None:
     made = sealed(Cause("outliers", "all", 1.0), seed=7)
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.findings[0].term.effect == "outliers"
-    assert found.ladder[-1].holdout.rms_mm < 1.1e3 * made.floor * 1.05
+    last = found.ladder[-1]
+    assert last.trusted.rms_mm < 1.1e3 * made.floor * 1.05
+    assert last.holdout.rms_mm > 2.0 * last.trusted.rms_mm  # what is held out stays there
     made = sealed(Cause("swapped_rows", "all", 1.0), seed=7)
     found = mc.diagnose(made.robot, made.data, quick=True)
     assert found.findings[0].term.effect == "swapped_rows"
     moved = np.flatnonzero(np.abs(made.displacement).max(axis=(0, 2)) > 0.01)
     assert sorted(found.findings[0].rows) == made.data.line[moved].tolist()
-    assert found.ladder[-1].holdout.rms_mm < 1.1e3 * made.floor * 1.05
+    assert found.ladder[-1].trusted.rms_mm < 1.1e3 * made.floor * 1.05
 
 
 def test_rows_find_their_own_points_again() -> None:
@@ -175,10 +178,13 @@ def test_rows_find_their_own_points_again() -> None:
 def test_closed_share_is_of_squares_above_the_floor() -> None:
     rng = np.random.default_rng(0)
     before, after = (s * rng.normal(size=(3, 4000, 3)) for s in (2e-3, 1e-3))
-    share, (low, high) = closed_share(before, after, np.sqrt(3.0) * 0.5, 0)
+    floor, group = Floor(np.sqrt(3.0) * 0.5, 0.8, 0.9, REPEATS), np.arange(4000)
+    share, (low, high) = closed_share(before, after, group, floor, 0.0, rng)
     assert abs(share - (4.0 - 1.0) / (4.0 - 0.25)) < 0.02
     assert low < share < high
-    none = closed_share(before * 0.0, before * 0.0, 1.0, 0)
+    _, (lower, higher) = closed_share(before, after, group, floor, 0.01, rng)
+    assert higher - lower > 5.0 * (high - low)  # other training poses would have changed it
+    none = closed_share(before * 0.0, before * 0.0, group, floor, 0.0, rng)
     assert np.isnan(none[0])
 
 

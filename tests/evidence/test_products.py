@@ -167,7 +167,10 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     terms = [c.term for c in early.candidates][:6]
     for term in terms:  # one by one, products asked for in between
         (found,) = late.with_terms([(term, 1.0)])
-        late.products.across(RATIOS[:2], found.main)
+        first = late.found[terms[0].text].main  # as two effects that share a column
+        twice = np.concatenate([first, found.main, first])
+        for _ in range(NODES):
+            late.products.across(RATIOS[:2], twice)
     index = np.concatenate([late.found[term.text].main for term in terms])
     same = np.concatenate([c.main for c in early.candidates[:6]])
     p = early.products.columns.fixed
