@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
 from minimax_cal.diagnosing.folds import beyond_of
+from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
     FAULTS,
     Judges,
@@ -166,7 +167,14 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure_in=structure_left[0],
         where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*asked.data.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
+        notices=(
+            *asked.data.notices,
+            *notices,
+            *clean.remarks,
+            *study.fit.notices,
+            *foot_notices(ladder.last, clean.data),
+            *wrong,
+        ),
         provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
@@ -259,8 +267,9 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     fit = fit_cell(robot, asked.train(sound), SUM, progress)
     cell = fit.cell(robot, sound)
     error = cell.error(sound)
-    more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
-    wrong = wrong_rows(data, Cell.of(robot, fit.state, data.target_names).error(data))
+    seen = find_faults(cell.placed(sound), error)
+    more = tuple(fault for fault in seen if fault.effect == "outliers")
+    wrong = wrong_rows(data, cell.error(data))
     points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (
         *exchanged,

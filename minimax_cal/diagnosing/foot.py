@@ -1,4 +1,4 @@
-"""Reflectors on the robot's foot, which say of themselves how the base moved against the instrument."""
+"""Reflectors on the robot's foot: they say of themselves how base and instrument moved apart."""
 
 from __future__ import annotations
 
@@ -32,8 +32,12 @@ class Motion:
 def reflectors(data: Measurements) -> Array:
     """(m, n, 3) the foot's reflectors as the first session saw them, NaN where not measured [m]."""
     names = [name[:-2] for name in data.columns if name.startswith("base") and name.endswith("_x")]
-    parts = [[data.columns.get(f"{name}_{axis}") for axis in "xyz"] for name in names]
-    whole = [np.stack(part, axis=-1) for part in parts if not any(p is None for p in part)]
+    every = [[f"{name}_{axis}" for axis in "xyz"] for name in names]
+    whole = [
+        np.stack([data.columns[name] for name in three], axis=-1)
+        for three in every
+        if all(name in data.columns for name in three)
+    ]
     if not whole:
         return np.zeros((data.poses, 0, 3))
     points = np.stack(whole, axis=1)
@@ -82,7 +86,7 @@ def fitted(points: Array, columns: Array, rows: Array) -> Array:
 
 
 def motion(scene: Scene, term: Term) -> Array:
-    """(3, 6) motion of the reflectors' middle by each parameter, from the first visit to the last."""
+    """(3, 6) motion of the reflectors' middle by each parameter, from first visit to last."""
     middle = np.nanmean(scene.points, axis=(0, 2))
     points = np.broadcast_to(middle[None, :, None], (1, 3, scene.poses))
     field = term.columns(replace(scene, points=points)).shift[:, 0]
