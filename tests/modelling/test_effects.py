@@ -60,8 +60,7 @@ def all_terms(scene: Scene) -> list[Term]:
         for place in effect.places(scene):
             for choice in effect.choices(scene, place):
                 out += [Term(name, place, c) for c in (choice, *effect.finer(scene, choice)[:2])]
-    jumps = ({"since": 0.4}, {"sessions": 3.0})  # of a moment that errors show, and of sessions
-    return [*out, *(Term("session_jump", "frame", choice) for choice in jumps)]
+    return [*out, Term("session_jump", "frame", {"since": 0.4})]  # a moment that errors show
 
 
 ROBOT = weighty()
