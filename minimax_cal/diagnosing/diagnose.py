@@ -37,7 +37,7 @@ from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
-from minimax_cal.fitting.stations import stationed
+from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
@@ -89,6 +89,7 @@ def diagnose(
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
+    notices = (*notices, *unplaced(raw, ~held))
     raw = stationed(robot, raw, ~held)
     with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
         return examined(Asked(robot, raw, held, options), notices, progress, began)

@@ -25,7 +25,7 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
-from minimax_cal.fitting.stations import jumps, pose_of, stationed
+from minimax_cal.fitting.stations import jumps, pose_of, stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
@@ -154,7 +154,9 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
     data = with_groups(data)
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
-    data = stationed(robot, data, np.isin(data.line, train.line))
+    kept = np.isin(data.line, train.line)
+    said = (*said, *unplaced(data, kept))
+    data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES

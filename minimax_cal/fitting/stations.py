@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.fitting.start import fit_base, project
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.history import sessions
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, labels, seen_from
 from minimax_cal.modelling.cell import Cell
@@ -32,11 +31,11 @@ ROUNDS, SAME = 20, 1e-9  # of placing targets and frames in turn, until these mo
 def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
     """The data with the points of all sessions in the frame of the first, as the drawing has it.
 
-    train: (m,) True for the rows that may be looked at.  Raises DataError for a session of too few.
+    train: (m,) True for the rows that may be looked at.  Sessions that have none there are taken to
+    be in the first frame (`unplaced` says so).  Raises DataError for a session of too few points.
     """
-    label = labels(data)
-    names = [str(label[sessions(data) == s][0]) for s in np.unique(sessions(data))]
-    if len(names) == 1 or data.frames:
+    label, names = labels(data), sessions_of(data.take(train))
+    if len(names) < 2 or data.frames:
         return data
     for name in names:
         rows = train & (label == name)
@@ -47,6 +46,23 @@ def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
                 "whose frame they share"
             )
     return seen_from(data, placed(robot, data.take(train), names))
+
+
+def sessions_of(data: Measurements) -> list[str]:
+    """The names of sessions in the order of their first rows."""
+    return list(dict.fromkeys(labels(data).tolist()))
+
+
+def unplaced(data: Measurements, train: Array) -> tuple[str, ...]:
+    """A notice on sessions that are held out whole: no row tells where their frame stands."""
+    names = sessions_of(data.take(train))
+    lost = [name for name in sessions_of(data) if name not in names]
+    if not lost:
+        return ()
+    return (
+        f"{data.source}: held out whole: session {', '.join(lost)}; judged in the frame of session "
+        f"{names[0]}",
+    )
 
 
 def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Array]:

@@ -135,6 +135,15 @@ def test_a_session_without_points_enough_is_refused() -> None:
         mc.calibrate(ROBOT, data, "sum", holdout=0.0)
 
 
+def test_a_session_held_out_whole_is_judged_in_the_first_frame() -> None:
+    session = np.repeat(["a", "b"], 60)
+    fit = mc.calibrate(ROBOT, labelled(ONE, session), "sum", holdout=0.5, holdout_by="session")
+    assert fit.cell.sessions.frames == {}
+    assert len(set(session[fit.held])) == 1
+    assert any("held out whole: session" in text for text in fit.notices)
+    assert fit.accuracy["holdout"].rms_mm < 2.0 * fit.accuracy["train"].rms_mm
+
+
 def test_small_steps_of_frames_are_taken_as_whole_turns() -> None:
     """Points moved by the step, to first order, are where the new frame puts them."""
     rng = np.random.default_rng(0)
