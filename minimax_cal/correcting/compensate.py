@@ -297,7 +297,8 @@ def arm_of(cell: Cell) -> Cell:
 def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
     """What the reader should know about effects and limits."""
     out = limit_notices(cell.robot, data)
-    left = [term.label for term in cell.effects.terms if term not in arm.effects.terms]
+    own = arm.effects.terms
+    left = [t.label for t in cell.effects.terms if t not in own and not t.frees_frames]
     if left:
         out.append(
             f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"

@@ -144,6 +144,13 @@ def test_a_session_held_out_whole_is_judged_in_the_first_frame() -> None:
     assert fit.accuracy["holdout"].rms_mm < 2.0 * fit.accuracy["train"].rms_mm
 
 
+def test_a_station_held_out_whole_fails_in_words() -> None:
+    fit = mc.calibrate(ROBOT, TWO, "sum", holdout=0.5, holdout_by="session")
+    assert str(fit.status) == "failed"
+    assert mc.Fit.from_dict(fit.to_dict()).status == fit.status
+    assert "NaN" not in fit.json()
+
+
 def test_small_steps_of_frames_are_taken_as_whole_turns() -> None:
     """Points moved by the step, to first order, are where the new frame puts them."""
     rng = np.random.default_rng(0)
