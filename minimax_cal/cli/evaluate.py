@@ -12,7 +12,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.ground.files import json_text
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.measurements import read_measurements
-from minimax_cal.modelling.cell import evaluate, load_cell
+from minimax_cal.modelling.cell import evaluate, load_cell, strangers
 
 
 @click.command(name="evaluate")
@@ -29,7 +29,7 @@ def evaluate_command(fit: Path, data: Path, to: Output) -> int:
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
-    to.notice(*measured.notices, *doubts)
+    to.notice(*measured.notices, *strangers(cell, measured), *doubts)
     content = {
         "schema": 1,
         "kind": "evaluation",

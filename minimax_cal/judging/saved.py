@@ -16,7 +16,7 @@ from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, strangers
 from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import load_robot
 
@@ -50,6 +50,8 @@ def open_fit(source: Fit | Path | str, data: Path | str = "", nominal: str = "")
     notices: tuple[str, ...] = ()
     if data:
         measured, said = known_targets(read_measurements(data), cell)
+        said += strangers(cell, measured)
+        measured = cell.placed(measured)
         held, more = unseen(measured, fit)
         notices = (*measured.notices, *said, *more)
     elif fit.data.poses:
@@ -119,6 +121,7 @@ def nominal_cell(
     if missing:
         raise DataError(f"{train.source}: {missing[0]} was not measured")
     check_joints(robot, train)
-    state = fit_base(model_of(robot, train), robot.mdh).state
+    state = fit_base(model_of(robot, fit.cell.placed(train)), robot.mdh).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
-    return Cell.of(robot, state, train.target_names), (said,)
+    sessions = fit.cell.sessions
+    return Cell.of(robot, state, train.target_names, sessions=sessions), (said,)

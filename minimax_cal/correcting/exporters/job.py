@@ -80,7 +80,7 @@ def job_of(fit: Fit | Cell, source: str) -> Job:
         raise OptionError(f"{source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell = fit if isinstance(fit, Cell) else fit.cell
     nominal = fit.nominal if isinstance(fit, Fit) else None
-    labels = tuple(term.label for term in cell.effects.terms)
+    labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
     before = nominal.robot if nominal else cell.robot
     known = nominal is not None
     return Job(cell.robot, before, source, labels, compliance_of(cell), fitted=known)
