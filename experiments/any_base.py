@@ -18,7 +18,7 @@ import click
 import numpy as np
 
 from experiments import sweep
-from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
+from experiments.off_starts import SAME, STEP, Setting, problem_of, starts_of
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
