@@ -32,7 +32,15 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.conditions",
         "Errors, training and held out, under each way to fit, simulated and real",
     ),
+    "splits": (
+        "experiments.splits",
+        "Minimax against the sum over many splits, at random and by groups",
+    ),
     "methods": ("experiments.methods", "MDH, product of exponentials and minimax side by side"),
+    "courses": (
+        "experiments.courses",
+        "Error against iteration from paper S's start, simulated and real",
+    ),
     "calibration_process": (
         "experiments.calibration_process",
         "Error against iteration for all methods and backends, on real data",
@@ -69,6 +77,7 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
     ),
+    "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

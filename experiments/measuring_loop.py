@@ -93,8 +93,7 @@ class Arm:
     def fit(self, q: Array, seen: Array) -> Fit:
         """Measure some poses and calibrate."""
         data = measured(self.task, self.real, q, seen, 0.0, self.rng)
-        return calibrate(self.real.robot.with_mdh(self.task.ground.cell.robot.mdh), data, "sum",
-                         holdout=0.0)  # fmt: skip
+        return calibrate(self.task.ground.cell.robot, data, "sum", holdout=0.0)
 
     def judged(self, fit: Fit, q: Array, seen: Array) -> tuple[float, float]:
         """The promise of a fit from poses, and its true RMS error at the fresh poses [m]."""
@@ -191,7 +190,7 @@ def run(job: Job) -> Found:
 def jobs_of(study: Study) -> list[Job]:
     """The arms."""
     if study.quick:
-        return [Job(study.seed, 60e-6, 150, 2)]
+        return [Job(study.seed, 45e-6, 150, 2)]
     return [Job(study.seed + number, 30e-6, 500, 9) for number in range(4)]
 
 
