@@ -23,6 +23,10 @@ from experiments.sweep import Study, look_for, needed, study_options
 from minimax_cal.ground.errors import OptionError
 
 STUDIES = {  # name: (module with the command `main`, what it tells)
+    "papers": (
+        "experiments.papers",
+        "Both papers item by item: all tables and figures, and a table of verdicts",
+    ),
     "convergence": (
         "experiments.convergence",
         "From which starts the least-squares methods reach the minimum, and how fast",

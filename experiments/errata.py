@@ -306,6 +306,13 @@ ALSO = (
 )
 
 
+def stands(one: Erratum) -> bool:
+    """Whether the mended formula gives the truth, to 0.1 %, and the printed one does not."""
+    printed, mended, truth = one.example()
+    near = 1e-3 * max(abs(truth), abs(printed))
+    return abs(mended - truth) <= near < abs(printed - truth)
+
+
 def page() -> str:
     """The list in Markdown, as docs/errata.md has it."""
     lines = []
