@@ -107,7 +107,7 @@ def from_errata(study: Study) -> list[Verdict]:
     return [
         Verdict("S, M: the formulas as printed", "errata", f"{count} slips",
                 f"{shown} shown by counter-example", HOLDS if shown == count else NO,
-                "list and proofs: errata")
+                "list with proofs: docs/errata.md")
     ]  # fmt: skip
 
 

@@ -27,6 +27,7 @@ REACHED = {  # Fig. 5: which methods reach the minimum within 10000 iterations
     (0.0, 0.0): PAPER,
     (3.1, 3.1): ("nllm", "snlgn", "snllm"),
 }
+NEAR = 20.0  # percent points that count as alike where so much is not told
 SEVERAL = "the paper tells neither base, pose range, size of errors, unit nor rule of damping"
 
 
@@ -63,7 +64,8 @@ def model() -> list[Verdict]:
         Verdict("S eq. 24, 32: derivative of the projection", "papers", "Jᵀc",
                 f"against finite differences {off:.0e} relative", HOLDS if off < 1e-6 else NO),
         Verdict("S contribution: fewer initial values", "papers", "only the angles",
-                f"{len(rows)} of {at.size} parameters need a start", HOLDS),
+                f"{len(rows)} of {at.size} parameters need a start",
+                HOLDS if len(rows) < at.size else NO),
     ]  # fmt: skip
 
 
@@ -84,10 +86,14 @@ def table_2(rows: Sequence[Row]) -> list[Verdict]:
     def at(place: int, method: str) -> float:
         return float(cells[method][place])
 
-    starts = int(at(0, "nlgn"))
-    where = f"{NAMES}; {starts} starts, all parameters, pseudo-inverses, mm"
+    starts = listed((at(0, method) for method in PAPER), ".0f")
+    where = f"{NAMES}; all parameters, pseudo-inverses, mm; starts {starts}"
     separable = min(at(5, "snlgn"), at(5, "snllm")) == 100.0
-    metres = by["all, m", "nllm"]
+    metres = by["all, m", "nllm"].cells()
+    share = float(metres[-1])
+    alike = [
+        all(abs(cells[m][place] - printed[m][place - 1]) < NEAR for m in PAPER) for place in (4, 5)
+    ]
     own = [float(by["identifiable", method].cells()[-1]) for method in ("snlgn", "snllm")]
     caught = bool(np.array_equal(mm["nllm"].minimum, mm["nllm"].converged))
     gap = at(2, "nlgn") - at(2, "snlgn")
@@ -105,12 +111,12 @@ def table_2(rows: Sequence[Row]) -> list[Verdict]:
                 f"{cost:.1f}", told(cost > 3.0), "a start's mean time, as a ratio: no two machines "
                 "are alike"),
         Verdict("S Table 2: converged %", "convergence", theirs(3), column(4),
-                told(at(4, "nlgn") < 100.0, at(4, "nllm") < 100.0, separable), where),
+                told(alike[0], max(at(4, "nlgn"), at(4, "nllm")) < 100.0 and separable), where),
         Verdict("S Table 2: to the minimum %", "convergence", theirs(4), column(5),
-                told(at(5, "nlgn") < 99.0, at(5, "nllm") < 99.0, separable), where),
-        Verdict("S Table 2: NLLM once lengths are in metres", "convergence", "-",
-                f"{metres.cells()[-1]:.2f} % in {metres.cells()[3]:.2f} iterations",
-                told(float(metres.cells()[-1]) == 100.0),
+                told(alike[1], max(at(5, "nlgn"), at(5, "nllm")) < 99.0 and separable), where),
+        Verdict("S Table 2: NLLM fails, with lengths in metres too", "convergence",
+                "68.98 % in 4595.27 iterations", f"{share:.2f} % in {metres[3]:.2f} iterations",
+                told(share < 99.0, float(metres[3]) > 1000.0), f"{metres[2]} starts. "
                 "(JᵀJ + μI) adds square millimetres to square radians: the failure of NLLM is one "
                 "of units"),
         Verdict("S Table 2: separable methods on the identifiable parameters", "convergence",
