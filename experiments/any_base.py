@@ -126,7 +126,7 @@ def row_of(span: float, results: Sequence[Result]) -> tuple[Cell, ...]:
 SPANS = (1.0, float(np.pi))  # poses within so far of zero [rad]
 
 
-def study_of(study: Study, count: int = 500) -> dict[float, list[Result]]:
+def study_of(study: Study, count: int = 200) -> dict[float, list[Result]]:
     """The trials of each span."""
     count = 12 if study.quick else count
     return {
@@ -152,7 +152,7 @@ def save(study: Study, found: dict[float, list[Result]]) -> None:
 
 @click.command()
 @study_options("any_base")
-@click.option("--trials", "count", type=int, default=500, show_default=True)
+@click.option("--trials", "count", type=int, default=200, show_default=True)
 def main(study: Study, count: int) -> None:
     """Global convergence from any base pose."""
     save(study, study_of(study, count))

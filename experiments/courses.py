@@ -168,11 +168,11 @@ def study_of(study: Study) -> Found:
 
 def longer(study: Study, cap: int) -> dict[Job, Course]:
     """Fig. 4: the first starts of a coarse grid that NLLM has not come back from, for longer."""
-    theta, alpha = grid(15 if study.quick else 9)
+    theta, alpha = grid(15)
     starts = zip(theta.tolist(), alpha.tolist(), strict=True)
     jobs = [Job(SIMULATED, start, "nllm", cap, study.seed) for start in starts]
     ended = study.sweep(run, jobs, "which starts NLLM does not come back from")
-    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged][:6]
+    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged][:4]
     more = [Job(j.arm, j.start, j.method, LONGER * cap, j.seed) for j in stuck]
     return dict(zip(more, study.sweep(run, more, "for longer"), strict=True))
 

@@ -191,7 +191,7 @@ def jobs_of(study: Study) -> list[Job]:
     """The arms."""
     if study.quick:
         return [Job(study.seed, 45e-6, 150, 2)]
-    return [Job(study.seed + number, 30e-6, 500, 9) for number in range(4)]
+    return [Job(study.seed + number, 30e-6, 400, 5) for number in range(3)]
 
 
 def study_of(study: Study) -> dict[Job, Found]:
