@@ -21,6 +21,7 @@ import click
 
 from experiments import (
     any_base,
+    by_pose,
     conditions,
     convergence,
     courses,
@@ -33,6 +34,7 @@ from experiments import (
     verdicts_s,
 )
 from experiments.real import SHARED
+from experiments.record import save_figure
 from experiments.sweep import Study, study_options
 from experiments.verdicts import HEADER, HOLDS, MISSING, NO, Verdict, table_of
 from minimax_cal.ground.files import write_whole
@@ -68,6 +70,9 @@ def from_conditions(study: Study) -> list[Verdict]:
     """Paper M, Table 3 and Fig. 2-6."""
     found = conditions.study_of(study)
     conditions.save(study, found)
+    for robot, outcomes in found.items():
+        name = conditions.ROBOTS[robot][0]
+        save_figure(study.out, f"by_pose_{robot}", by_pose.picture(name, outcomes))
     return [
         *verdicts_m.condition_3(found),
         *verdicts_m.improvements(found),
