@@ -223,7 +223,7 @@ def study_of(
     """Every variant on its starts."""
     setting = Setting(seed=study.seed + 1, base_angle=base_angle)
     least = least_cost(setting)
-    cap = 300 if study.quick else CAP
+    cap = 100 if study.quick else CAP
     rows = []
     for parameters, method in VARIANTS:
         few = (parameters, method) in SLOW and not full
@@ -233,15 +233,16 @@ def study_of(
     return rows, setting
 
 
-def pictures(rows: Sequence[Row]) -> dict[str, Figure]:
-    """Fig. 3 for each set of parameters, by file name."""
+def pictures(rows: Sequence[Row], surfaces: bool) -> dict[str, Figure]:
+    """Fig. 3 for each set of parameters, by file name; surfaces take their time."""
     figures = {}
     for parameters in dict.fromkeys(row.parameters for row in rows):
         chosen = [row for row in rows if row.parameters == parameters]
         name = parameters.replace(", ", "_")
         for what in ("iterations", "RMS mm"):
             figures[f"{what.split()[0].lower()}_{name}"] = maps(chosen, what)
-        figures[f"surface_{name}"] = surface(chosen)
+        if surfaces:
+            figures[f"surface_{name}"] = surface(chosen)
     return figures
 
 
@@ -257,7 +258,7 @@ def save(study: Study, rows: Sequence[Row], setting: Setting) -> None:
         "rows": plain([dict(zip(names, row.cells(), strict=True)) for row in rows]),
         "least_rms_mm": float(1e3 * np.sqrt(least_cost(setting) / setting.poses)),
     }
-    study.save(tables, content, pictures(rows))
+    study.save(tables, content, pictures(rows, not study.quick))
 
 
 @click.command()
