@@ -60,7 +60,6 @@ def save_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
 def save_figure(folder: Path, name: str, figure: Figure) -> None:
     """Write a figure as PNG and SVG."""
     folder.mkdir(parents=True, exist_ok=True)
-    figure.draw_without_rendering()  # ticks are made when drawn; `save` has to know them
     for suffix in ("png", "svg"):
         save(figure, folder / f"{name}.{suffix}")
 
