@@ -136,7 +136,7 @@ def present() -> list[str]:
 
 def jobs_of(study: Study) -> list[Job]:
     """Fig. 5 and Fig. 6."""
-    cap = 300 if study.quick else CAP
+    cap = 100 if study.quick else CAP
     arms = present()[:1] if study.quick else present()
     return [
         *(Job(SIMULATED, s, method, cap, study.seed) for s in STARTS for method in PAPER),
@@ -172,7 +172,7 @@ def longer(study: Study, cap: int) -> dict[Job, Course]:
     starts = zip(theta.tolist(), alpha.tolist(), strict=True)
     jobs = [Job(SIMULATED, start, "nllm", cap, study.seed) for start in starts]
     ended = study.sweep(run, jobs, "which starts NLLM does not come back from")
-    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged][:4]
+    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged][: 1 if study.quick else 4]
     more = [Job(j.arm, j.start, j.method, LONGER * cap, j.seed) for j in stuck]
     return dict(zip(more, study.sweep(run, more, "for longer"), strict=True))
 
