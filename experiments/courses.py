@@ -172,8 +172,9 @@ def longer(study: Study, cap: int) -> dict[Job, Course]:
     starts = zip(theta.tolist(), alpha.tolist(), strict=True)
     jobs = [Job(SIMULATED, start, "nllm", cap, study.seed) for start in starts]
     ended = study.sweep(run, jobs, "which starts NLLM does not come back from")
-    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged][: 1 if study.quick else 4]
-    more = [Job(j.arm, j.start, j.method, LONGER * cap, j.seed) for j in stuck]
+    stuck = [job for job, course in zip(jobs, ended, strict=True) if not course.converged]
+    some = stuck[: 1 if study.quick else 4]
+    more = [Job(j.arm, j.start, j.method, LONGER * cap, j.seed) for j in some]
     return dict(zip(more, study.sweep(run, more, "for longer"), strict=True))
 
 
