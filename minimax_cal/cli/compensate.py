@@ -11,6 +11,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     FIT,
     PATH,
+    SAFE_CELLS,
     WIDTH,
     Output,
     options_of,
@@ -42,9 +43,10 @@ from minimax_cal.robots.robot import load_robot
     lever=Option("What a radian counts as [default: the targets' own].", "mm"),
     clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
 )
+@SAFE_CELLS
 @result_options("the targets (CSV)")
 def compensate_command(
-    fit: Path, targets: Path, robot: str | None, to: Output, **chosen: Any
+    fit: Path, targets: Path, robot: str | None, safe_cells: bool, to: Output, **chosen: Any
 ) -> int:
     """Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to go.
 
@@ -55,7 +57,7 @@ def compensate_command(
     nominal = None if robot is None else load_robot(robot)
     found = compensate(fit, given.data, nominal, **chosen)
     to.notice(*found.notices)
-    text = given.corrected(found)
+    text = to.cells(given.corrected(found), safe_cells)
     if to.path:
         write_whole(to.path, text)
     if to.as_json:

@@ -416,7 +416,7 @@ def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
 
 
 def test_command_through_main_where_it_is_registered(saved: Path, tmp_path: Path) -> None:
-    from minimax_cal.cli import cli
+    from minimax_cal.cli.running import cli
 
     if "compensate" not in cli.commands:
         pytest.skip("not registered in this checkout")
