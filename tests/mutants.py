@@ -3,8 +3,9 @@
     python tests/mutants.py minimax_cal/robots/kinematics.py tests/robots/test_kinematics.py
     python tests/mutants.py MODULE TEST... --count 20 --seed 1
 
-A seeded sample of changes: another comparison, sign, operation, number, truth value or extreme.  Each
-is run in a copy of the project; a test that fails, or runs twenty times as long, has killed it.
+A seeded sample of changes: another comparison, sign, operation, number, truth value or extreme.
+Each is run in a copy of the project; a test that fails, or runs twenty times as long, has killed
+it.
 """
 
 from __future__ import annotations
@@ -105,11 +106,11 @@ def code(tree: ast.AST) -> Iterator[ast.AST]:
 def mutants(source: str) -> list[tuple[int, str, str]]:
     """Line, what was changed, and the whole source with that change."""
     tree = ast.parse(source)
-    found = []
-    for node in code(tree):
-        for said in faults(node):
-            found.append((getattr(node, "lineno", 0), said, ast.unparse(tree)))
-    return found
+    return [
+        (getattr(node, "lineno", 0), said, ast.unparse(tree))
+        for node in code(tree)
+        for said in faults(node)
+    ]
 
 
 def noticed(tree: Path, tests: list[str], limit: float) -> str:
@@ -155,7 +156,8 @@ def main() -> None:
                 print(f"{chosen.module}:{line}: {what}: {source.splitlines()[line - 1].strip()}",
                       flush=True)  # fmt: skip
     killed = len(sample) - len(survivors)
-    print(f"{chosen.module}: {killed} of {len(sample)} killed ({100 * killed / len(sample):.0f} %), "
+    share = 100 * killed / len(sample)
+    print(f"{chosen.module}: {killed} of {len(sample)} killed ({share:.0f} %), "
           f"of {len(every)} possible", flush=True)  # fmt: skip
 
 

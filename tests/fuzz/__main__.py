@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -59,13 +60,13 @@ def main() -> int:
         show(chosen.seed, chosen.only)
         return 0
     began, found = time.perf_counter(), list[Outcome]()
-    for each in outcomes(chosen.seed, range(chosen.first, chosen.first + chosen.cases)):
-        found.append(each)
-        if each.kind not in GOOD:
-            print(
-                f"{each.number} {each.command}: {each.kind}; {each.broke}; {each.detail}",
-                flush=True,
-            )
+    numbers = range(chosen.first, chosen.first + chosen.cases)
+    with suppress(KeyboardInterrupt):  # what was found until then
+        for each in outcomes(chosen.seed, numbers):
+            found.append(each)
+            if each.kind not in GOOD:
+                what = f"{each.kind}; {each.broke}; {each.detail}"
+                print(f"{each.number} {each.command}: {what}", flush=True)
     print("\n".join(lines(found)))
     slowest = max(found, key=lambda each: each.seconds)
     print(f"seed {chosen.seed}, {time.perf_counter() - began:.0f} s; the slowest took "

@@ -226,5 +226,5 @@ def broken(name: str, raw: bytes, rng: Rng) -> tuple[bytes, str]:
     way = pick(rng, BYTES if rng.random() < 0.2 else own)
     try:
         return way(raw, rng), f"{name}: {way.__name__}"
-    except (ValueError, IndexError, csv.Error, yaml.YAMLError):  # broken already
+    except (ValueError, IndexError, RecursionError, csv.Error, yaml.YAMLError):  # broken already
         return raw[::-1], f"{name}: backwards"
