@@ -52,6 +52,9 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Ca
     done = call(place / "bin" / "pip", "install", "--quiet", wheel)
     assert done.returncode == 0, done.stderr[-2000:]
 
+    header = ",".join(f"q{joint}_deg" for joint in range(1, 7))
+    (folder / "targets.csv").write_text(f"{header}\n20,30,-10,40,50,60\n-20,10,20,-40,60,10\n")
+
     def run(*arguments: object, code: int = 0) -> Ran:
         ended = call(place / "bin" / "minimax-cal", *arguments, folder=folder)
         assert "Traceback" not in ended.stderr, ended.stderr
@@ -84,7 +87,7 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("evaluate", "fit.json", "poses.csv")
     run("diagnose", "irb120", "poses.csv", "-o", "diagnosis.json")
     run("import", "poses.csv", "-o", "again.csv")
-    run("compensate", "truth.json", "poses.csv", "--robot", "irb120", "--max-change", 90)
+    run("compensate", "fit.json", "targets.csv")
     run("iso9283", "fit.json")
     run("map", "fit.json", "--samples", 1000, "--json")
     run("tradeoff", "irb120", "poses.csv", "--steps", 1)
