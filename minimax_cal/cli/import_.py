@@ -10,6 +10,7 @@ import click
 
 from minimax_cal.cli.options import JSON, PATH, QUIET, SAFE_CELLS, Output, output, show, with_output
 from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.words import visible
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
 from minimax_cal.measuring.measurements import read_measurements
 
@@ -63,7 +64,7 @@ def import_command(
         click.echo(json_text(content(found, to.path)), nl=False)
         return 0
     show(found.files(), *found.columns())
-    wrote = f"wrote {to.path}" if to.path else "nothing written; add -o FILE"
+    wrote = f"wrote {visible(str(to.path))}" if to.path else "nothing written; add -o FILE"
     click.echo(f"{found.headline()}\n{wrote}")
     return 0
 
