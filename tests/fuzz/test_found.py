@@ -81,6 +81,26 @@ def test_joints_that_cannot_be_are_refused(cell: str, tmp_path: Path) -> None:
             read(path)
 
 
+def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path: Path) -> None:
+    """A variance that rounding made negative was a warning, and "good to nan mm"."""
+    robot = mc.load_robot("irb120")
+    mdh = robot.mdh.copy()
+    mdh[3, 3] = np.pi  # two axes that are one: alpha4 of another arm
+    path = tmp_path / "wires.csv"
+    path.write_bytes(material()["wires.csv"])
+    found = mc.relative(robot.with_mdh(mdh), read_relative(path))
+    assert not any("nan" in notice for notice in found.notices)
+
+
+def test_the_name_of_an_output_moves_no_cursor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("data.csv").write_bytes(material()["data.csv"])
+    assert run("import", "data.csv", "-o", "\x1b]0;owned\x07") == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
 def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> None:
     figure = new_figure(0.5, 0.5)
     axes = figure.subplots()
