@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.target_file import read_targets
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.options import Option
+from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import load_robot
 
 
@@ -65,10 +67,15 @@ def compensate_command(
     elif to.path:
         click.echo(found.summary(WIDTH))
     else:
-        click.echo(text, nl=False)
+        click.echo(on_terminal(text) if sys.stdout.isatty() else text, nl=False)
         if not to.quiet:
             click.echo(found.summary(WIDTH), err=True)
     if found.failed.any():
         click.echo(f"error: {found.complaint()}", err=True)
         return FAILED
     return 0
+
+
+def on_terminal(text: str) -> str:
+    """A file for people to look at: its cells may hold codes that move a cursor."""
+    return "".join(f"{visible(line)}\n" for line in text.splitlines())

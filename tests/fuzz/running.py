@@ -129,7 +129,8 @@ def manners(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
         return "unclear", f"exit {code} with {len(errors)} lines of error: {err[-200:]!r}"
     if any(INTERNALS.search(line) for line in errors):
         return "unclear", f"speaks of its inside: {errors[0]}"
-    if control := CONTROL.search((out + err).replace("\r\n", "\n")):
+    shown = err if one.command == "compensate" else out + err  # whose stdout is a file, in a pipe
+    if control := CONTROL.search(shown.replace("\r\n", "\n")):
         return "unclear", f"prints {control[0]!r}"
     if any(len(line) > 1100 for line in err.splitlines()):
         return "unclear", "a line of more than 1100 letters"

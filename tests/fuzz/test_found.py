@@ -101,6 +101,13 @@ def test_the_name_of_an_output_moves_no_cursor(
     assert "\x1b" not in capsys.readouterr().out
 
 
+def test_targets_on_a_terminal_move_no_cursor() -> None:
+    """In a pipe they are the file as it is; `compensate` without -o prints them."""
+    from minimax_cal.cli.compensate import on_terminal
+
+    assert on_terminal("q1_rad,\x1b[31m\n1,2\n") == "q1_rad,\N{REPLACEMENT CHARACTER}[31m\n1,2\n"
+
+
 def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> None:
     figure = new_figure(0.5, 0.5)
     axes = figure.subplots()
