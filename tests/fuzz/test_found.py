@@ -101,6 +101,17 @@ def test_the_name_of_an_output_moves_no_cursor(
     assert "\x1b" not in capsys.readouterr().out
 
 
+def test_a_lever_that_cannot_be_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its square overflowed."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("fit.json", "targets.csv"):
+        Path(name).write_bytes(material()[name])
+    line = refused(capsys, "compensate", "fit.json", "targets.csv", "--lever", "1e308")
+    assert "must be positive and finite" in line
+
+
 def test_targets_on_a_terminal_move_no_cursor() -> None:
     """In a pipe they are the file as it is; `compensate` without -o prints them."""
     from minimax_cal.cli.compensate import on_terminal
