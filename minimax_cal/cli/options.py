@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
 from inspect import signature
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from minimax_cal.solvers.status import Status
 
 WIDTH = 110  # of text that goes to no terminal
 MOST_NOTICES = 50
+MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -78,6 +79,8 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
     def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
         if told.many:
             return told.many(map(read, given) if told.read else names_of(given))
+        if isinstance(given, float) and MOST < abs(given) < inf:
+            raise click.BadParameter(f"{given:g} cannot be; at most {MOST:g}")
         return default if given is None else read(given)
 
     return click.option(

@@ -108,8 +108,12 @@ def test_a_lever_that_cannot_be_is_refused(
     monkeypatch.chdir(tmp_path)
     for name in ("fit.json", "targets.csv"):
         Path(name).write_bytes(material()[name])
-    line = refused(capsys, "compensate", "fit.json", "targets.csv", "--lever", "1e308")
+    line = refused(capsys, "compensate", "fit.json", "targets.csv", "--lever", "1e9")
     assert "must be positive and finite" in line
+    for option in ("--lever", "--tolerance"):
+        line = refused(capsys, "compensate", "fit.json", "targets.csv", option, "1e308")
+        assert "cannot be; at most 1e+12" in line
+    assert "cannot be" in refused(capsys, "plan", "irb120", "--poses", 9, "--noise", "-1e300")
 
 
 def test_targets_on_a_terminal_move_no_cursor() -> None:
