@@ -19,12 +19,17 @@ import dataclasses
 import functools
 import hashlib
 import inspect
+import io
+import itertools
 import pickle
+import sys
+import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from enum import Enum
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -49,9 +54,18 @@ R = TypeVar("R")
 
 CACHE = Path("results/cache")
 PATIENCE = 5.0  # for a scheduler, and for its first worker, to answer [s]
+DESERTED = 30.0  # a cluster without workers, which a nanny may yet start again [s]
+WATCH = 1.0  # how often that is looked at [s]
 LIBRARIES = tuple(Path(package.__path__[0]) for package in (minimax_cal, qp_backends))
 SOLVERS = ("daqp", "osqp", "clarabel", "proxsuite", "quadprog", "piqp", "highspy", "scs")
 NUMERICS = ("numpy", "scipy", "qpsolvers", "cvxpy", *SOLVERS)
+OF_ARRAYS = {
+    *itertools.product(("numpy._core.multiarray",), ("_reconstruct", "scalar")),
+    *itertools.product(("numpy.core.multiarray",), ("_reconstruct", "scalar")),
+    *itertools.product(("numpy._core.numeric", "numpy.core.numeric"), ("_frombuffer",)),
+    *itertools.product(("numpy",), ("ndarray", "dtype")),
+    *itertools.product(("pathlib",), ("PosixPath", "WindowsPath")),
+}
 OUTPUT = {"__init__", "__main__", "index", "record", "sweep"}  # files that shape no result
 
 
@@ -142,8 +156,14 @@ def here(calls: Sequence[Call], jobs_in_parallel: int) -> Generator[tuple[int, A
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=jobs_in_parallel, return_as="generator_unordered")
         arriving = parallel(joblib.delayed(part)(*call) for call in calls)
+        loky = import_module("joblib.externals.loky.process_executor")
         try:
             yield from arriving
+        except loky.BrokenProcessPool as error:
+            raise click.ClickException(
+                "a process of this sweep died: too little memory, or it was killed; give fewer "
+                f"--jobs ({type(error).__name__})"
+            ) from error
         finally:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
@@ -160,14 +180,28 @@ def on_cluster(calls: Sequence[Call], cluster: str) -> Generator[tuple[int, Any]
     with connected(cluster) as client:
         need_modules(client, cluster, {__name__, calls[0][0].__module__})
         futures = client.map(part, *zip(*calls, strict=True), pure=False)
-        arriving = distributed.as_completed(futures, loop=client.loop, with_results=True)
         try:
-            for _, found in arriving:
-                if isinstance(found, CancelledError):
-                    raise found
-                yield found
-        except (distributed.KilledWorker, CancelledError) as error:
+            for future in finished(client, futures):
+                yield future.result()
+        except (distributed.KilledWorker, CancelledError, OSError) as error:
             raise click.ClickException(f"{cluster}: {' '.join(str(error).split())}") from error
+
+
+def finished(client: Any, futures: Sequence[Any]) -> Iterator[Any]:
+    """Futures as they finish.  Raises OSError when nobody has been at work on them for long."""
+    distributed = needed("distributed", "distributed")
+    waiting, seen = set(futures), time.monotonic()
+    while waiting:
+        with suppress(distributed.TimeoutError), client.as_current():
+            done = distributed.wait(waiting, timeout=WATCH, return_when="FIRST_COMPLETED").done
+            waiting -= done
+            yield from done
+        if client.status == "running" and client.scheduler_info()["workers"]:
+            seen = time.monotonic()
+        elif time.monotonic() - seen > DESERTED:
+            raise OSError(
+                f"no scheduler or no workers for {DESERTED:g} s; start them again, and then this"
+            )
 
 
 def need_modules(client: Any, cluster: str, modules: set[str]) -> None:
@@ -239,24 +273,40 @@ def key(name: str, function: Callable[..., Any], job: object, code: str) -> str:
 
 
 def read_part(path: Path) -> list[Any]:
-    """[result], or [] where there is none or it is damaged.
-
-    Pickle is safe only for files that nobody else can write, as those of our own cache are; the
-    digest finds damage, not malice.
-    """
+    """[result], or [] where there is none, it is damaged or holds more than data."""
     try:
         digest, content = path.read_bytes().split(b"\n", 1)
         if digest.decode() != hashlib.sha256(content).hexdigest():
             return []
-        return [pickle.loads(content)]
+        return [DataOnly(io.BytesIO(content)).load()]
     except Exception:  # whatever is wrong with a kept part, it can be computed again
         return []
 
 
+class DataOnly(pickle.Unpickler):
+    """Loads what results are made of: data classes, enumerations, paths, arrays; no function.
+
+    The digest of a part finds damage, not malice: a part may come from anywhere.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        """A class that holds data, or what NumPy makes arrays of.  Raises UnpicklingError."""
+        if (module, name) in OF_ARRAYS:
+            return super().find_class(module, name)
+        found = getattr(sys.modules.get(module), name, None)  # nothing is imported for it
+        holds = isinstance(found, type) and (
+            dataclasses.is_dataclass(found) or issubclass(found, Enum)
+        )
+        if not holds:
+            raise pickle.UnpicklingError(f"{module}.{name} is no data")
+        return found
+
+
 def write_part(path: Path, result: object) -> None:
-    """Keep a result: whole, or not at all."""
+    """Keep a result: whole, or not at all.  Raises UnpicklingError for what is not data."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
+    DataOnly(io.BytesIO(content)).load()  # else it would be computed again and again
     write_whole(path, hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
 
 

@@ -6,6 +6,7 @@ import difflib
 import inspect
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module, metadata, util
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from . import child
 from .problem import BackendError, Problem, Solution, Status
 
 Solver = Callable[..., Solution]
@@ -55,13 +57,24 @@ SPARSE_ORDER = ("piqp", "clarabel", "scs", "highs", "osqp", "daqp", "quadprog", 
 _registered: dict[str, Solver] = {}
 
 
-def register(name: str, solver: Callable[..., Any]) -> None:
+def register(name: str, solver: Callable[..., Any], *, seconds: float | None = None) -> None:
     """Make the user's own solver choosable by name.
 
     solver(problem) returns a Solution or a pair (x, y); it may take the keywords tolerance,
     time_limit and warm_start.  A name of the table is replaced by it.
+    seconds: run it in a process of its own, which is ended after so long: a solver that never
+    ends, or dies, then costs no more than that.  It must stand at the top of a module that can be
+    imported.  None: in this process, without a clock.
     """
-    _registered[name] = partial(_own, solver=solver, keywords=_keywords(solver))
+    module, where = getattr(solver, "__module__", ""), getattr(solver, "__qualname__", "")
+    if seconds is not None and (module == "__main__" or not where.isidentifier()):
+        raise BackendError(
+            f"{name!r} in a process of its own must be a function at the top of a module that can "
+            "be imported; move it into a file of its own"
+        )
+    if seconds is not None and not seconds > 0.0:
+        raise BackendError(f"{name!r}: {seconds} seconds; give a positive number")
+    _registered[name] = partial(_own, solver=solver, keywords=_keywords(solver), seconds=seconds)
 
 
 def names() -> tuple[str, ...]:
@@ -147,12 +160,24 @@ def _keywords(solver: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def _own(
-    problem: Problem, *, solver: Callable[..., Any], keywords: tuple[str, ...], **given: Any
+    problem: Problem,
+    *,
+    solver: Callable[..., Any],
+    keywords: tuple[str, ...],
+    seconds: float | None,
+    **given: Any,
 ) -> Solution:
     """The answer of the user's own solver as a Solution."""
     start = time.perf_counter()
-    answer = solver(problem, **{name: given[name] for name in keywords})
+    known = {name: given[name] for name in keywords}
+    if seconds is None:
+        answer = solver(deepcopy(problem), **known)  # it may change what it gets
+    else:
+        limit = min(seconds, given["time_limit"])
+        answer = child.call(solver.__module__, solver.__qualname__, problem, known, limit)
     if isinstance(answer, Solution):
+        if not isinstance(answer.status, Status):
+            raise TypeError(f"the status is {answer.status!r}, which is no qp_backends.Status")
         return replace(
             answer, x=np.asarray(answer.x, np.float64), y=np.asarray(answer.y, np.float64)
         )

@@ -14,8 +14,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.cli import cli
 from minimax_cal.cli.commands import COMMANDS, ENTRIES
+from minimax_cal.cli.running import cli
 from minimax_cal.fitting.instruments import RelativeOptions
 from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.planning.options import PlanOptions

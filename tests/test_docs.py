@@ -22,7 +22,7 @@ from test_folders import FOLDERS
 
 import minimax_cal as mc
 import qp_backends
-from minimax_cal.cli import cli
+from minimax_cal.cli.running import cli
 from minimax_cal.modelling.effects import EFFECTS
 from qp_backends import registry
 

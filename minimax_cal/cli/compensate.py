@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     FIT,
     PATH,
+    SAFE_CELLS,
     WIDTH,
     Output,
     options_of,
@@ -20,6 +22,7 @@ from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.target_file import read_targets
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.options import Option
+from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import load_robot
 
 
@@ -42,9 +45,10 @@ from minimax_cal.robots.robot import load_robot
     lever=Option("What a radian counts as [default: the targets' own].", "mm"),
     clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
 )
+@SAFE_CELLS
 @result_options("the targets (CSV)")
 def compensate_command(
-    fit: Path, targets: Path, robot: str | None, to: Output, **chosen: Any
+    fit: Path, targets: Path, robot: str | None, safe_cells: bool, to: Output, **chosen: Any
 ) -> int:
     """Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to go.
 
@@ -55,7 +59,7 @@ def compensate_command(
     nominal = None if robot is None else load_robot(robot)
     found = compensate(fit, given.data, nominal, **chosen)
     to.notice(*found.notices)
-    text = given.corrected(found)
+    text = to.cells(given.corrected(found), safe_cells)
     if to.path:
         write_whole(to.path, text)
     if to.as_json:
@@ -63,10 +67,15 @@ def compensate_command(
     elif to.path:
         click.echo(found.summary(WIDTH))
     else:
-        click.echo(text, nl=False)
+        click.echo(on_terminal(text) if sys.stdout.isatty() else text, nl=False)
         if not to.quiet:
             click.echo(found.summary(WIDTH), err=True)
     if found.failed.any():
         click.echo(f"error: {found.complaint()}", err=True)
         return FAILED
     return 0
+
+
+def on_terminal(text: str) -> str:
+    """A file for people to look at: its cells may hold codes that move a cursor."""
+    return "".join(f"{visible(line)}\n" for line in text.splitlines())

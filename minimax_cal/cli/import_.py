@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import JSON, PATH, QUIET, Output, output, show, with_output
-from minimax_cal.ground.files import json_text
-from minimax_cal.measuring.importers import Imported, import_files, save
+from minimax_cal.cli.options import JSON, PATH, QUIET, SAFE_CELLS, Output, output, show, with_output
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.words import visible
+from minimax_cal.measuring.importers import Imported, csv_of, import_files
 from minimax_cal.measuring.measurements import read_measurements
 
 
@@ -36,6 +37,7 @@ from minimax_cal.measuring.measurements import read_measurements
     help="Of a file with several points a pose: which of them follow each other.",
 )
 @click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@SAFE_CELLS
 @JSON
 @QUIET
 @output("the measurements (CSV)")
@@ -45,6 +47,7 @@ def import_command(
     joints: Path | None,
     layout: str | None,
     decimal: str | None,
+    safe_cells: bool,
     to: Output,
     **chosen: Any,
 ) -> int:
@@ -54,14 +57,14 @@ def import_command(
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
     if to.path:
-        save(to.path, found)
+        write_whole(to.path, to.cells(csv_of(found), safe_cells))
         read_measurements(to.path)  # what was written can be read
     to.notice(*found.data.notices)
     if to.as_json:
         click.echo(json_text(content(found, to.path)), nl=False)
         return 0
     show(found.files(), *found.columns())
-    wrote = f"wrote {to.path}" if to.path else "nothing written; add -o FILE"
+    wrote = f"wrote {visible(str(to.path))}" if to.path else "nothing written; add -o FILE"
     click.echo(f"{found.headline()}\n{wrote}")
     return 0
 

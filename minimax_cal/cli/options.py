@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
 from inspect import signature
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from minimax_cal.cli import FAILED
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import one_line, visible
+from minimax_cal.ground.words import one_line, visible, without_formulas
 from minimax_cal.solvers.status import Status
 
 WIDTH = 110  # of text that goes to no terminal
 MOST_NOTICES = 50
+MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -35,6 +36,11 @@ JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
 QUIET = click.option("--quiet", "-q", is_flag=True, help="No notices and no progress on stderr.")
+SAFE_CELLS = click.option(
+    "--safe-cells",
+    is_flag=True,
+    help="Put an apostrophe before cells that a spreadsheet would run as a formula.",
+)
 
 
 # ---- options from fields and arguments ---------------------------------------------------------
@@ -73,6 +79,8 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
     def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
         if told.many:
             return told.many(map(read, given) if told.read else names_of(given))
+        if isinstance(given, float) and MOST < abs(given) < inf:
+            raise click.BadParameter(f"{given:g} cannot be; at most {MOST:g}")
         return default if given is None else read(given)
 
     return click.option(
@@ -129,6 +137,16 @@ class Output:
             click.echo(f"notice: {one_line(text)}", err=True)
         if shown and len(texts) > MOST_NOTICES:
             click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
+
+    def cells(self, text: str, safe: bool) -> str:
+        """CSV that holds text of its input; what a spreadsheet would run is said, or made safe."""
+        quoted, count = without_formulas(text)
+        if count and not safe:
+            self.notice(
+                f"{count} cells begin as a formula does, which a spreadsheet would run; "
+                "--safe-cells puts an apostrophe before them"
+            )
+        return quoted if safe else text
 
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""

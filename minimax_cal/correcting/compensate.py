@@ -20,7 +20,7 @@ from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
@@ -205,8 +205,8 @@ def check_choices(
     for name, value in (("tolerance", tolerance), ("largest change", most_change)):
         if not (np.isfinite(value) and value > 0.0):
             raise OptionError(f"{name} {value:g}: must be positive and finite")
-    if lever <= 0.0 or np.isinf(lever):
-        raise OptionError(f"lever {lever:g} m: must be positive and finite")
+    if lever <= 0.0 or lever > FARTHEST:
+        raise OptionError(f"lever {lever:g} m: must be positive and finite, at most {FARTHEST:g}")
     if not 0.0 <= clock <= 1.0:
         raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
 

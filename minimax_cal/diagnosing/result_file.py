@@ -178,6 +178,8 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
         cell_from_dict(cell, f"{source}: cells[{i}]")
         for i, cell in enumerate(content.get("cells", ()))
     )
+    if len({(cell.robot.joints, cell.target_names) for cell in cells}) > 1:
+        raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose -o")
     return assembled(content, source, part, cells)
 
 

@@ -23,7 +23,7 @@ from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.errors import CalibrationError, said
 from minimax_cal.ground.files import finite, numbers
 from minimax_cal.ground.records import (
     AGAIN,
@@ -312,7 +312,9 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     try:
         arrays = {name: unpacked(array) for name, array in part.arrays.items()}
     except ValueError as error:
-        raise CalibrationError(f"{source}: its arrays cannot be read ({error}); {AGAIN}") from error
+        raise CalibrationError(
+            f"{source}: its arrays cannot be read ({said(error)}); {AGAIN}"
+        ) from error
     cell = refined(cell, arrays, "cell")
     for name, scores in part.accuracy.told():
         if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
@@ -461,7 +463,7 @@ def measured_poses(
         return replace(data, source=str(given["source"]), frames=frames), held, errors
     except FAULTS as error:
         raise CalibrationError(
-            f"{source}: its list of poses cannot be read ({error}); {AGAIN}"
+            f"{source}: its list of poses cannot be read ({said(error)}); {AGAIN}"
         ) from error
 
 

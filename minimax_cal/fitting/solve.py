@@ -56,6 +56,8 @@ FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessia
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 EXACT = 1e-9  # an error below is rounding: data that were computed, not measured [m]
+HOPELESS = 10.0 * POOR_FIT  # worst errors above this share of the reach: no calibration, so that
+LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -398,7 +400,10 @@ def worst_case(
     problem = minimax_problem(model, state, distances, options.distance, per)
     name, notices = usable(options.qp)
     qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
-    optimum = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+    settings = Sqp(hessian=options.hessian)
+    if problem.size > (HOPELESS * task.robot.reach()) ** 2:
+        settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
+    optimum = minimax.solve(problem, state, qp, settings)
     if optimum.status is Status.STALLED and optimum.value * problem.size < EXACT**2:
         optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left
     certificate = None

@@ -19,7 +19,7 @@ from scipy import stats
 
 from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.errors import CalibrationError, OptionError, said
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
@@ -416,7 +416,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         dof, kind = float(part["degrees_of_freedom"]), str(part["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
-            f"{source}: its covariance does not fit its robot and targets ({error})"
+            f"{source}: its covariance does not fit its robot and targets ({said(error)})"
         ) from error
     if not np.isfinite(rows).all() or np.any(np.diag(rows) < 0.0) or np.any(rows != rows.T):
         raise CalibrationError(f"{source}: its covariance is no symmetric matrix of numbers")

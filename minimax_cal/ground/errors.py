@@ -1,5 +1,11 @@
 """What goes wrong through the user's input: one line that names the place and the mend."""
 
+from __future__ import annotations
+
+import re
+
+NUMPYS = re.compile(r"shape|inhomogeneous|broadcast|dimension|convert|array|invalid literal")
+
 
 class CalibrationError(Exception):
     """The input is wrong; the message says where, what, and what to do (exit code 2)."""
@@ -15,3 +21,13 @@ class DataError(CalibrationError):
 
 class OptionError(CalibrationError):
     """A choice that does not exist or does not fit the data."""
+
+
+def said(error: Exception) -> str:
+    """What is wrong with the content of a file, without Python's and NumPy's words for it."""
+    text = str(error).partition("\n")[0]
+    if isinstance(error, KeyError):
+        return f"{text} is missing"
+    if isinstance(error, CalibrationError):
+        return text
+    return text if type(error) is ValueError and not NUMPYS.search(text) else "wrong kind or size"

@@ -22,7 +22,7 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.errors import CalibrationError, said
 
 AGAIN = "write it again with minimax-cal"
 FAULTS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -108,8 +108,9 @@ def reading(source: str, part: str = "") -> Iterator[None]:
         yield
     except FAULTS as error:
         what = f"its {part} " if part else ""
-        text = str(error).partition("\n")[0]
-        raise CalibrationError(f"{source}: {what}cannot be read ({text}); {AGAIN}") from error
+        raise CalibrationError(
+            f"{source}: {what}cannot be read ({said(error)}); {AGAIN}"
+        ) from error
 
 
 def packed(values: Array) -> dict[str, Any]:
@@ -121,6 +122,8 @@ def packed(values: Array) -> dict[str, Any]:
 def unpacked(part: Packed) -> Array:
     """The array of `packed`.  Raises ValueError."""
     raw = np.frombuffer(base64.b64decode(part.float64, validate=True), dtype="<f8")
+    if raw.size != math.prod(part.shape):
+        raise ValueError(f"{raw.size} numbers in place of {math.prod(part.shape)}")
     return np.array(raw.reshape(part.shape), dtype=float)
 
 

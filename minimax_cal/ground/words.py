@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import unicodedata
+from contextlib import suppress
 
 HIDDEN = ("Cc", "Cs", "LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 REPLACED = "\N{REPLACEMENT CHARACTER}"
 LONGEST = 1000  # letters of a message; a cell of a file may hold more than anybody reads
+
+FORMULA = tuple("=+-@\t\r\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SIGN}"
+                "\N{FULLWIDTH HYPHEN-MINUS}\N{FULLWIDTH COMMERCIAL AT}")  # fmt: skip
 
 
 def visible(text: str) -> str:
@@ -25,3 +31,25 @@ def one_line(text: str) -> str:
     """A message in one line that hides nothing and floods no terminal."""
     line = visible(" ".join(text.split()))
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
+
+
+def without_formulas(text: str) -> tuple[str, int]:
+    """CSV with an apostrophe before each cell that a spreadsheet would run; how many there are."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    count = 0
+    for row in csv.reader(io.StringIO(text, newline="")):
+        runs = [is_formula(cell) for cell in row]
+        count += sum(runs)
+        writer.writerow([f"'{cell}" if run else cell for cell, run in zip(row, runs, strict=True)])
+    return stream.getvalue(), count
+
+
+def is_formula(cell: str) -> bool:
+    """Whether a spreadsheet takes a cell for a formula; a number with its sign is none."""
+    if not cell.startswith(FORMULA):
+        return False
+    with suppress(ValueError):
+        float(cell)
+        return False
+    return True

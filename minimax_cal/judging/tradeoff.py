@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.fitting.calibrate import again, calibrate
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.minimax_problem import MinimaxProblem, minimax_problem
 from minimax_cal.fitting.options import Progress, silent, usable
@@ -206,6 +207,10 @@ class Tradeoff:
     def headline(self) -> str:
         """What giving up RMS buys, in a sentence."""
         first, last = self.choices[0], self.choices[-1]
+        if first is last:
+            return (
+                f"Least squares misses by {first.train.rms_mm:.4g} mm RMS: this is no calibration."
+            )
         grows = 100.0 * (last.train.rms_mm / first.train.rms_mm - 1.0)
         falls = 100.0 * (1.0 - last.train.max_mm / first.train.max_mm)
         text = (
@@ -268,19 +273,20 @@ def tradeoff(
     if not 0 <= steps <= MOST_STEPS:
         raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")
     began = time.perf_counter()
-    if isinstance(robot, Fit):
-        given = robot
-        first, last = (
-            given if given.objective == objective else again(given, progress, objective=objective)
-            for objective in ("sum", "point")
-        )
-    elif data is None:
-        raise OptionError("tradeoff: give the measurements too, or a fit that holds them")
-    else:
-        first, last = (
-            calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
-            for objective in ("sum", "point")
-        )
+    settings = {"steps": steps, "qp": qp, "holdout": holdout, "seed": seed}
+
+    def fit(objective: str) -> Fit:
+        if isinstance(robot, Fit):
+            same = robot.objective == objective
+            return robot if same else again(robot, progress, objective=objective)
+        if data is None:
+            raise OptionError("tradeoff: give the measurements too, or a fit that holds them")
+        return calibrate(robot, data, objective, qp, holdout=holdout, seed=seed, progress=progress)
+
+    first = fit("sum")
+    if first.accuracy["train"].rms_mm > 1e3 * POOR_FIT * first.before.robot.reach():
+        return hopeless(first, began, settings)
+    last = fit("point")
     worst = problem_of(first)
     ends = (
         Compromise.of(worst, 1.0, first.cell.state, first.status),
@@ -288,7 +294,6 @@ def tradeoff(
     )
     solver = partial(solve_qp, name=usable(qp)[0], tolerance=QP_TOLERANCE)
     curve = curve_of(worst, ends, steps, solver, progress)
-    settings = {"steps": steps, "qp": qp, "holdout": holdout, "seed": seed}
     names = ("sum", *["compromise"] * (len(curve) - 2), "point")
     return Tradeoff(
         robot=first.robot.name,
@@ -297,6 +302,16 @@ def tradeoff(
         notices=tuple(dict.fromkeys((*first.notices, *last.notices))),
         provenance=Provenance.of(first.robot, first.data, settings),
     )
+
+
+def hopeless(fit: Fit, began: float, settings: dict[str, Any]) -> Tradeoff:
+    """Least squares alone: with errors of that size the worst point is searched for minutes."""
+    choice = Choice(
+        "sum", 1.0, fit.cell, fit.accuracy["train"], fit.accuracy["holdout"], Status.FAILED
+    )
+    said = (*fit.notices, "the fit is too poor to look for compromises")
+    provenance = Provenance.of(fit.robot, fit.data, settings)
+    return Tradeoff(fit.robot.name, (choice,), time.perf_counter() - began, said, provenance)
 
 
 def problem_of(fit: Fit) -> MinimaxProblem:

@@ -18,6 +18,7 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_text
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
+MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
 JOINT = re.compile(r"q(\d+)_(rad|deg|mm|m)")
 TARGET = re.compile(r"smr(\d+)_([xyz])_(mm|m)")
 # Optional columns that some part of the project understands: pattern, factor to SI by unit.
@@ -72,6 +73,13 @@ class Rows:
             (int(m[1]), m[2], name) for name in self.header if (m := JOINT.fullmatch(name))
         )
         q = np.stack([self.number(name, unit=unit) for _, unit, name in found], axis=1)
+        if (odd := np.abs(q) > MOST).any():
+            row, joint = np.argwhere(odd)[0]
+            name = found[joint][2]
+            raise DataError(
+                f"{self.path}:{self.line[row]}: column {name}: {self.text(name)[row]} cannot be; "
+                "check the number and its unit"
+            )
         return q, np.array([unit in ("m", "mm") for _, unit, _ in found])
 
 

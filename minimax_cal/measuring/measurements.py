@@ -29,7 +29,7 @@ FARTHEST = 1e5  # no instrument measures farther [m]
 PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
     "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
     "payload": ("payload_kg", 0.0, 1e5, 1.0),
-    "u95": ("u95_mm", -np.inf, 1.0, 1e3),
+    "u95": ("u95_mm", 0.0, 1.0, 1e3),
 }
 
 
@@ -241,6 +241,11 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
 
     >>> mc.write_measurements("poses.csv", data)
     """
+    write_whole(path, measurements_text(data))
+
+
+def measurements_text(data: Measurements) -> str:
+    """The CSV of measurements."""
     joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
@@ -262,7 +267,7 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
                 number = float(value) * named[name][1]
                 row.append("" if np.isnan(number) else f"{number:.9g}")
         writer.writerow(row)
-    write_whole(path, stream.getvalue())
+    return stream.getvalue()
 
 
 def file_column(stem: str) -> tuple[str, float]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.errors import DataError, said
 from minimax_cal.ground.files import numbers, plain
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements, measurements
@@ -66,7 +66,7 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
             raise ValueError("its parts differ in length")
     except (KeyError, TypeError, ValueError, AttributeError, DataError) as error:
         raise DataError(
-            f"{source}: its list of poses cannot be read ({error}); write the file again with "
-            "minimax-cal calibrate -o"
+            f"{source}: its list of poses cannot be read ({said(error)}); write the file "
+            "again with minimax-cal calibrate -o"
         ) from error
     return Measurements(data.q, data.y, names, sliding, line, columns, source=source), held

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, DataError
+from minimax_cal.ground.errors import CalibrationError, DataError, said
 from minimax_cal.ground.files import json_of, read_text
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
@@ -202,7 +202,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
         effects = effects_from(content, source)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
-            f"{source}: is not a saved calibration (robot, base, targets_mm: {error}); "
+            f"{source}: is not a saved calibration (robot, base, targets_mm: {said(error)}); "
             "write one with minimax-cal calibrate -o"
         ) from error
     if not np.abs(spots).max(initial=0.0) <= FARTHEST:
@@ -216,7 +216,9 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
             if len(names) != len(value):
                 raise ValueError(f"{term.label}: {len(value)} values for {', '.join(names)}")
     except (KeyError, IndexError, ValueError) as error:
-        raise CalibrationError(f"{source}: its effects do not fit its robot ({error})") from error
+        raise CalibrationError(
+            f"{source}: its effects do not fit its robot ({said(error)})"
+        ) from error
     return cell
 
 

@@ -1,7 +1,9 @@
 import json
 import subprocess
 import sys
+from csv import reader
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from conftest import run
@@ -238,6 +240,66 @@ def test_inputs_are_never_overwritten(csv: Path, capsys: pytest.CaptureFixture[s
     assert run("calibrate", "irb2600", csv, "-o", "-") == 2
     assert "name a file" in capsys.readouterr().err
     assert not Path("-").exists()
+
+
+def test_a_closed_stdout_is_told_before_the_work(csv: Path) -> None:
+    """What is opened next would take its place, and hold the result."""
+    closed = '"$@" >&-'
+    command = ["sh", "-c", closed, "sh", sys.executable, "-m", "minimax_cal.cli"]
+    ended = subprocess.run(
+        [*command, "calibrate", "irb2600", str(csv)], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("error: stdout is closed")
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_ctrl_c_during_imports_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Interrupted(ModuleType):
+        def __getattr__(self, name: str) -> None:
+            raise KeyboardInterrupt
+
+    name = "minimax_cal.cli.running"
+    monkeypatch.setitem(sys.modules, name, Interrupted(name))
+    assert run("robots") == 130
+    assert capsys.readouterr().err == "error: interrupted\n"
+
+
+def test_too_little_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from minimax_cal.cli import robots
+
+    def greedy(**_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(robots.robots_command, "callback", greedy)
+    assert run("robots") == 1
+    assert "not enough memory" in capsys.readouterr().err
+
+
+def test_cells_that_a_spreadsheet_would_run(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They pass through `import` and `compensate`, which say so; --safe-cells makes them text."""
+    header, *rows = csv.read_text().splitlines()
+    formula = "=cmd|' /C calc'!A0"
+    odd, out, fit = (tmp_path / name for name in ("odd.csv", "out.csv", "fit.json"))
+    odd.write_text("\n".join([f"{header},@note", *(f"{row},{formula}" for row in rows)]))
+    assert run("calibrate", "irb2600", csv, "--objective", "sum", "-o", fit, "-q") == 0
+    for command in (("import", odd), ("compensate", fit, odd)):
+        capsys.readouterr()
+        run(*command, "-o", out)
+        assert "61 cells begin as a formula does" in capsys.readouterr().err
+        assert f",{formula}" in out.read_text()
+        run(*command, "-o", out, "--safe-cells")
+        assert "formula" not in capsys.readouterr().err
+        table = list(reader(out.read_text().splitlines()))
+        at = next(i for i, name in enumerate(table[0]) if "note" in name)
+        assert [row[at] for row in table] == ["'@note", *[f"'{formula}"] * 60]
+        assert not any(cell.startswith("'") for row in table for cell in row[:at])  # -1.5 stays
 
 
 def test_what_a_file_holds_moves_no_cursor(

@@ -62,6 +62,23 @@ def cell_of(robot: mc.Robot, effects: Fitted = NOTHING) -> mc.Cell:
     return mc.Cell(robot, np.eye(4), ("smr1", "smr2", "smr3"), spots, effects)
 
 
+def test_joints_that_count_the_other_way(robot: mc.Robot, rng: np.random.Generator) -> None:
+    """The same arm with other joint signs: the same corrections, with these signs."""
+    sign = np.array([1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
+    wrong = off(robot, rng)
+    stiff = Fitted((Term("link_bending", "L2"),), (np.array([1e-6]),))
+    q = regular(robot, random_poses(robot, 40, rng))
+    plain = compensate(cell_of(wrong, stiff), q, robot, frame="own")
+    other = replace(robot, sign=sign, lower=-robot.upper, upper=-robot.lower)
+    turned = replace(wrong, sign=sign, lower=-robot.upper, upper=-robot.lower)
+    found = compensate(cell_of(turned, stiff), q * sign, other, frame="own")
+    assert_allclose(found.q, plain.q * sign, rtol=0, atol=1e-9)
+    assert np.abs(plain.q - q).max() > 1e-4
+    for frame in ("best-fit", "flange"):  # a base placed by poses of the two models
+        same = compensate(cell_of(other), q * sign, other, frame=frame)
+        assert_allclose(same.q, q * sign, rtol=0, atol=1e-7)
+
+
 def regular(robot: mc.Robot, q: Array) -> Array:
     """The poses at which no two wrist axes and no links line up."""
     flange = robot.pose(q)[:, :3, 3]
@@ -416,7 +433,7 @@ def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
 
 
 def test_command_through_main_where_it_is_registered(saved: Path, tmp_path: Path) -> None:
-    from minimax_cal.cli import cli
+    from minimax_cal.cli.running import cli
 
     if "compensate" not in cli.commands:
         pytest.skip("not registered in this checkout")

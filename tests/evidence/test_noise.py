@@ -67,6 +67,20 @@ def test_weights_are_the_inverse_variances(quiet: Study) -> None:
     )
 
 
+def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None:
+    """Half of the rows' freedom is in the fit: dividing by their number would say 0.5."""
+    n, p = 300, 150
+    found = []
+    for _ in range(20):
+        basis = np.linalg.qr(rng.normal(size=(n, p)))[0]
+        noise = rng.normal(size=n)
+        rest = noise - basis @ (basis.T @ noise)
+        rows = Rows(rest, basis, np.ones(n), 1.0, n, np.zeros((0, 0, 0)), np.zeros((0, 0)))
+        found.append(restricted(rows, np.zeros((n, 0))))
+    total = [one.variance * (1.0 + one.ratio) for one in found]  # equal rows: only the sum counts
+    assert abs(np.mean(total) - 1.0) < 4.0 * np.sqrt(2.0 / (n - p) / len(found))
+
+
 def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
     rows = quiet.rows
     few = Rows(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -123,6 +124,37 @@ def test_damaged_parts_are_computed_again(expected: list[Found], tmp_path: Path)
     assert [len(module.read_part(path)) for path in paths[:6]] == [0, 0, 0, 0, 0, 1]
     assert same(sweep(work, JOBS, **one), expected)
     assert all(module.read_part(path) for path in paths)
+
+
+class Trap:
+    """Runs code when a pickle is loaded without care."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+def test_a_part_holds_data_and_runs_nothing(tmp_path: Path) -> None:
+    """Whoever writes into the cache can still make no code run."""
+    part, sprung = tmp_path / "x.part", tmp_path / "sprung"
+    for content in (pickle.dumps(Trap(sprung)), pickle.dumps([os.system, "true"])):
+        part.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+        assert module.read_part(part) == []
+    assert not sprung.exists()
+    with pytest.raises(pickle.UnpicklingError, match="is no data"):
+        module.write_part(part, work)
+    good = {"a": (Found(1, np.arange(3.0), 2), None), "b": [np.float64(2.5), Path("x"), "y"]}
+    module.write_part(part, good)
+    (found,) = module.read_part(part)
+    assert found["a"][0].values.tolist() == [0.0, 1.0, 2.0]
+    assert found["b"] == good["b"]
+
+
+def test_a_process_that_dies_ends_the_sweep_in_a_word(tmp_path: Path) -> None:
+    with pytest.raises(click.ClickException, match="a process of this sweep died"):
+        sweep(kill_worker, [0, 1, 2], name="dead", jobs_in_parallel=2, folder=tmp_path)
 
 
 def test_a_key_names_all_that_a_result_depends_on() -> None:
@@ -275,6 +307,55 @@ def test_errors_of_a_job_come_back_from_a_cluster(cluster: str, tmp_path: Path) 
 def test_a_job_that_kills_its_worker_ends_the_sweep(cluster: str, tmp_path: Path) -> None:
     with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
         sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
+
+
+@pytest.fixture
+def deserted(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and its one worker, without a nanny; for tests that end them."""
+    pytest.importorskip("distributed")
+    file = tmp_path / "scheduler.json"
+    quiet = dict(env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    dask = [sys.executable, "-m", "dask"]
+    place = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    running = [
+        subprocess.Popen([*dask, "scheduler", *place, "--scheduler-file", str(file)], **quiet)
+    ]
+    try:
+        wait_for(lambda: file.exists() and file.stat().st_size)
+        address = json.loads(file.read_text())["address"]
+        size = ["--no-nanny", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0"]
+        running += [subprocess.Popen([*dask, "worker", address, *size], **quiet)]
+        yield address, running
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize("dead", ["worker", "scheduler"])
+def test_a_deserted_cluster_is_not_waited_for(
+    dead: str,
+    deserted: tuple[str, list[subprocess.Popen[bytes]]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "PATIENCE", 60.0)
+    monkeypatch.setattr(module, "DESERTED", 1.0)
+    monkeypatch.setattr(module, "WATCH", 0.2)
+    address, running = deserted
+    log = tmp_path / "log"
+    jobs = [Job(seed, str(log), 0.3) for seed in range(100)]
+
+    def end() -> None:
+        wait_for(log.exists)
+        running[dead == "worker"].kill()
+
+    with ThreadPoolExecutor(1) as other:
+        ending = other.submit(end)
+        with pytest.raises(click.ClickException, match="tcp://"):
+            sweep(work, jobs, name="deserted", cluster=address, folder=tmp_path)
+    ending.result()
+    assert len(list(tmp_path.glob("deserted/*.part"))) >= 1  # what arrived is kept
 
 
 @click.command()

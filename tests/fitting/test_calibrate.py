@@ -20,6 +20,23 @@ def test_true_robot_is_found_without_noise(robot: mc.Robot, clean: Simulation) -
     assert_allclose(fit.predict(new), clean.cell.predict(new), rtol=0, atol=1e-10)
 
 
+def test_each_accuracy_is_of_its_own_rows(robot: mc.Robot, noisy: Simulation) -> None:
+    """Nominal and calibrated, trained and held out: none stands in the place of another."""
+    fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.3)
+    for name, cell, rows in (
+        ("nominal", fit.nominal, fit.held),
+        ("nominal_train", fit.nominal, ~fit.held),
+        ("holdout", fit.cell, fit.held),
+        ("train", fit.cell, ~fit.held),
+    ):
+        away = noisy.data.y[rows] - cell.predict(noisy.data.q[rows])
+        found = fit.accuracy[name]
+        assert found.poses == rows.sum()
+        assert_allclose(found.rms_mm, 1e3 * np.sqrt((away**2).sum(-1).mean()), rtol=1e-9)
+        assert_allclose(found.max_mm, 1e3 * np.sqrt((away**2).sum(-1).max()), rtol=1e-9)
+    assert len({fit.accuracy[name].rms_mm for name in fit.accuracy}) == 4
+
+
 def test_minimax_lowers_the_largest_sum(robot: mc.Robot, noisy: Simulation) -> None:
     total = mc.calibrate(robot, noisy.data, "sum")
     worst = mc.calibrate(robot, noisy.data, "minimax")

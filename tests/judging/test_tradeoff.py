@@ -240,3 +240,14 @@ def test_a_saved_fit_is_enough(robot: mc.Robot, tmp_path: Path) -> None:
         assert (a.train, a.holdout) == (b.train, b.holdout)
     with pytest.raises(mc.OptionError, match="give the measurements too"):
         tradeoff(robot)
+
+
+def test_no_compromise_is_looked_for_where_nothing_fits(robot: mc.Robot, noisy: Simulation) -> None:
+    """One target mirrored: least squares misses by far, and the worst point took minutes."""
+    y = noisy.data.y.copy()
+    y[:, 1, 1] *= -1.0
+    found = tradeoff(robot, noisy.data.with_y(y))
+    assert found.status is Status.FAILED
+    assert [choice.objective for choice in found.choices] == ["sum"]
+    assert "no calibration" in found.headline()
+    assert json.loads(found.json())["status"] == "failed"

@@ -74,18 +74,26 @@ def test_projected_lengths_are_the_linear_least_squares_ones(
     assert_allclose(y.target_positions[0], best.target_positions, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["even", "weighted", "poses"])
 def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
-    robot: mc.Robot, rng: np.random.Generator
+    kind: str, robot: mc.Robot, rng: np.random.Generator
 ) -> None:
     """J'J from Schur complement and coupling against finite differences of the projected residual.
 
     The residual is P y with lengths eliminated by dense linear algebra, in measurement axes: an
     independent route to paper S, eq. 18-24.
     """
+    from minimax_cal.modelling.model import pose_weights, with_poses
     from minimax_cal.solvers.least_squares import METHODS, examine
 
-    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)))
+    u95 = {"u95": rng.uniform(1e-5, 1e-4, 30)} if kind == "weighted" else {}
+    data = mc.measurements(rng.uniform(-2, 2, (30, 6)), rng.normal(size=(30, 3, 3)), **u95)
     this = model_of(robot, data)
+    root = np.sqrt(this.weight).T.repeat(3, axis=1)[:, None] * np.eye(9)
+    if kind == "poses":
+        square, axes = np.linalg.eigh(pose_weights(data, 0.3))
+        root = np.sqrt(np.maximum(square, 0.0))[..., None] * np.swapaxes(axes, 1, 2)
+        this = with_poses(this, pose_weights(data, 0.3))
     names = this.names
     chosen = np.zeros(names.count, dtype=bool)
     for name in (
@@ -104,8 +112,10 @@ def test_full_golub_pereyra_matrix_is_the_square_of_the_projected_jacobian(
         step[angles] = dw
         at = x.step(step)
         matrix = np.einsum("ab,kmbp->kmap", at.rotation, this.jacobian(at)[..., linear])
+        matrix = root @ np.moveaxis(matrix, 0, 1).reshape(30, 9, -1)
         matrix = matrix.reshape(-1, linear.sum())
-        error = (this.error(at) @ at.rotation.T).reshape(-1)
+        error = np.moveaxis(this.error(at) @ at.rotation.T, 0, 1).reshape(30, 9, 1)
+        error = (root @ error).reshape(-1)
         return np.asarray(error - matrix @ np.linalg.lstsq(matrix, error, rcond=None)[0])
 
     step = 1e-6
@@ -161,6 +171,16 @@ def test_pose_weights_are_position_and_orientation_errors(
     cost = np.einsum("ma,mab,mb->m", bent, pose_weights(data, lever), bent)
     assert_allclose(cost / (bent**2).sum(1), cost[0] / (bent[0] ** 2).sum(), rtol=1e-9)
     assert cost[0] >= (bent[0] ** 2).sum() * (1 - 1e-9)
+
+
+def test_a_pose_without_all_targets_weighs_nothing(rng: np.random.Generator) -> None:
+    from minimax_cal.modelling.model import pose_weights
+
+    y = rng.normal(size=(30, 3, 3))
+    y[4, 1] = np.nan
+    weight = pose_weights(mc.measurements(rng.uniform(-2, 2, (30, 6)), y), 0.3)
+    assert np.all(weight[4] == 0.0)
+    assert np.all(np.delete(weight, 4, axis=0).any(axis=(1, 2)))
 
 
 def test_mixed_normal_equations_are_explicit_ones(

@@ -177,5 +177,7 @@ def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> f
     rigid = np.concatenate([np.tile(np.eye(3), (len(point), 1, 1)), -hat(point)], axis=2)
     basis, _ = np.linalg.qr(rigid.reshape(-1, 6))
     jacobian = jacobian - basis @ (basis.T @ jacobian)
-    variance = np.einsum("ri,ij,rj->", jacobian, covariance[np.ix_(told, told)], jacobian)
-    return float(np.sqrt(variance / len(point)))
+    # by its square root: where much is known badly, rounding would make the sum itself negative
+    spread, axes = np.linalg.eigh(covariance[np.ix_(told, told)])
+    root = jacobian @ (axes * np.sqrt(np.maximum(spread, 0.0)))
+    return float(np.sqrt((root**2).sum() / len(point)))

@@ -11,6 +11,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
 from minimax_cal.measuring.importers.reading import (
@@ -22,9 +23,9 @@ from minimax_cal.measuring.importers.reading import (
     Told,
 )
 from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
-from minimax_cal.measuring.measurements import Measurements, write_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements_text
 
-__all__ = ["IMPORTERS", "Imported", "import_files", "read_any", "save", "units_of"]
+__all__ = ["IMPORTERS", "Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
 
 # Tried in this order.  `text`: looks at the text alone; `rows`: at header and cells.
 IMPORTERS = {
@@ -228,10 +229,15 @@ def no_joints(points: Sequence[Reading]) -> str:
 
 
 def save(path: Path | str, imported: Imported) -> None:
-    """Write the contract's CSV; columns that nothing uses are kept as text."""
+    """Write the contract's CSV."""
+    write_whole(path, csv_of(imported))
+
+
+def csv_of(imported: Imported) -> str:
+    """The contract's CSV; columns that nothing uses are kept as text."""
     data = imported.data
     columns = {name: blanks(column) for name, column in data.columns.items()}
-    write_measurements(path, replace(data, columns={**columns, **data.unknown}))
+    return measurements_text(replace(data, columns={**columns, **data.unknown}))
 
 
 def blanks(column: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from warnings import catch_warnings, filterwarnings
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,7 +49,12 @@ def save(figure: Figure, path: Path) -> None:
     kind = path.suffix.lower().lstrip(".")
     stream = io.BytesIO()
     stamp = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": None}[kind]
-    with rc_context({"svg.hashsalt": "minimax-cal"}):  # the same picture gives the same file
+    with (
+        rc_context({"svg.hashsalt": "minimax-cal"}),  # the same picture gives the same file
+        catch_warnings(),
+    ):
+        # labels of huge numbers leave no room for the axes: nothing that a user could mend
+        filterwarnings("ignore", "constrained_layout not applied", UserWarning)
         figure.savefig(stream, format=kind, dpi=150, metadata=stamp)
     write_whole(path, stream.getvalue())
 

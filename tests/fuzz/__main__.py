@@ -1,0 +1,78 @@
+"""Hostile runs of every command, and a table of how they ended.
+
+python -m tests.fuzz --cases 10000 --seed 7          # the table, as docs/reliability.md has it
+python -m tests.fuzz --seed 7 --only 4711            # one of them again, with its files
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from .cases import case
+from .running import GOOD, KINDS, Outcome, outcome, outcomes
+
+
+def lines(found: list[Outcome]) -> list[str]:
+    """The table as Markdown: a row a command, a column a kind."""
+    count = Counter((each.command, each.kind) for each in found)
+    commands = sorted({each.command for each in found})
+    head = ("command", "cases", *KINDS)
+    rows = [
+        (name, sum(count[name, kind] for kind in KINDS), *(count[name, kind] for kind in KINDS))
+        for name in commands
+    ]
+    total = ("all", len(found), *(sum(count[n, kind] for n in commands) for kind in KINDS))
+    cells = [head, ["---", *["---:"] * (len(head) - 1)], *rows, total]
+    return ["| " + " | ".join(map(str, row)) + " |" for row in cells]
+
+
+def show(seed: int, number: int) -> None:
+    """One case: what it is, its files in a folder, and how it ends."""
+    one = case(seed, number)
+    folder = Path(f"results/fuzz/{seed}-{number}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, raw in one.files.items():
+        (folder / name).write_bytes(raw)
+    print(
+        f"cd {folder}: {one.arguments}\nbroken: {one.broke}\nexpected: {one.expect or 'anything'}"
+    )
+    print(outcome(one))
+
+
+def main() -> int:
+    """Run them; 1 where something is none of GOOD."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int)
+    chosen = parser.parse_args()
+    if chosen.only is not None:
+        show(chosen.seed, chosen.only)
+        return 0
+    began, found = time.perf_counter(), list[Outcome]()
+    numbers = range(chosen.first, chosen.first + chosen.cases)
+    with suppress(KeyboardInterrupt):  # what was found until then
+        for each in outcomes(chosen.seed, numbers):
+            found.append(each)
+            if each.kind not in GOOD:
+                what = f"{each.kind}; {each.broke}; {each.detail}"
+                print(f"{each.number} {each.command}: {what}", flush=True)
+    print("\n".join(lines(found)))
+    slowest = max(found, key=lambda each: each.seconds)
+    print(f"seed {chosen.seed}, {time.perf_counter() - began:.0f} s; the slowest took "
+          f"{slowest.seconds:.1f} s ({slowest.number} {slowest.command})")  # fmt: skip
+    return int(any(each.kind not in GOOD for each in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""A hostile run: a command, the files that it reads, and what is known of the answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import click
+import numpy as np
+
+from minimax_cal.cli.running import cli
+
+from .known import FATAL, HARMLESS, with_known
+from .material import material
+from .mutations import VALUES, Rng, broken, pick
+
+# Command lines that work, each word that names a file of the material one that may be broken.
+TEMPLATES = (
+    "calibrate ROBOT data.csv --objective sum --json",
+    "calibrate ROBOT data.csv --json -o out.json",
+    "calibrate ROBOT data.csv --objective point --json",
+    "calibrate ROBOT data.csv --objective pose",
+    "calibrate irb120 data.csv --objective sum --effects joint_compliance:all",
+    "calibrate irb120 data.csv --objective sum --loss huber --figure out.svg",
+    "calibrate irb120 data.csv --prior a*=0.5mm --fix beta* --holdout 0.3",
+    "evaluate fit.json data.csv --json",
+    "evaluate truth.json data.csv --json",
+    "evaluate effects.json data.csv -o out.json",
+    "import data.csv -o out.csv",
+    "import tracker.csv -o out.csv --json",
+    "import tracker.csv -o out.csv --safe-cells",
+    "compensate fit.json targets.csv -o out.csv",
+    "compensate effects.json targets.csv --json",
+    "compensate truth.json targets.csv --robot ROBOT --safe-cells",
+    "iso9283 fit.json --poses --json",
+    "iso9283 fit.json data.csv -o out.json",
+    "map fit.json --samples 500 --json",
+    "map fit.json data.csv --samples 500 -o out.png",
+    "export fit.json --to urdf -o out.urdf",
+    "export fit.json --to dh-csv -o out.csv",
+    "export ROBOT --to json -o out.json",
+    "export effects.json --to ur-yaml -o out.yaml",
+    "export fit.json --to urdf --urdf robot.urdf -o out.urdf",
+    "report fit.json -o out.html --date 2026-01-01",
+    "report effects.json -o out.html --date 2026-01-01 --customer Name",
+    "report diagnosis.json -o out.html --date 2026-01-01",
+    "relative ROBOT wires.csv --json",
+    "relative irb120 wires.csv -o out.json",
+    "tradeoff irb120 data.csv --steps 2 --json",
+    "diagnose irb120 data.csv --json",
+    "plan ROBOT --poses 4 --candidates 40 -o out.csv",
+    "plan irb120 --poses 4 --candidates 40 --fit fit.json --data data.csv --json",
+    "simulate ROBOT --poses 8 -o out.csv --truth out.json",
+    "effects ROBOT data.csv --json",
+    "robots --json",
+    "backends --json",
+)
+ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
+# How often, beside the others: those that take seconds, and those that can hardly go wrong.
+RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08}
+RATES |= {"robots": 0.2, "backends": 0.2}
+PLACES = (
+    "/dev/null",
+    ".",
+    "no/such/x",
+    "/proc/x",
+    "loop",
+    "out.json/x",
+    "x" * 300,
+    "data.csv",
+    "-",
+    "",
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """number, seed: make it again.  files: by name.  broke: what was done.
+
+    expect: "" nothing is known, "same": the answer is that of the good files, "noticed": no success
+    without a word.
+    """
+
+    number: int
+    seed: int
+    arguments: tuple[str, ...]
+    files: dict[str, bytes]
+    broke: tuple[str, ...]
+    expect: str = ""
+
+    @property
+    def command(self) -> str:
+        """The first word."""
+        return self.arguments[0]
+
+
+def case(seed: int, number: int) -> Case:
+    """The hostile run of that number."""
+    rng = np.random.default_rng([seed, number])
+    rates = np.array([RATES.get(line.split()[0], 1.0) for line in TEMPLATES])
+    line = TEMPLATES[int(rng.choice(len(TEMPLATES), p=rates / rates.sum()))]
+    words = [str(pick(rng, ROBOTS)) if word == "ROBOT" else word for word in line.split()]
+    files = dict(material())
+    if "data.csv" in words and words[0] in ("calibrate", "evaluate") and rng.random() < 0.3:
+        return known(seed, number, words, files, rng)
+    broke = []
+    inputs = [word for word in words if word in files]
+    for _ in range(int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):
+        how = rng.random()
+        if inputs and how < 0.65:
+            name = str(pick(rng, inputs))
+            files[name], said = broken(name, files[name], rng) if files[name] else (b"", name)
+            broke.append(said)
+        elif how < 0.92:
+            broke.append(option(words, rng))
+        else:
+            broke.append(place(words, rng))
+    return Case(number, seed, tuple(words), files, tuple(broke))
+
+
+def known(seed: int, number: int, words: list[str], files: dict[str, bytes], rng: Rng) -> Case:
+    """Measurements changed in a way of which it is known what it does."""
+    harmless = words[0] == "evaluate" or rng.random() < 0.4
+    way = pick(rng, HARMLESS if harmless else FATAL)
+    files["data.csv"] = with_known(files["data.csv"], way, rng)
+    expect = "same" if harmless and words[0] == "evaluate" else "noticed" if not harmless else ""
+    return Case(number, seed, tuple(words), files, (f"data.csv: {way.__name__}",), expect)
+
+
+def option(words: list[str], rng: Rng) -> str:
+    """Give an option of the command, known or not, an odd value; or change a word."""
+    if rng.random() < 0.15:
+        at = int(rng.integers(1, len(words))) if len(words) > 1 else 0
+        words[at] = str(pick(rng, VALUES))
+        return f"word {at}: {words[at][:20]}"
+    found: list[click.Option] = [
+        part for part in cli.commands[words[0]].params if isinstance(part, click.Option)
+    ]
+    chosen: Any = pick(rng, found)
+    flag = max(chosen.opts, key=len)
+    if flag == "--pdf":  # starts a browser
+        return "nothing"
+    values = [] if chosen.is_flag else [str(pick(rng, VALUES)) for _ in range(chosen.nargs)]
+    if isinstance(chosen.type, click.Choice) and rng.random() < 0.7:
+        values = [str(pick(rng, list(chosen.type.choices)))]
+    words += [flag, *values]
+    return f"{flag} {' '.join(values)[:30]}".strip()
+
+
+def place(words: list[str], rng: Rng) -> str:
+    """Send an output to an odd place."""
+    where = str(pick(rng, PLACES))
+    if "-o" in words:
+        words[words.index("-o") + 1] = where
+    else:
+        words += ["-o", where]
+    return f"-o {where[:20]}"

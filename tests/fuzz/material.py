@@ -1,0 +1,93 @@
+"""Good files that the fuzzer breaks: an arm, its measurements, and what every command makes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import tempfile
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+import minimax_cal as mc
+from minimax_cal.cli import main
+
+POSES = 24
+
+
+def done(*arguments: str) -> None:
+    """Run a command that has to work."""
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            main(arguments)
+    except SystemExit as ended:
+        if ended.code:
+            raise RuntimeError(f"{arguments} ended with {ended.code}") from ended
+
+
+MADE: dict[str, bytes] = {}  # a process that runs cases is handed those of its parent
+
+
+def material() -> dict[str, bytes]:
+    """Files by name, all of one simulated arm, made once."""
+    if MADE:
+        return MADE
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            make()
+            MADE.update({path.name: path.read_bytes() for path in sorted(Path().iterdir())})
+        finally:
+            os.chdir(before)
+    return MADE
+
+
+def make() -> None:
+    """Write them all to the current folder."""
+    robot = mc.load_robot("irb120")
+    plain = robot.to_dict()
+    Path("robot.json").write_text(json.dumps(plain))
+    Path("robot.yaml").write_text(yaml.safe_dump(plain))
+    Path("robot.toml").write_text(toml(plain))
+    few = ("simulate", "irb120", "--poses", str(POSES), "--seed", "3")
+    done(*few, "-o", "data.csv", "--truth", "truth.json")
+    done("calibrate", "robot.json", "data.csv", "-o", "fit.json")
+    sums = ("calibrate", "robot.json", "data.csv", "--objective", "sum")
+    done(*sums, "--effects", "joint_compliance:all", "-o", "effects.json")
+    done("diagnose", "robot.json", "data.csv", "-o", "diagnosis.json")
+    done("export", "fit.json", "--to", "urdf", "-o", "robot.urdf")
+    rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
+    bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
+    write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])
+    semicolon = "\n".join(";".join(row).replace(".", ",") for row in rows)
+    Path("tracker.csv").write_text(semicolon + "\n")
+    rng = np.random.default_rng(0)
+    posts = rng.uniform(-1.0, 1.0, (4, 3)) * 2000.0
+    q = np.array([[float(cell) for cell in row[:6]] for row in rows[1:]])
+    at = robot.pose(q)[:, :3, 3] * 1e3
+    wires = np.linalg.norm(at[:, None] - posts, axis=-1) + rng.normal(0.0, 0.05, (len(q), 4))
+    header = [*rows[0][:6], *(f"wire{i + 1}_mm" for i in range(4))]
+    write("wires.csv", [header, *(list(map(str, [*a, *w])) for a, w in zip(q, wires, strict=True))])
+
+
+def write(name: str, rows: list[list[str]]) -> None:
+    """A CSV file."""
+    Path(name).write_text("".join(",".join(row) + "\n" for row in rows))
+
+
+def toml(robot: dict[str, object]) -> str:
+    """A robot as TOML; tables come last."""
+    joints = robot.pop("joints")
+    units = robot.pop("units")
+    assert isinstance(joints, list)
+    assert isinstance(units, dict)
+    lines = [f"{key} = {json.dumps(value)}" for key, value in robot.items()]
+    lines += ["[units]", *(f"{key} = {json.dumps(value)}" for key, value in units.items())]
+    for joint in joints:
+        lines += ["[[joints]]", *(f"{key} = {json.dumps(value)}" for key, value in joint.items())]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,133 @@
+"""What hostile runs found, each in its smallest form."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from minimax_cal.fitting.instruments import read_relative
+from minimax_cal.ground.records import Packed, unpacked
+from minimax_cal.reporting.plots.figures import new_figure, save
+
+from .material import material
+
+
+def broken(folder: Path, name: str, change: Any) -> Path:
+    """A result file of the material after a change of its JSON."""
+    content = json.loads(material()[name])
+    change(content)
+    path = folder / name
+    path.write_text(json.dumps(content))
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line of a refusal."""
+    capsys.readouterr()
+    assert run(*arguments) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
+    return line
+
+
+def test_cells_of_a_diagnosis_are_of_one_arm(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page drew the last one at the joints of the first."""
+
+    def shorter(content: Any) -> None:
+        del content["cells"][-1]["robot"]["joints"][2]
+
+    path = broken(tmp_path, "diagnosis.json", shorter)
+    assert "its cells are not of one arm" in refused(capsys, "report", path)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("split", None), ("line", [None]), ("q", [[1.0], [1.0, 2.0]]), ("measured_mm", "x")],
+)
+def test_a_broken_list_of_poses_is_told_in_our_words(
+    part: str, value: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = broken(tmp_path, "fit.json", lambda content: content["poses"].update({part: value}))
+    line = refused(capsys, "iso9283", path)
+    assert "its list of poses cannot be read" in line
+    assert not any(word in line for word in ("NoneType", "shape", "inhomogeneous", "convert"))
+
+
+def test_arrays_of_another_size_are_told_in_our_words() -> None:
+    text = base64.b64encode(np.zeros(5).tobytes()).decode()
+    with pytest.raises(ValueError, match="5 numbers in place of 6"):
+        unpacked(Packed(shape=(2, 3), float64=text))
+    assert unpacked(Packed(shape=(5,), float64=text)).tolist() == [0.0] * 5
+
+
+@pytest.mark.parametrize("cell", ["1e308", "-1e300", "100001"])
+def test_joints_that_cannot_be_are_refused(cell: str, tmp_path: Path) -> None:
+    """Rounding them overflowed."""
+    for name, read in (("data.csv", mc.read_measurements), ("wires.csv", read_relative)):
+        lines = material()[name].decode().splitlines()
+        rest = lines[2].split(",")
+        lines[2] = ",".join([rest[0], cell, *rest[2:]])
+        path = tmp_path / name
+        path.write_text("\n".join(lines))
+        with pytest.raises(mc.DataError, match=r":3: column q2_rad: .* cannot be"):
+            read(path)
+
+
+def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path: Path) -> None:
+    """A variance that rounding made negative was a warning, and "good to nan mm"."""
+    robot = mc.load_robot("irb120")
+    mdh = robot.mdh.copy()
+    mdh[3, 3] = np.pi  # two axes that are one: alpha4 of another arm
+    path = tmp_path / "wires.csv"
+    path.write_bytes(material()["wires.csv"])
+    found = mc.relative(robot.with_mdh(mdh), read_relative(path))
+    assert not any("nan" in notice for notice in found.notices)
+
+
+def test_the_name_of_an_output_moves_no_cursor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("data.csv").write_bytes(material()["data.csv"])
+    assert run("import", "data.csv", "-o", "\x1b]0;owned\x07") == 0
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_a_lever_that_cannot_be_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its square overflowed."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("fit.json", "targets.csv"):
+        Path(name).write_bytes(material()[name])
+    line = refused(capsys, "compensate", "fit.json", "targets.csv", "--lever", "1e9")
+    assert "must be positive and finite" in line
+    for option in ("--lever", "--tolerance"):
+        line = refused(capsys, "compensate", "fit.json", "targets.csv", option, "1e308")
+        assert "cannot be; at most 1e+12" in line
+    assert "cannot be" in refused(capsys, "plan", "irb120", "--poses", 9, "--noise", "-1e300")
+
+
+def test_targets_on_a_terminal_move_no_cursor() -> None:
+    """In a pipe they are the file as it is; `compensate` without -o prints them."""
+    from minimax_cal.cli.compensate import on_terminal
+
+    assert on_terminal("q1_rad,\x1b[31m\n1,2\n") == "q1_rad,\N{REPLACEMENT CHARACTER}[31m\n1,2\n"
+
+
+def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> None:
+    figure = new_figure(0.5, 0.5)
+    axes = figure.subplots()
+    axes.set_ylabel("long" * 40)
+    axes.set_xlabel("long" * 40)
+    axes.set_title("t\n" * 40)
+    save(figure, tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 0
