@@ -187,7 +187,8 @@ def with_tool(arm: Arm, sag: Array, drawn: float) -> Arm:
 class Parts:
     """An arm in the making.  soft: laws of what gives way under gravity, with their values.
 
-    grouped: whether a law takes the torques of several groups of links apart.  sagging: laws of the
+    grouped: whether a law takes the torques of several groups of links apart, or no spring does
+    what it does.  sagging: laws of the
     tool; tools: each as its turn per direction of gravity (3, 3) [rad], and along z [m].  firm:
     effects that elements hold exactly.
     """
@@ -257,10 +258,9 @@ def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """A link that bends, or the base."""
     value = float(values[0])
-    if value <= 0.0:
-        parts.left_out.append(f"{term.label}: its value is below zero, which no spring has")
-        return
-    if term.effect == "base_flex":
+    if value <= 0.0:  # no spring does that; others may take over what it does
+        parts.grouped = True
+    elif term.effect == "base_flex":
         parts.put(base=parts.arm.base + value)
     else:
         link = joint_of(term.place)

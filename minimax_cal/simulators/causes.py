@@ -72,7 +72,7 @@ def causes_of(
     whole = fitted(fit, [*firm, *others]) if others else fits[-1]
     rows, held, same = judged_by(fit, data, chosen)
     floor = told.floor if told else math.nan
-    return Causes(("calibrated geometry", *(f"+ {label}" for label in labels)), tuple(fits), whole,
+    return Causes(("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels)), tuple(fits), whole,
                   rows, held, floor, same)  # fmt: skip
 
 

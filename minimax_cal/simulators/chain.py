@@ -22,6 +22,7 @@ from minimax_cal.robots.urdf import UrdfRobot, to_robot
 from minimax_cal.robots.urdf_file import Element, Joint, Urdf
 
 ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
+DRIVES_TENDON = 3  # mjTRN_TENDON
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
 Bodies = Sequence[int]
 
@@ -58,12 +59,11 @@ class Chain:
         return tuple(self.model.joint(j).name for j in self.joints)
 
     def servo(self, joint: int) -> int:
-        """Id of the position actuator of a joint, or of its name; -1 where there is none."""
-        m, name = self.model, self.model.joint(joint).name
+        """Id of the position actuator of a joint; -1 where there is none."""
+        m = self.model
         for i in range(m.nu):
-            drives = m.actuator_trntype[i] == 0 and m.actuator_trnid[i, 0] == joint
-            ours = bool(name) and m.actuator(i).name == name
-            if (drives or ours) and m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]:
+            is_servo = m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]
+            if is_servo and drives(m, i, joint):
                 return i
         return -1
 
@@ -141,13 +141,17 @@ def way_to(model: Any, body: int) -> tuple[int, ...]:
 
 
 def driven(model: Any, joint: int) -> bool:
-    """Whether an actuator drives a joint, or has its name."""
-    name = model.joint(joint).name
-    return any(
-        (model.actuator_trntype[i] == 0 and model.actuator_trnid[i, 0] == joint)
-        or (name and model.actuator(i).name == name)
-        for i in range(model.nu)
-    )
+    """Whether an actuator drives a joint."""
+    return any(drives(model, i, joint) for i in range(model.nu))
+
+
+def drives(model: Any, actuator: int, joint: int) -> bool:
+    """Whether an actuator drives a joint, itself or by a tendon of ours."""
+    kind, number = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind == DRIVES_TENDON:
+        name = model.joint(joint).name
+        return bool(name) and bool(model.tendon(number).name == f"{name}_drive")
+    return kind == 0 and number == joint
 
 
 def at_zero(model: Any, joints: Sequence[int]) -> Any:

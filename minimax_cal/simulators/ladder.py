@@ -157,7 +157,12 @@ class Run:
         mapped = None
         if whole.mapped.terms:
             mapped = self.with_commands(whole)
-        return Last(replace(rung, why=before.why), mapped, whole, (*notices, *told(whole)))
+        return Last(
+            replace(rung, why=before.why),
+            mapped,
+            whole,
+            (*notices, *told(replace(whole, remainder=0.0))),
+        )
 
     def with_commands(self, whole: Arm) -> Rung:
         """The arm with all effects, driven with mapped commands."""

@@ -39,8 +39,8 @@ def told(arm: Arm) -> list[str]:
     out += [f"not in the file: {text}" for text in arm.left_out]
     if arm.remainder:
         out.append(
-            "masses are not known: one set of masses and springs imitates the effects of the fit "
-            f"to {1e3 * arm.remainder:.2g} mm RMS"
+            "one set of masses and springs stands for the effects of the fit, to "
+            f"{1e3 * arm.remainder:.2g} mm RMS"
         )
     if arm.play.any():
         joints = ", ".join(f"play{i + 1}" for i in np.flatnonzero(arm.play))

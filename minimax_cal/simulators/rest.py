@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain, body_pose, mujoco
+from minimax_cal.simulators.chain import Chain, body_pose, mujoco, way_to
 
 LONGEST = 8.0  # that an arm may take to come to rest [s]
 STILL = 1e-6  # slower is at rest [rad/s, m/s]
@@ -49,6 +49,7 @@ def at_rest(
     servos = np.array([chain.servo(joint) for joint in chain.joints])
     driven = bool((servos >= 0).all())
     at = np.array([int(model.jnt_qposadr[joint]) for joint in chain.joints])
+    dofs = np.array([int(model.jnt_dofadr[j]) for j in way_to(model, carrier(chain))])
     sides = plays(chain)
     springs = np.array(model.qpos_spring)
     out, stands, moving, touching = [], [], [], []
@@ -60,7 +61,7 @@ def at_rest(
             model.qpos_spring[place] = data.qpos[place] = side
         if driven:
             data.ctrl[servos] = commands[row]
-            moving.append(not settled(mj, model, data))
+            moving.append(not settled(mj, model, data, dofs))
             touching.append(bool(data.ncon) and pressed(mj, model, data))
         else:
             mj.mj_kinematics(model, data)
@@ -73,12 +74,12 @@ def at_rest(
     return Rested(np.array(out), np.array(stands), np.array(moving), np.array(touching), driven)
 
 
-def settled(mj: Any, model: Any, data: Any) -> bool:
-    """Step until nothing moves, or for as long as an arm may take; whether it came to rest."""
+def settled(mj: Any, model: Any, data: Any, dofs: Array) -> bool:
+    """Step until the arm's joints are still, or for LONGEST; whether it came to rest."""
     before = False
     while data.time < LONGEST:
         mj.mj_step(model, data, CHUNK)
-        still = bool(np.abs(data.qvel).max(initial=0.0) < STILL)
+        still = bool(np.abs(data.qvel[dofs]).max(initial=0.0) < STILL)
         if still and before:
             return True
         before = still

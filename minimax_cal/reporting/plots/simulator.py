@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 import textwrap
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, plain_ticks, save
 from minimax_cal.simulators.result import SimulatorGap
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def save_simulator_gap(gap: SimulatorGap, path: Path | str) -> None:
-    """The ladder in the simulator, from the model as given down to the noise.
+    """Draw the ladder.  path: its suffix, one of `figures.PICTURES`, chooses the format."""
+    save(simulator_figure(gap), Path(path))
 
-    path: its suffix, one of `figures.PICTURES`, chooses the format.
-    """
+
+def simulator_figure(gap: SimulatorGap) -> Figure:
+    """The ladder in the simulator, from the model as given down to the noise."""
     rungs = (*gap.rungs, *([gap.commands] if gap.commands else []))
     held = np.array([rung.holdout_rms_mm for rung in rungs])
     worst = np.array([rung.holdout_max_mm for rung in rungs])
@@ -43,4 +49,4 @@ def save_simulator_gap(gap: SimulatorGap, path: Path | str) -> None:
                 fontsize="small")  # fmt: skip
     title = f"{gap.robot} in the simulator: {gap.holdout_poses} held-out poses"
     figure.suptitle(textwrap.fill(title, 90), fontweight="bold")
-    save(figure, Path(path))
+    return figure
