@@ -3,9 +3,10 @@
     python -m experiments.simulator_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
 Three arms, one of seven axes, that give way at their joints and foot, have play in their gears and
-encoders that count wrong; masses unknown.  Their nominal models, with servo gains as published
-models have them, are corrected step by step; every figure is measured in the simulator, on poses
-that no fit has seen.  The last column drives the corrected file by a loop of its own.
+encoders that count wrong; one of them again with masses unknown.  Their nominal models, with servo
+gains as published models have them, are corrected step by step; every figure is measured in the
+simulator, on poses that no fit has seen.  The last column drives the corrected file by a loop of
+its own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import math
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -30,23 +31,25 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.reporting.plots.simulator import simulator_figure
+from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.simulators.result import SimulatorGap
 
-PUBLISHED = (2e4, 2e4, 2e4, 5e3, 5e3, 5e3, 5e3)  # gains of the size in use
-COMPLIANCE = 2e-6  # of each joint, under assumed masses that are large [rad/(N m)]
-GAIN, BASE, PLAY = 4e-4, 3e-7, 1.5e-4  # [-], [rad/(N m)], from stop to stop [rad]
+PUBLISHED = (5000.0, 5000.0, 5000.0, 1000.0, 1000.0, 1000.0, 1000.0)  # gains of the size in use
+COMPLIANCE = 6e-6  # of each joint [rad/(N m)]
+GAIN, BASE, PLAY = 4e-4, 9e-7, 1.5e-4  # [-], [rad/(N m)], from stop to stop [rad]
 NOISE = 10e-6  # of a coordinate [m]
 EFFECTS = ("joint_compliance:all", "encoder_gain:all", "base_flex:frame", "backlash:all")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One arm.  poses: measured, a quarter of them held out."""
+    """One arm.  poses: measured, a quarter of them held out.  known: whether its masses are."""
 
     robot: str
     poses: int
     seed: int
+    known: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,12 @@ def robot_called(name: str) -> mc.Robot:
     ]
     units = {"length": "mm", "angle": "rad"}
     return robot_from_dict({"name": "an arm of seven axes", "units": units, "joints": joints})
+
+
+def weighed(robot: mc.Robot) -> mc.Robot:
+    """The robot with masses: a third of what would be assumed, as real arms have."""
+    mass, com = tubes(robot.mdh)
+    return replace(robot, mass=np.maximum(mass / 3.0, 0.5), com=com)
 
 
 def measured(robot: mc.Robot, trial: Trial) -> mc.Measurements:
@@ -101,8 +110,9 @@ def published(robot: mc.Robot, path: Path) -> None:
 
 def run(trial: Trial) -> Result:
     """The ladder of one arm, and its corrected file by itself."""
-    robot = robot_called(trial.robot)
+    robot = weighed(robot_called(trial.robot))
     data = measured(robot, trial)
+    robot = robot if trial.known else robot_called(trial.robot)
     fit = mc.calibrate(robot, data, objective="sum", effects=EFFECTS)
     with tempfile.TemporaryDirectory() as folder:
         model, corrected = Path(folder) / f"{trial.robot}.xml", Path(folder) / "corrected.xml"
@@ -147,7 +157,8 @@ def rows_of(trial: Trial, result: Result) -> list[tuple[Cell, ...]]:
     out: list[tuple[Cell, ...]] = []
     for rung in result.gap.rungs:
         off = 1e3 * (rung.holdout_rms_mm - rung.predicted_rms_mm)
-        out.append((trial.robot, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm,
+        name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
+        out.append((name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm,
                     rung.predicted_rms_mm, off, rung.sag_mrad, math.nan))  # fmt: skip
     out[-1] = (*out[-1][:-1], result.alone_mm)
     return out
@@ -173,10 +184,14 @@ def main(study: Study, poses: int) -> None:
     names = ("ur10",) if study.quick else ("ur10", "irb2600", "seven_axes")
     poses = 80 if study.quick else poses
     trials = [Trial(name, poses, study.seed + i) for i, name in enumerate(names)]
+    trials += [Trial("ur10", poses, study.seed, known=False)]
     results = study.sweep(run, trials, "arms")
     table = table_of(trials, results)
     content = {
-        trial.robot: {**result.gap.to_dict(), "alone_mm": result.alone_mm}
+        trial.robot + ("" if trial.known else "_unknown_masses"): {
+            **result.gap.to_dict(),
+            "alone_mm": result.alone_mm,
+        }
         for trial, result in zip(trials, results, strict=True)
     }
     figures = {"simulator_gap_ladder": simulator_figure(results[0].gap)}

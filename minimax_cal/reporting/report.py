@@ -45,8 +45,8 @@ def report(
     path: of the page, which needs no network.  title: that of the robot unless given.  customer,
     author: who accepts, who measured.  date: YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
     pdf: printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called
-    with what the reader should know of both together, which the page says too.  Lengths on the page are in mm, angles in mrad.
-    Returns the path of the page.  Raises CalibrationError for wrong input.
+    with what the reader should know of both together, which the page says too.  Lengths on the page
+    are in mm, angles in mrad.  Returns its path.  Raises CalibrationError for wrong input.
 
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """

@@ -20,6 +20,8 @@ from minimax_cal.measuring.measurements import Measurements, split
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.arm import ELEMENTS, assumed
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.given import told_masses
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ class Causes:
 
 
 def causes_of(
-    robot: Robot,
+    chain: Chain,
     data: Measurements,
     fit: Fit | Path | str | None,
     diagnosis: Diagnosis | Path | str | None,
@@ -50,8 +52,10 @@ def causes_of(
 ) -> Causes:
     """From a fit, a diagnosis, or both; without either a diagnosis is made.
 
-    robot: that the model is, nominal.  chosen: share and seed of the held-out poses, for a new one.
+    chain: the arm in the model.  A fit without masses is made again with those of the model: then
+    its springs are the model's.  chosen: share and seed of the held-out poses, for a new diagnosis.
     """
+    robot = chain.robot
     fit = load_fit(fit) if isinstance(fit, Path | str) else fit
     told = load_diagnosis(diagnosis) if isinstance(diagnosis, Path | str) else diagnosis
     if fit is None and told is None:
@@ -62,6 +66,11 @@ def causes_of(
         terms = carried_over(terms, robot)
         rows = replace(told.data, digest=told.provenance.data_sha256)
         fit = calibrate(robot, marked(rows, told.held), objective="sum")
+    elif not assumed(robot) and assumed(fit.before.robot):
+        progress("fit with the masses of the model")
+        terms = carried_over(terms, robot)
+        fit = weighed(fit, chain, [t.label if not t.choice else t for t in terms])
+        terms = fit.cell.effects.terms
     firm = [term for term in terms if term.effect in ELEMENTS]
     labels = list(dict.fromkeys(term.label for term in firm))
     fits = [fit if not fit.cell.effects.terms else again(fit, effects=())]
@@ -72,8 +81,17 @@ def causes_of(
     whole = fitted(fit, [*firm, *others]) if others else fits[-1]
     rows, held, same = judged_by(fit, data, chosen)
     floor = told.floor if told else math.nan
-    return Causes(("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels)), tuple(fits), whole,
-                  rows, held, floor, same)  # fmt: skip
+    names = ("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels))
+    return Causes(names, tuple(fits), whole, rows, held, floor, same)
+
+
+def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
+    """The same fit, effects given, of a robot that has the masses of a simulator's model."""
+    nominal = fit.before.robot
+    mass, com = told_masses(chain, nominal)
+    settings = {**vars(fit.options), "effects": tuple(effects)}
+    rows = marked(fit.data, fit.held)
+    return calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
 
 
 def established(told: Diagnosis) -> tuple[Term, ...]:

@@ -68,8 +68,11 @@ class Chain:
         return -1
 
 
-def chain_of(model: Any, count: int, source: str, tip: str = "") -> Chain:
-    """The arm of so many joints in a model.  tip: its last body.  Raises RobotError."""
+def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: bool = False) -> Chain:
+    """The arm of so many joints in a model.
+
+    tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
+    """
     joints = joints_of(model, count, source, tip)
     seen = as_urdf(model, joints, source)
     down = np.array(model.opt.gravity)
@@ -77,6 +80,8 @@ def chain_of(model: Any, count: int, source: str, tip: str = "") -> Chain:
     robot = robot_from_dict(seen.content, source)
     if size > 0.0:
         robot = replace(robot, up=-(seen.base[:3, :3].T @ down) / size)
+    if unknown:
+        robot = replace(robot, mass=robot.mass * np.nan, com=robot.com * np.nan)
     base = seen.base
     told = told_robot(model, source)
     if told is not None and told.joints == count:

@@ -29,7 +29,9 @@ def correct(job: Job) -> Export:
     if job.cell is None or not job.fitted or job.model is None:
         raise OptionError(f"{job.source}: --mjcf corrects by a calibration; give one as FIT")
     given = read_model(job.model)
-    chain = chain_of(given.compiled(), job.robot.joints, given.source, job.tip)
+    chain = chain_of(
+        given.compiled(), job.robot.joints, given.source, job.tip, unknown=given.assumed
+    )
     own = None if assumed(chain.robot) else told_masses(chain, job.nominal)
     arm = arm_of(job.cell, job.q, own)
     tree, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)

@@ -24,7 +24,7 @@ from minimax_cal.ground.files import read_raw
 from minimax_cal.robots.gravity import G
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
-from minimax_cal.robots.urdf_file import parse_xml
+from minimax_cal.robots.urdf_file import ASSUMED, parse_xml, walk
 from minimax_cal.simulators.arm import Arm, assumed, stiff
 from minimax_cal.simulators.chain import (
     ROBOT,
@@ -44,11 +44,15 @@ DEEPEST = 20  # includes within includes
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """A model's file.  tree: with its includes written out.  folder: where its assets are."""
+    """A model's file.  tree: with its includes written out.  folder: where its assets are.
+
+    assumed: whether it says itself that its masses are.
+    """
 
     source: str
     tree: ET.Element
     folder: Path
+    assumed: bool = False
 
     def compiled(self, tree: ET.Element | None = None) -> Any:
         """The model as MuJoCo sees it.  Raises RobotError."""
@@ -70,7 +74,8 @@ def read_model(path: Path | str) -> Given:
     raw = read_raw(path, kind=RobotError)
     top = parse_xml(raw, str(path))
     if top.tag == "robot":
-        return Given(str(path), from_urdf(path), path.parent)
+        marked = any(ASSUMED in element.attributes for element in walk(top))
+        return Given(str(path), from_urdf(path), path.parent, marked)
     if top.tag != "mujoco":
         raise RobotError(f"{path}: is neither MJCF nor URDF: its root is <{top.tag}>")
     return Given(str(path), written_out(path, path.parent, 0), path.parent)

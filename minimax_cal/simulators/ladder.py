@@ -64,8 +64,8 @@ def simulator_gap(
     progress("reading the model")
     rows = data if isinstance(data, Measurements) else read_measurements(data)
     given = read_model(model)
-    chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip)
-    causes = causes_of(chain.robot, rows, fit, diagnosis, (holdout, seed), progress)
+    chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
+    causes = causes_of(chain, rows, fit, diagnosis, (holdout, seed), progress)
     if not causes.held.any():
         raise OptionError(f"{causes.data.source}: no pose is held out; give --holdout 0.2")
     run = Run(given, chain, causes, progress)

@@ -145,8 +145,8 @@ def read_sources(results: Sequence[Result]) -> Sources:
             raise CalibrationError(f"{path}: is a second {kind}; give one and one {other}")
     if len(arms) > 1 or not (fits or gaps):
         raise CalibrationError(
-            f"{path}: a report is of a calibration or a diagnosis, give one as well; with it one gap "
-            "in a simulator at most"
+            f"{path}: a report is of a calibration or a diagnosis: give one as well, and at most "
+            "one gap in a simulator"
         )
     files.sort(key=lambda file: file.kind)
     fit, gap = fits[0] if fits else None, gaps[0] if gaps else None
