@@ -105,7 +105,7 @@ def published(robot: mc.Robot, path: Path) -> None:
     text = mc.export(robot, "mjcf", notify=lambda notice: None)
     gains = iter(PUBLISHED)
     text = re.sub(r'kp="[^"]*"', lambda _: f'kp="{next(gains)}"', text)
-    path.write_text(re.sub(r'damping="[^"]*"', 'damping="400"', text))
+    path.write_text(re.sub(r'kv="[^"]*"', 'kv="400"', text))
 
 
 def run(trial: Trial) -> Result:

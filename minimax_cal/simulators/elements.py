@@ -37,7 +37,8 @@ class Layout:
     root: of the tree.  names: of the n joints.  bodies: that carry them.  joints: their elements.
     seats: (n, 4, 4) frame of joint i (z its axis, at joint value 0) in its body [m].
     anchors, axes: (n, 3) a point on each joint's axis [m] and its direction, in its body.
-    degrees: whether the file counts angles in degrees.
+    degrees: whether the file counts angles in degrees.  implicit: whether its integrator takes the
+    dampers of servos implicitly, as it does those of joints.
     """
 
     root: ET.Element
@@ -48,6 +49,7 @@ class Layout:
     anchors: Array
     axes: Array
     degrees: bool = False
+    implicit: bool = True
 
 
 def numbers(values: ArrayLike) -> str:
@@ -120,11 +122,13 @@ def servos(layout: Layout, arm: Arm, stiffness: Array) -> None:
     _, _, inertia = carried(arm)
     damper = damping(stiffness, np.where(arm.robot.prismatic, carried(arm)[0] / G, inertia))
     for i, name in enumerate(layout.names):
-        layout.joints[i].set("damping", numbers([damper[i]]))
-        layout.joints[i].set("stiffness", "0")
         servo = servo_of(layout, name)
         gear = 1.0 / (1.0 + arm.gain[i])
-        tune(servo, stiffness[i] / gear**2)
+        if layout.implicit:
+            tune(servo, stiffness[i] / gear**2, damper[i] / gear**2)
+        else:
+            layout.joints[i].set("damping", numbers([damper[i]]))
+            tune(servo, stiffness[i] / gear**2, 0.0)
         if arm.gain[i]:
             servo.set("gear", numbers([gear]))
         others = [(j, c) for k, j, c in arm.coupled if k == i]
@@ -148,17 +152,17 @@ def servo_of(layout: Layout, joint: str) -> ET.Element:
     return part(actuators, "position", name=joint, joint=joint)
 
 
-def tune(servo: ET.Element, gain: float) -> None:
-    """Give a position actuator another gain."""
+def tune(servo: ET.Element, gain: float, damper: float) -> None:
+    """Give a position actuator another gain and damper."""
     if servo.tag == "position":
         for name in ("dampratio", "timeconst", "inheritrange"):
             servo.attrib.pop(name, None)
         servo.set("kp", numbers([gain]))
-        servo.set("kv", "0")
+        servo.set("kv", numbers([damper]))
     else:
         servo.set("gainprm", numbers([gain]))
         servo.set("biastype", "affine")
-        servo.set("biasprm", numbers([0.0, -gain, 0.0]))
+        servo.set("biasprm", numbers([0.0, -gain, -damper]))
 
 
 def spring(

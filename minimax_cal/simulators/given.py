@@ -39,6 +39,7 @@ from minimax_cal.simulators.elements import Layout, equip, numbers, quaternion, 
 from minimax_cal.simulators.mjcf import weigh
 
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
 DEEPEST = 20  # includes within includes
 
 
@@ -248,6 +249,9 @@ def seats(
         raise RobotError(f"{given.source}: {what}: give each joint a name and a body of its own")
     joints = [named[name] for name in chain.names]
     bodies = [parents[joint] for joint in joints]
+    for number, element in zip(chain.joints, joints, strict=True):
+        if model.jnt_stiffness[number]:  # its own, or of its class
+            element.set("stiffness", "0")
     moving = [joint for joint in chain.seen.chain if joint.moves]
     data = at_zero(model, chain.joints)
     old = [body_pose(data, b) for b in chain.bodies]
@@ -274,6 +278,7 @@ def seats(
         seats=np.array(out),
         anchors=np.array([model.jnt_pos[j] for j in chain.joints]),
         axes=np.array([model.jnt_axis[j] for j in chain.joints]),
+        implicit=int(model.opt.integrator) in IMPLICIT,
         degrees=compiler_of(given).get("angle", "degree") == "degree",
     )
 

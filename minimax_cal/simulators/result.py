@@ -120,10 +120,9 @@ class SimulatorGap:
         if math.isfinite(self.floor):
             noise = (math.nan, math.nan, math.nan, "what noise alone would leave")
             rows = (*rows, ("noise floor", self.floor, *noise))
-        header = ("model", "held-out RMS mm", "held-out max mm", "fit says RMS mm",
-                  "joints off, max mrad", "")  # fmt: skip
-        return Table(f"{self.robot} in the simulator: {self.holdout_poses} held-out poses", header,
-                     rows, ("", ".4f", ".4f", ".4f", ".3f", ""))  # fmt: skip
+        header = ("model", "RMS mm", "max mm", "fit says mm", "joints off mrad", "")
+        title = f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses"
+        return Table(title, header, rows, ("", ".4f", ".4f", ".4f", ".3f", ""))
 
     def headline(self) -> str:
         """The result in a sentence or two."""

@@ -120,7 +120,7 @@ def test_models_that_do_not_fit_are_refused(
 
 
 def test_the_study_in_its_quick_form() -> None:
-    result = study.run(study.Trial("ur10", 60, 0))
+    result = study.run(study.Trial("ur10", 48, 0))
     for rung in result.gap.rungs[2:]:
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
     assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < AGREES
