@@ -24,7 +24,7 @@ from experiments.speed import identified
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import split
+from minimax_cal.measuring.grouping import split
 from minimax_cal.modelling.model import SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers import least_squares, minimax

@@ -24,7 +24,8 @@ from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.measurements import Measurements, split
+from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot, load_robot

@@ -290,7 +290,7 @@ def held_out(error: Array, n: int, rms: float, rng: np.random.Generator) -> tupl
     error: (k, m, 3) of many poses, the first n held out, the next n new.
     """
     held, new = error[:, :n], error[:, n : 2 * n]
-    middle, most = rms_interval(held, LEVEL, rng=rng), max_interval(held, LEVEL, rng=rng)
+    middle, most = (f(held, level=LEVEL, rng=rng) for f in (rms_interval, max_interval))
     worst = [float(np.linalg.norm(part, axis=-1).max()) for part in (held, new, new[:, :1])]
     return middle.low <= rms <= middle.high, most.low <= worst[1] <= most.high, worst[2] > worst[0]
 

@@ -39,7 +39,8 @@ from minimax_cal.fitting.instruments.identify import position_sigma
 from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
-from minimax_cal.measuring.measurements import Measurements, measurements, split
+from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import gravity, random_poses
 from minimax_cal.robots.robot import Robot, load_robot

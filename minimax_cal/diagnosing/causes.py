@@ -13,7 +13,8 @@ from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import ENOUGH, alternatives
-from minimax_cal.evidence.selection import Choice, Library
+from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.table import Term
@@ -28,11 +29,15 @@ ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 class Causes:
     """What may be wrong.
 
-    faults: of the data.  choice: the effects selected, effects: as findings, the weightiest first.
+    faults: of the data.  library: what could be tested, and ripple:
+    whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
+    weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.
     """
 
     faults: tuple[Fault, ...]
+    library: Library
+    ripple: bool
     choice: Choice
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
@@ -44,22 +49,25 @@ def causes_of(
 ) -> Causes:
     """The effects that explain a study's errors, beside faults that are known."""
     progress("effects")
-    library, choice = chosen(study, exclude)
+    lib, choice = chosen(study, exclude)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
-        library, choice = chosen(study, (*exclude, "backlash"))
+        lib, choice = chosen(study, (*exclude, "backlash"))
     progress("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
-    effects = merged([finding(study, choice, i) for i in by_weight(study, choice)])
-    return Causes((*faults, *read_back), choice, tuple(effects), traces, library.untestable)
+    effects = merged([finding(study, choice, i) for i in by_weight(choice)])
+    ripple = "gear_ripple" not in exclude
+    return Causes(
+        (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
+    )
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
     """The library and what it explains."""
-    library = selection.library(study.scene, study.rows, exclude)
-    return library, selection.select(library, ripple="gear_ripple" not in exclude)
+    lib = library(study.scene, study.rows, exclude)
+    return lib, selection.select(lib, ripple="gear_ripple" not in exclude)
 
 
 def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
@@ -79,23 +87,36 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     return in_lines(study.data, found, "readback")
 
 
-def by_weight(study: Study, choice: Choice) -> list[int]:
+def by_weight(choice: Choice) -> list[int]:
     """The effects in the order in which each takes most of what is left, points weighing alike."""
-    rows, columns = study.rows, choice.library.columns
-    fields = [columns[:, one.candidate.main] for one in choice.fits]
-    fields = [field - rows.basis @ (rows.basis.T @ field) for field in fields]
-    rest, order = rows.error, []
-    waiting = list(range(len(fields)))
-    taken = np.zeros((len(rest), 0))
+    lib = choice.library
+    fields = [lib.products.clear(one.candidate.main) for one in choice.fits]
+    sizes = [len(field) for field in fields]
+    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    columns = np.concatenate([np.zeros((0, len(lib.rows.error))), *fields])
+    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    gram, pull = columns @ columns.T, columns @ lib.rows.error
+    waiting, order = list(range(len(fields))), []
+    taken = np.zeros(0, dtype=int)
     while waiting:
-        left = []
+        gains = []
         for i in waiting:
-            basis = np.linalg.qr(np.concatenate([taken, fields[i]], axis=1))[0]
-            left.append(float(((rest - basis @ (basis.T @ rest)) ** 2).sum()))
-        best = waiting.pop(int(np.argmin(left)))
-        taken = np.concatenate([taken, fields[best]], axis=1)
+            both = np.concatenate([taken, parts[i]])
+            value = np.linalg.lstsq(gram[np.ix_(both, both)], pull[both], rcond=1e-12)[0]
+            gains.append(float(pull[both] @ value))
+        best = waiting.pop(int(np.argmax(gains)))
+        taken = np.concatenate([taken, parts[best]])
         order.append(best)
     return order
+
+
+def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
+    """The terms of each effect selected, the weightiest first, all lines of a joint together."""
+    out: dict[tuple[str, str], list[Term]] = {}
+    for number in by_weight(choice):
+        term = choice.fits[number].candidate.term
+        out.setdefault((term.effect, term.place), []).append(term)
+    return [tuple(terms) for terms in out.values()]
 
 
 def finding(study: Study, choice: Choice, number: int) -> Finding:
@@ -111,7 +132,7 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
             rival = found[i][0].candidate.term
             advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
     columns = one.candidate.term.columns(table.library.scene)
-    size, _ = table.setting(one).likeness(one, one.candidate)
+    size, _ = table.likeness(one, one.candidate)
     return Finding(
         terms=(one.candidate.term,),
         names=columns.names,

@@ -17,7 +17,7 @@ from scipy import stats
 
 from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import groups
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.effects.scene import Scene, turning
 from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.robots.kinematics import cross

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
+from minimax_cal.fitting.claims import bad_rows, beyond_of, contradiction, unseen_suspects
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.options import (
     Options,
@@ -27,12 +28,14 @@ from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, groups, read_measurements, split
+from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
@@ -59,6 +62,7 @@ def calibrate(
     *,
     holdout: float = 0.2,
     seed: int = 0,
+    holdout_by: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
@@ -77,7 +81,8 @@ def calibrate(
 
     robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
     worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
-    out of the fit; seed: of that choice.  fix, free: parameters as ``beta*``, a list or a text with
+    out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
+    poses are held out together.  fix, free: parameters as ``beta*``, a list or a text with
     commas.  priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of
     the least squares.  lever: what a radian counts as in the pose objective [m], the targets' own
     unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
@@ -95,6 +100,7 @@ def calibrate(
         qp=qp,
         holdout=holdout,
         seed=seed,
+        holdout_by=holdout_by,
         fix=listed(fix),
         free=listed(free),
         priors=priors or {},
@@ -111,10 +117,10 @@ def calibrate(
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = data if isinstance(data, Measurements) else read_measurements(data)
     check(robot, data, options)
-    parts = parted(robot, data, options)
+    poses = parted(robot, data, options)
     progress("start")
-    solved = fit_cell(robot, parts.train, options, progress)
-    return judged(robot, options, parts, solved, began)
+    solved = fit_cell(robot, poses.train, options, progress)
+    return judged(robot, options, poses, solved, began)
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -125,9 +131,9 @@ def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
     began = time.perf_counter()
     options = replace(fit.options, **changes)  # type: ignore[arg-type]
     check(fit.before.robot, fit.data, options)
-    parts = Parts(fit.data, fit.train, fit.data.take(fit.held), fit.data.notices)
-    solved = fit_cell(fit.before.robot, parts.train, options, progress)
-    return judged(fit.before.robot, options, parts, solved, began)
+    poses = Parts(fit.data, fit.train, fit.data.take(fit.held), fit.data.notices)
+    solved = fit_cell(fit.before.robot, poses.train, options, progress)
+    return judged(fit.before.robot, options, poses, solved, began)
 
 
 def check(robot: Robot, data: Measurements, options: Options) -> None:
@@ -143,7 +149,8 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     """Training and held-out poses; targets that hardly any pose shows are left out."""
     if options.effects:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
-    train, held, said = split(data, options.holdout, options.seed)
+    data = with_groups(data)
+    train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
@@ -156,25 +163,29 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     return Parts(data, train, held, notices)
 
 
-def judged(robot: Robot, options: Options, parts: Parts, solved: Solved, began: float) -> Fit:
+def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: float) -> Fit:
     """The fit with its accuracy on training and on held-out poses."""
-    data, held = parts.data, np.isin(parts.data.line, parts.held.line)
+    data, held = poses.data, np.isin(poses.data.line, poses.held.line)
     calibrated = Cell.of(robot, solved.state, data.target_names, solved.effects)
     nominal = Cell.of(robot, solved.nominal, data.target_names)
     before, after = nominal.error(data), calibrated.error(data)
+    suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    wrong = contradiction(robot, data, after, held, suspects)
     notices = (
-        *parts.notices,
+        *poses.notices,
         *solved.notices,
-        *remarks(options, parts),
+        *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *doubts(robot, solved, before[:, ~held]),
+        *bad_rows(suspects, data.source),
+        *([wrong] if wrong else []),
     )
     return Fit(
         cell=calibrated,
         nominal=nominal,
         objective=options.objective,
         qp=usable(options.qp)[0],  # the one that ran
-        status=solved.status,
+        status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
         parameters=parameter_table(robot, solved),
@@ -186,7 +197,7 @@ def judged(robot: Robot, options: Options, parts: Parts, solved: Solved, began: 
         },
         identification=solved.identification,
         uncertainty=solved.uncertainty,
-        minimax=worst_case(options.objective, solved, parts.train, after[:, ~held]),
+        minimax=worst_case(options.objective, solved, poses.train, after[:, ~held]),
         certificate=solved.certificate,
         trace=solved.trace,
         data=data,
@@ -195,22 +206,23 @@ def judged(robot: Robot, options: Options, parts: Parts, solved: Solved, began: 
         error=after,
         notices=notices,
         loss=options.loss,
-        suspects=solved.robust.suspects,
+        suspects=suspects,
         weights=solved.robust.weights,
         share=solved.estimator.share,
         prior=solved.estimator.model.prior.weight,
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
+        beyond=beyond_of(robot, options, data, held, solved, suspects),
     )
 
 
-def remarks(options: Options, parts: Parts) -> Iterator[str]:
+def remarks(options: Options, poses: Parts) -> Iterator[str]:
     """What the reader should know about the data behind a result."""
-    if not parts.held.poses:
+    if not poses.held.poses:
         yield "no pose is held out: nothing here says how the fit does on new poses"
-    if options.objective == "minimax" and len(parts.data.target_names) == 1:
+    if options.objective == "minimax" and len(poses.data.target_names) == 1:
         yield "there is one target: minimax and sum are the same"
-    if checks.collinear(parts.train):
+    if checks.collinear(poses.train):
         yield (
             "the targets lie nearly on a line: positions are fine, but orientations about that "
             "line would not be determined"

@@ -14,12 +14,13 @@ from typing import Any, overload
 
 import numpy as np
 
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.suspects import Suspect, table_of
+from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
@@ -27,8 +28,9 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import Accuracy, before_and_after
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.grouping import clusters, grouped
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
@@ -245,7 +247,8 @@ class Fit:
     cell: the calibrated robot with base and targets.  nominal: the nominal robot with its best
     base and targets, None where an old file does not tell it.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
-    poses.  uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
+    poses.  beyond: on whole parts that were left out.
+    uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
     minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
     data: all m poses, with their history where effects need it; none in an old file.
@@ -283,6 +286,7 @@ class Fit:
     prior: Array
     widening: float
     provenance: Provenance
+    beyond: Beyond
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
 
     def __repr__(self) -> str:
@@ -312,6 +316,11 @@ class Fit:
             "holdout": self.error[:, self.held],
             "nominal_train": self.error_nominal[:, ~self.held],
         }
+
+    @property
+    def trusted(self) -> Accuracy:
+        """On the held-out points that do not stand out."""
+        return accuracy(aside(self.error, self.data, self.suspects)[:, self.held])
 
     @property
     def covariance(self) -> Array:
@@ -344,8 +353,8 @@ class Fit:
 
     @property
     def group(self) -> Array:
-        """(training poses,) rows with one number are one pose."""
-        return groups(self.train)
+        """(training poses,) rows with one number belong together: a pose, or a cluster of poses."""
+        return clusters(self.train)
 
     @cached_property
     def distances(self) -> Distances:
@@ -374,8 +383,12 @@ class Fit:
         if self.stated is not None:
             return self.stated
         rng = np.random.default_rng(self.options.seed)
+        group = grouped(self.data, self.options.holdout_by)[self.held]
         return {
-            key: (rms_interval(self.errors[key], rng=rng), max_interval(self.errors[key], rng=rng))
+            key: (
+                rms_interval(self.errors[key], group, rng=rng),
+                max_interval(self.errors[key], group, rng=rng),
+            )
             for key in ("nominal", "holdout")
         }
 
@@ -383,11 +396,18 @@ class Fit:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
+        """What the table of accuracy tells, with titles."""
+        for title, key in ACCURACIES:
+            yield title, self.accuracy[key]
+            if key == "holdout" and any(one.held for one in self.suspects):
+                yield f"{title}, without suspects", self.trusted
+
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
         rows: list[tuple[TableCell, ...]] = [
             (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
+            for title, a in self.accuracies()
         ]
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(
@@ -432,9 +452,10 @@ class Fit:
         """The result in a sentence or two."""
         before, after, where = before_and_after(self.accuracy)
         identified = sum(p.identifiable for p in self.parameters)
+        beyond = f"{self.beyond.sentence()} " if self.beyond.worst else ""
         text = (
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
-            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {beyond}"
             f"{identified} of {len(self.parameters)} parameters identified "
             f"(condition {self.identification.condition:.3g}); {self.status} after "
             f"{self.iterations} iterations, {self.seconds:.2f} s."
@@ -443,7 +464,7 @@ class Fit:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        every = [self.accuracy_table(), self.interval_table()]
+        every = [self.accuracy_table(), self.interval_table(), self.beyond.table()]
         if self.minimax and self.objective != "point":
             every.append(self.minimax.table())
         if self.certificate:

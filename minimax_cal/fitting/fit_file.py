@@ -8,13 +8,14 @@ worked out from the others, or missing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from minimax_cal.fitting.beyond import Beyond, Fold
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.identify import Identification
@@ -53,6 +54,7 @@ from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
 NO_KKT = Kkt(math.nan, math.nan, math.nan)
+EARLIER = "an earlier version wrote this file"
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
 
@@ -78,6 +80,20 @@ class ScoresPart(Part):
         )
 
 
+class BeyondPart(Part):
+    """On parts that were left out [mm]."""
+
+    folds: tuple[Recorded[Fold], ...] = ()
+    typical_mm: Number = math.nan
+    geometric: dict[str, Number] = Field(default_factory=dict)
+    reason: str = ""
+
+    def beyond(self) -> Beyond:
+        """As the code has it."""
+        plain = self.geometric.get("typical_mm", math.nan)
+        return Beyond(self.folds, self.typical_mm, plain, self.reason)
+
+
 class AccuraciesPart(Part):
     """Before and after, on the held-out and on the training poses."""
 
@@ -85,6 +101,11 @@ class AccuraciesPart(Part):
     train: ScoresPart
     holdout: ScoresPart
     nominal_train: ScoresPart
+    beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
+
+    def told(self) -> Iterator[tuple[str, ScoresPart]]:
+        """All but `beyond`, with their names."""
+        return ((name, part) for name, part in self if isinstance(part, ScoresPart))
 
 
 TableParameter = Annotated[Parameter, Gaps(required=("value",))]  # in its unit: mm, rad, ...
@@ -139,6 +160,7 @@ class SuspectPart(Part):
     score: Number = math.nan
     chance: Number = math.nan
     together: bool = False
+    held: bool = False
 
 
 class FitPart(Part):
@@ -184,7 +206,11 @@ def written(fit: Fit) -> dict[str, Any]:
         "iterations": fit.iterations,
         "seconds": finite(fit.seconds),
         "parameters": [p.to_dict() for p in fit.parameters],
-        "accuracy": {key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+        "accuracy": {
+            **{key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+            "holdout_trusted": fit.trusted.to_dict(),
+            "beyond": fit.beyond.to_dict(),
+        },
         "condition": finite(fit.identification.condition),
         "trace_mm2": [value * 1e6 for value in fit.trace],
         "notices": list(fit.notices),
@@ -287,7 +313,7 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     except ValueError as error:
         raise CalibrationError(f"{source}: its arrays cannot be read ({error}); {AGAIN}") from error
     cell = refined(cell, arrays, "cell")
-    for name, scores in part.accuracy:
+    for name, scores in part.accuracy.told():
         if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
             raise CalibrationError(
                 f"{source}: accuracy.{name} is not of {len(cell.target_names)} targets; {AGAIN}"
@@ -326,7 +352,7 @@ def assembled(
         iterations=part.iterations,
         seconds=part.seconds,
         parameters=parameters,
-        accuracy={key: scores.accuracy() for key, scores in part.accuracy},
+        accuracy={key: scores.accuracy() for key, scores in part.accuracy.told()},
         identification=identification_of(part, parameters, names, arrays),
         uncertainty=known,
         minimax=minimax_of(part),
@@ -338,12 +364,13 @@ def assembled(
         error=after,
         notices=part.notices,
         loss=part.loss,
-        suspects=tuple(suspect_of(suspect, train) for suspect in part.suspects),
+        suspects=tuple(suspect_of(suspect, data, held) for suspect in part.suspects),
         weights=arrays.get("weights", train.seen.T.astype(float)),
         share=arrays.get("share", np.ones(k)),
         prior=arrays.get("prior", np.zeros(names.count)),
         widening=part.widening,
         provenance=part.provenance,
+        beyond=part.accuracy.beyond.beyond(),
         stated=intervals_of(part, arrays),
     )
 
@@ -561,9 +588,9 @@ def certificate_of(part: CertificatePart | None) -> Certificate | None:
     )
 
 
-def suspect_of(part: SuspectPart, train: Measurements) -> Suspect:
+def suspect_of(part: SuspectPart, data: Measurements, held: Array) -> Suspect:
     """A point that stands out."""
-    rows = np.flatnonzero(train.line == part.line)
+    rows = np.flatnonzero(data.line[held == part.held] == part.line)
     return Suspect(
         line=part.line,
         target=part.target,
@@ -572,4 +599,5 @@ def suspect_of(part: SuspectPart, train: Measurements) -> Suspect:
         score=part.score,
         p_value=part.chance,
         together=part.together,
+        held=part.held,
     )

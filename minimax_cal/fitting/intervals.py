@@ -33,16 +33,20 @@ class Interval:
 UNKNOWN = Interval(math.nan, math.nan)
 
 
-def rms_interval(error: Array, level: float = 0.95, *, rng: np.random.Generator) -> Interval:
+def rms_interval(
+    error: Array, group: Array | None = None, level: float = 0.95, *, rng: np.random.Generator
+) -> Interval:
     """Interval for the RMS distance over poses like these [m].
 
     Studentised bootstrap of the log mean square over poses [Davison and Hinkley 1997, ch. 5], its
     samples spread by a kernel in the logarithm: without it the skewness of few squares is missed.
-    error: (k, m, 3) measured minus predicted, NaN where not measured [m].
+    error: (k, m, 3) measured minus predicted, NaN where not measured [m].  group: (m,) poses with
+    one number are drawn together.
     """
     square = (error**2).sum(axis=-1)
     seen = np.isfinite(square)
     total, count = np.where(seen, square, 0.0).sum(axis=0), seen.sum(axis=0)
+    total, count = (np.bincount(members(error, group), of) for of in (total, count))
     total, count = total[count > 0], count[count > 0]
     m = len(count)
     if m < FEWEST:
@@ -73,18 +77,31 @@ def log_mean(total: Array, count: Array) -> tuple[Array, Array]:
     return np.log(mean), np.sqrt((off**2).sum(-1) / (m * (m - 1.0))) / mean
 
 
-def max_interval(error: Array, level: float = 0.95, *, rng: np.random.Generator) -> Interval:
+def members(error: Array, group: Array | None) -> Array:
+    """(m,) number of each pose's group, counted from 0."""
+    if group is None:
+        return np.arange(error.shape[1])
+    return np.unique(group, return_inverse=True)[1].reshape(-1)
+
+
+def max_interval(
+    error: Array, group: Array | None = None, level: float = 0.95, *, rng: np.random.Generator
+) -> Interval:
     """Where the largest distance of equally many new poses will lie [m].
 
     A prediction interval: exact where the logarithms of the larger half of the poses' largest
     distances are the upper half of a normal sample; a little too wide for lighter tails, as those
     of tracker noise.  It is wide: no method without such an assumption has an upper end at all, for
     the new poses exceed the largest distance seen with probability 1/2.  error: (k, m, 3) measured
-    minus predicted, NaN where not measured [m].
+    minus predicted, NaN where not measured [m].  group: (m,) poses with one number count as one.
     """
     distance = np.linalg.norm(error, axis=-1)
     seen = np.isfinite(distance)
-    largest = np.where(seen, distance, 0.0).max(axis=0)[seen.any(axis=0)]
+    group = members(error, group)[seen.any(axis=0)]
+    each = np.where(seen, distance, 0.0).max(axis=0, initial=0.0)[seen.any(axis=0)]
+    largest = np.full(group.max(initial=-1) + 1, -1.0)
+    np.maximum.at(largest, group, each)
+    largest = largest[largest >= 0.0]
     m = len(largest)
     if m < FEWEST:
         return UNKNOWN

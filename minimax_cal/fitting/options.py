@@ -61,7 +61,9 @@ class Options:
     objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.
     lever: metres that a radian counts as in the pose objective, None for the targets' own.
     qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
-    seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
+    region; None for poses that repeat each other or stand in a cluster.
+    fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
     distance constraints, two-sided, squared or off.  distance_tolerance: [m], None for the
@@ -79,6 +81,12 @@ class Options:
         0.2, "Share of the poses kept out of the fit; a split column overrides it."
     )
     seed: int = option(0, "Seed of the choice of held-out poses.")
+    holdout_by: str | None = option(
+        None,
+        "Hold out whole groups of poses: a column, as session or group, or region; those are also "
+        "left out in turn.",
+        metavar="COLUMN",
+    )
     fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
     free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)
     priors: Mapping[str, float] = option(

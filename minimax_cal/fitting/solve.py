@@ -21,7 +21,8 @@ from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share,
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.grouping import clusters, groups
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Fitted, Term, names_of
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
@@ -216,7 +217,7 @@ def fit_cell(
         state=state,
         identification=stage.identification,
         estimator=Estimator(plain, shares(task, model, optimum), mix),
-        group=groups(data),
+        group=clusters(data),
         status=optimum.status if optimum else stage.squares.status[0],
         iterations=rounds + (optimum.iterations if optimum else 0),
         optimum=optimum,

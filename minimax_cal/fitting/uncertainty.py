@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -53,17 +54,9 @@ class Estimator:
 
     def at(self, rows: Array) -> Estimator:
         """The same on some poses.  rows: indices, possibly repeated."""
-        model = self.model
-        few = replace(
-            model,
-            q=model.q[rows],
-            y=model.y[..., rows],
-            weight=model.weight[:, rows],
-            fields=model.fields[..., rows] if len(model.fields) else model.fields,
-            moved=model.moved[..., rows] if len(model.moved) else model.moved,
-        )
         share = self.share if self.share.ndim == 1 else self.share[:, rows]
-        return Estimator(few, share, self.mix[rows] if len(self.mix) else self.mix)
+        mix = self.mix[rows] if len(self.mix) else self.mix
+        return Estimator(self.model.take(rows), share, mix)
 
     def thinned(self, group: Array, most: int) -> tuple[Estimator, Array]:
         """About so many rows at most, whole poses drawn at random; as much less of the prior.
@@ -137,7 +130,7 @@ class Poses:
             seen=model.seen,
         )
 
-    @property
+    @cached_property
     def bread(self) -> Array:
         """(p, p) H."""
         flat = [a.reshape(-1, a.shape[-1]) for a in (self.jacobian, self.weighted)]
@@ -150,12 +143,12 @@ class Poses:
         count = 3.0 * np.count_nonzero(self.seen)
         return float((self.error**2).sum()) / max(count - paid, 1.0)
 
-    @property
+    @cached_property
     def gram(self) -> Array:
         """(m, p, p) J'A J of each pose."""
         return np.asarray(np.swapaxes(self.jacobian, -1, -2) @ self.weighted)
 
-    @property
+    @cached_property
     def score(self) -> Array:
         """(m, p) J'A e of each pose."""
         return np.asarray(np.einsum("mrp,mr->mp", self.weighted, self.error))

@@ -31,6 +31,7 @@ OPTIONAL = {
         "tau": r"tau\d+_(Nm)",
         "approach": r"approach\d+",
         "session": r"session",
+        "group": r"group",
         "u95": r"u95_(mm|m)",
         "pose": r"pose",
         "split": r"split",
@@ -38,7 +39,7 @@ OPTIONAL = {
         "base": r"base\d+_[xyz]_(mm|m)",
     }.items()
 }
-TEXT = {"session", "pose", "split"}  # labels, compared but never computed with
+TEXT = {"session", "group", "pose", "split"}  # labels, compared but never computed with
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +171,8 @@ def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
 
 def near(name: str) -> str:
     """A hint when a column's name is close to one that would be used."""
-    known = ["order", "time_s", "temperature_C", "payload_kg", "session", "u95_mm", "pose", "split"]
+    known = ["order", "time_s", "temperature_C", "payload_kg", "session", "group", "u95_mm"]
+    known += ["pose", "split"]
     known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
     known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
     match = difflib.get_close_matches(name, known, 1, cutoff=0.75)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.measuring.columns import (
     JOINT,
@@ -272,57 +272,3 @@ def file_column(stem: str) -> tuple[str, float]:
     if re.fullmatch(r"qread\d+", stem):
         return f"{stem}_rad", 1.0
     return stem + exact.get(stem, ""), 1.0
-
-
-def groups(data: Measurements) -> Array:
-    """(m,) a number for each pose: rows with the same joints or the same `pose` share it."""
-    _, group = np.unique(np.round(data.q, 9), axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    if "pose" in data.columns:
-        labels = data.columns["pose"]
-        for label in np.unique(labels[labels != ""]):
-            same = np.isin(group, group[labels == label])
-            group[same] = group[same].min()
-    return np.asarray(group)
-
-
-def split(
-    data: Measurements, holdout: float, seed: int
-) -> tuple[Measurements, Measurements, tuple[str, ...]]:
-    """Training and held-out poses, and notices.
-
-    A `split` column decides where there is one; else a seeded random share of the poses is held
-    out, all rows of a pose together.  Raises OptionError, DataError.
-    """
-    if seed < 0:
-        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
-    if not 0.0 <= holdout < 1.0:
-        raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
-    if "split" in data.columns:
-        labels = np.char.lower(data.columns["split"].astype(str))
-        odd = ~np.isin(labels, ("train", "holdout"))
-        if odd.any():
-            row = int(np.argmax(odd))
-            label = str(data.columns["split"][row])
-            raise DataError(
-                f"{data.source}:{data.line[row]}: column split: {label!r} is neither train nor "
-                "holdout"
-            )
-        held = labels == "holdout"
-        if held.all():
-            raise DataError(f"{data.source}: column split leaves no row for training")
-        notices: tuple[str, ...] = ("the split column decides what is held out",)
-        shared = groups(data)
-        if np.isin(shared[held], shared[~held]).any():
-            notices += ("some poses stand both in training and in the held-out rows",)
-        return data.take(~held), data.take(held), notices
-    group = groups(data)
-    poses = np.unique(group)
-    count = round(holdout * len(poses))
-    if count == len(poses):
-        raise OptionError(
-            f"holdout {holdout:g} leaves none of {len(poses)} poses for training; give less"
-        )
-    chosen = np.random.default_rng(seed).permutation(poses)[:count]
-    held = np.isin(group, chosen)
-    return data.take(~held), data.take(held), ()

@@ -13,7 +13,7 @@ from minimax_cal.ground.files import numbers, plain
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements, measurements
 
-LABELS = ("pose", "session")  # columns of text; all others hold numbers, in SI
+LABELS = ("pose", "session", "group")  # columns of text; all others hold numbers, in SI
 TOLD = ("split", "order")  # columns that stand under names of their own
 
 

@@ -40,8 +40,8 @@ def test_laws_outside_the_library_leave_a_trace(law: str) -> None:
     from minimax_cal.diagnosing.study import studied
     from minimax_cal.fitting.options import Options, silent
     from minimax_cal.fitting.solve import fit_cell
+    from minimax_cal.measuring.grouping import split
     from minimax_cal.measuring.history import with_history
-    from minimax_cal.measuring.measurements import split
 
     sealed = make(Case("irb2600", "outside", (Cause(law, "J2", 300.0),), seed=5))
     train, _, _ = split(with_history(sealed.data), 0.2, 0)

@@ -23,7 +23,7 @@ from minimax_cal.diagnosing.where.residual import joint_rows, orthonormal, resid
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import groups
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots import kinematics

@@ -11,8 +11,8 @@ from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.noise import Noise, Rows, restricted
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import split
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,7 @@ def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generato
 def test_a_wider_level_is_wider(rng: np.random.Generator) -> None:
     error = rng.normal(size=(3, 12, 3))
     for interval in (rms_interval, max_interval):
-        wide, narrow = (interval(error, level, rng=rng_of()) for level in (0.99, 0.8))
+        wide, narrow = (interval(error, level=v, rng=rng_of()) for v in (0.99, 0.8))
         assert wide.low < narrow.low < narrow.high < wide.high
 
 

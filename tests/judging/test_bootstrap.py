@@ -22,7 +22,7 @@ from minimax_cal.judging.bootstrap import (
     solved_again,
     stepped,
 )
-from minimax_cal.measuring.measurements import groups
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State

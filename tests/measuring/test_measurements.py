@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.measuring.measurements import groups, split
+from minimax_cal.measuring.grouping import groups, split
 
 HEAD = "q1_rad,q2_rad,smr1_x_mm,smr1_y_mm,smr1_z_mm"
 GOOD = HEAD + "\n0.1,0.2,1,2,3\n0.3,0.4,4,5,6\n"

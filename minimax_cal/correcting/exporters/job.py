@@ -11,11 +11,13 @@ import numpy as np
 
 from minimax_cal.fitting.fit import Fit, opened
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
+from minimax_cal.solvers.status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,9 @@ def read_job(source: Fit | Cell | Robot | Path | str) -> Job:
 
 
 def job_of(fit: Fit | Cell, source: str) -> Job:
-    """Of a saved calibration, or of a cell whose nominal robot nobody knows."""
+    """Of a saved calibration, or of a cell of unknown nominal robot.  Raises OptionError."""
+    if isinstance(fit, Fit) and fit.status is Status.FAILED:
+        raise OptionError(f"{source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell = fit if isinstance(fit, Cell) else fit.cell
     nominal = fit.nominal if isinstance(fit, Fit) else None
     labels = tuple(term.label for term in cell.effects.terms)

@@ -20,7 +20,8 @@ from minimax_cal.diagnosing.where.smooth import (
     trend,
 )
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
 
 UP: Array = np.array([0.0, 0.0, 1.0])
 

@@ -12,7 +12,8 @@ from minimax_cal.diagnosing.where.answer import CANNOT_TELL, Part, Triage
 from minimax_cal.diagnosing.where.residual import Residual, summed
 from minimax_cal.diagnosing.where.significance import flips
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
 
 
 def lack_of_fit(rest: Residual) -> float:

@@ -9,7 +9,8 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import FARTHEST, Measurements, groups
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import FARTHEST, Measurements
 
 KINDS = ("distances", "closures", "poses")
 NO_POSES: Array = np.zeros((0, 4, 4))

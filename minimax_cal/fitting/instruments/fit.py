@@ -24,7 +24,7 @@ from minimax_cal.fitting.instruments.split import before_and_after, free_numbers
 from minimax_cal.fitting.instruments.start import ball_start, wire_start
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import groups
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares

@@ -10,7 +10,7 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.measurements import groups, split
+from minimax_cal.measuring.grouping import groups, split
 
 WHOLE = 5  # sockets from which on whole ones are held out
 

@@ -21,8 +21,9 @@ from minimax_cal.judging.iso9283.formulas import (
     spread_of,
     turns_of,
 )
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import STILL, followed, moves, visits
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 
 LOCK = 0.1  # |cos b| below which a and c exaggerate a turn more than tenfold

@@ -8,7 +8,8 @@ from scipy import stats
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FEWEST, between
 from minimax_cal.measuring.faults.fault import Amount, Fault
-from minimax_cal.measuring.measurements import Measurements, groups
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
 
 
 def noise(data: Measurements) -> tuple[Fault, ...]:

@@ -17,7 +17,7 @@ from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
 from minimax_cal.measuring.measurements import Measurements, check_finite
 
-TEXTS = ("session", "split", "pose")
+TEXTS = ("session", "group", "split", "pose")
 OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns with a choice
 MIXED = "mixed"
 

@@ -30,6 +30,7 @@ WORDS = {  # plain names that mean the same in any file
     "pose": ("pose", "point", "point name", "name", "id", "key", "no", "no.", "nr", "nr."),
     "order": ("order",),
     "session": ("session",),
+    "group": ("group",),
     "split": ("split",),
 }
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}

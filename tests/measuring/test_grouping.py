@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import (
+    REPEAT,
+    clusters,
+    grouped,
+    groups,
+    parts,
+    split,
+    with_groups,
+)
+from minimax_cal.measuring.measurements import Measurements
+
+
+def made(q: Array, **columns: Array) -> Measurements:
+    return mc.measurements(q, np.random.default_rng(0).normal(size=(len(q), 3)), **columns)
+
+
+def spread(rng: np.random.Generator, places: int, each: int, size: float) -> Array:
+    centre = rng.uniform(-2.0, 2.0, (places, 6))
+    return np.repeat(centre, each, axis=0) + size * rng.normal(size=(places * each, 6))
+
+
+def test_visits_that_differ_by_less_than_the_arm_repeats_are_one_pose(
+    rng: np.random.Generator,
+) -> None:
+    q = rng.uniform(-2.0, 2.0, (60, 6))
+    twice = np.concatenate([q, q[:40] + 0.2 * REPEAT * rng.uniform(-1, 1, (40, 6))])
+    group = groups(made(twice))
+    assert len(np.unique(group)) == 60
+    assert_array_equal(group[:40], group[60:])
+    train, held, _ = split(made(twice), 0.3, 0)
+    nearest = np.abs(train.q[:, None] - held.q[None]).max(axis=2).min()
+    assert nearest > 2.0 * REPEAT
+
+
+def test_a_slow_path_is_not_one_pose() -> None:
+    path = np.outer(np.arange(200) * 0.5 * REPEAT, np.eye(6)[0])
+    group = groups(made(path))
+    assert len(np.unique(group)) > 30
+    for number in np.unique(group):
+        assert np.ptp(path[group == number], axis=0).max() <= 2.0 * REPEAT
+
+
+def test_groups_do_not_depend_on_the_order_of_rows(rng: np.random.Generator) -> None:
+    q = spread(rng, 20, 3, 1e-5)
+    shuffled = rng.permutation(60)
+    held = [split(made(one), 0.3, 4)[1].q for one in (q, q[shuffled])]
+    assert {tuple(row) for row in held[0]} == {tuple(row) for row in held[1]}
+
+
+def test_clusters_are_found_and_held_out_whole(rng: np.random.Generator) -> None:
+    data = made(spread(rng, 16, 5, 0.01))
+    assert_array_equal(np.ptp(clusters(data).reshape(16, 5), axis=1), 0)
+    assert len(np.unique(clusters(data))) == 16
+    _, held, notices = split(data, 0.2, 0)
+    assert held.poses == 15
+    assert "80 poses stand in 16 groups" in notices[0]
+    assert len(np.unique(with_groups(data).columns["group"])) == 16
+
+
+@pytest.mark.parametrize("poses", [12, 30, 100, 400])
+def test_scattered_poses_stand_alone(poses: int, rng: np.random.Generator) -> None:
+    for _ in range(5):
+        data = made(rng.uniform(-2.0, 2.0, (poses, 6)))
+        assert len(np.unique(clusters(data))) == poses
+        assert "group" not in with_groups(data).columns
+
+
+def test_columns_force_groups(rng: np.random.Generator) -> None:
+    q = rng.uniform(-2.0, 2.0, (30, 6))
+    label = np.repeat(list("abcdef"), 5)
+    assert len(np.unique(grouped(made(q, group=label)))) == 6
+    assert len(np.unique(grouped(made(q, session=label), "session"))) == 6
+    assert len(np.unique(grouped(made(q), "region"))) == 5
+    with pytest.raises(mc.OptionError, match="choose region"):
+        grouped(made(q), "shift")
+    train, held, _ = split(made(q, session=label), 0.34, 1, "session")
+    assert not set(train.columns["session"]) & set(held.columns["session"])
+
+
+def test_parts_keep_repeats_together(rng: np.random.Generator) -> None:
+    q = rng.uniform(-2.0, 2.0, (50, 3))
+    q = np.concatenate([q, q + 1e-5])
+    found = parts(made(q, order=np.arange(100.0), session=np.repeat(["a", "b"], 50)))
+    names = [part.name for part in found]
+    for joint in (1, 2, 3):
+        assert f"joint {joint} at its low end" in names
+        assert f"joint {joint} at its high end" in names
+    assert sum("region" in name for name in names) == 5
+    for part in found:
+        assert_array_equal(part.rows[:50], part.rows[50:])
+        assert 3 <= part.rows.sum() <= 50
+    low = next(part for part in found if part.name == "joint 2 at its low end").rows
+    assert q[low, 1].max() < q[~low, 1].min() + 2e-5
+
+
+def test_sessions_and_the_last_poses_are_parts(rng: np.random.Generator) -> None:
+    q = rng.uniform(-2.0, 2.0, (60, 3))
+    day = np.repeat(["mon", "tue", "wed"], 20)
+    names = [part.name for part in parts(made(q, order=np.arange(60.0), session=day))]
+    assert {"session mon", "session tue", "session wed", "the last fifth"} <= set(names)
+    assert not any("fifth" in part.name for part in parts(made(q)))
+    assert [part.name[:11] for part in parts(made(q, session=day), "session")] == [
+        "the session"
+    ] * 3
