@@ -38,4 +38,4 @@ def gap_command(model: Path, data: Path, to: Output, **chosen: Any) -> int:
     if to.deliver(found.json):
         options.show(found.table(), headline=found.headline())
     to.draw(save_simulator_gap, found)
-    return 0
+    return options.exit_code(found.status)

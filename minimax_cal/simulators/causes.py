@@ -15,8 +15,9 @@ from minimax_cal.fitting.calibrate import again, calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.options import Progress
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import held_out
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, split
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.arm import ELEMENTS, assumed
@@ -80,7 +81,7 @@ def causes_of(
     others = [term for term in terms if term not in firm and maps(term, fit)]
     whole = fitted(fit, [*firm, *others]) if others else fits[-1]
     rows, held, same = judged_by(fit, data, chosen)
-    floor = told.floor if told else math.nan
+    floor = told.floor.value if told else math.nan
     names = ("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels))
     return Causes(names, tuple(fits), whole, rows, held, floor, same)
 
@@ -143,5 +144,4 @@ def judged_by(
     if fit.data.poses and fit.provenance.data_sha256 == data.digest:
         return with_history(fit.data), fit.held, True
     data = with_history(data)
-    held = np.isin(data.line, split(data, *chosen)[1].line)
-    return data, held, False
+    return data, held_out(data, *chosen)[0], False

@@ -30,6 +30,7 @@ from minimax_cal.simulators.mjcf import beside, text_of, told
 from minimax_cal.simulators.placing import placed_error
 from minimax_cal.simulators.rest import at_rest
 from minimax_cal.simulators.result import Rung, SimulatorGap
+from minimax_cal.solvers.status import Status
 
 TRAINING = 200  # poses that place base and targets
 SAGGING = 1e-4  # a joint that stands farther from its command is told [rad, m]
@@ -70,7 +71,9 @@ def simulator_gap(
         raise OptionError(f"{causes.data.source}: no pose is held out; give --holdout 0.2")
     run = Run(given, chain, causes, progress)
     rungs = [*run.before(), *run.corrected()]
-    made = run.last(rungs[-1], None if write is None else Path(write))
+    failed = causes.fits[-1].status is Status.FAILED
+    path = None if write is None or failed else Path(write)
+    made = run.last(rungs[-1], path)
     return SimulatorGap(
         model=str(model),
         robot=chain.robot.name,
@@ -79,9 +82,11 @@ def simulator_gap(
         floor=causes.floor,
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(causes.held.sum()),
+        status=causes.fits[-1].status,
+        beyond=causes.fits[-1].beyond.to_dict(),
         left_out=made.arm.left_out,
         notices=tuple(dict.fromkeys((*rows.notices, *run.notices, *made.notices))),
-        written="" if write is None else str(write),
+        written="" if path is None else str(path),
         seconds=time.perf_counter() - began,
         provenance=Provenance.of(chain.robot, rows, {"model": str(model), "holdout": holdout,
                                                      "seed": seed}),

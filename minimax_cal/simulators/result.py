@@ -17,6 +17,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import saved_content
+from minimax_cal.solvers.status import Status
 
 KIND = "simulator_gap"
 
@@ -50,7 +51,8 @@ class SimulatorGap:
 
     rungs: as given, without servo sag, with calibrated geometry, with each effect.  commands: the
     last of them with its command map, None where nothing is mapped.  floor: what noise alone would
-    leave [mm].  left_out: effects that the simulator has no element for.  written: where the last
+    leave [mm].  status: of the last fit.  beyond: its claim for poses where none was measured, by
+    its own formulas.  left_out: effects that the simulator has no element for.  written: where the last
     rung's model was written, empty where it was not.
     """
 
@@ -61,6 +63,8 @@ class SimulatorGap:
     floor: float
     train_poses: int
     holdout_poses: int
+    status: Status
+    beyond: Mapping[str, Any]
     left_out: tuple[str, ...]
     notices: tuple[str, ...]
     written: str
@@ -85,6 +89,8 @@ class SimulatorGap:
             "with_commands": self.commands.to_dict() if self.commands else None,
             "noise_floor_mm": finite(self.floor),
             "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
+            "status": str(self.status),
+            "beyond": dict(self.beyond),
             "left_out": list(self.left_out),
             "notices": list(self.notices),
             "written": self.written,
@@ -98,8 +104,8 @@ class SimulatorGap:
         part = checked(GapPart, content, source)
         return SimulatorGap(
             part.model, part.robot, part.rungs, part.with_commands, part.noise_floor_mm,
-            part.poses["train"], part.poses["holdout"], part.left_out, part.notices, part.written,
-            part.seconds, part.provenance,
+            part.poses["train"], part.poses["holdout"], part.status, part.beyond, part.left_out,
+            part.notices, part.written, part.seconds, part.provenance,
         )  # fmt: skip
 
     def json(self) -> str:
@@ -140,6 +146,12 @@ class SimulatorGap:
             )
         if self.commands:
             text += f". With its command map {self.commands.holdout_rms_mm:.3f} mm remain"
+        typical, worst = (self.beyond.get(key) for key in ("typical_mm", "worst_mm"))
+        if typical is not None and worst is not None:
+            text += (
+                f". Beyond the measured poses its fit claims {typical:.3f} mm, at worst "
+                f"{worst:.3f} mm ({self.beyond.get('worst_where')})"
+            )
         return text + "."
 
     def summary(self, width: int = 110) -> str:
@@ -162,6 +174,8 @@ class GapPart(Part):
     with_commands: Recorded[Rung] | None = None
     noise_floor_mm: Number = math.nan
     poses: dict[str, int]
+    status: Status = Status.CONVERGED
+    beyond: dict[str, Any] = Field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
     written: str = ""
