@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from minimax_cal.fitting.calibrate import again, calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.options import Progress
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -30,8 +30,8 @@ class Causes:
     """names: of the rungs from geometry on.  fits: of each; the last holds what can be mapped too.
 
     data: the measurements that the simulator is judged by, with their history; held: (m,) True
-    where held out.  floor: what noise alone would leave [mm].  same: whether these are the poses of
-    the fits.
+    where held out.  floor: what noise alone would leave, None untold.  same: whether these are the
+    poses of the fits.
     """
 
     names: tuple[str, ...]
@@ -39,7 +39,7 @@ class Causes:
     whole: Fit
     data: Measurements
     held: Array
-    floor: float
+    floor: Floor | None
     same: bool
 
 
@@ -81,7 +81,7 @@ def causes_of(
     others = [term for term in terms if term not in firm and maps(term, fit)]
     whole = fitted(fit, [*firm, *others]) if others else fits[-1]
     rows, held, same = judged_by(fit, data, chosen)
-    floor = told.floor.value if told else math.nan
+    floor = told.floor if told else None
     names = ("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels))
     return Causes(names, tuple(fits), whole, rows, held, floor, same)
 

@@ -51,9 +51,9 @@ class SimulatorGap:
 
     rungs: as given, without servo sag, with calibrated geometry, with each effect.  commands: the
     last of them with its command map, None where nothing is mapped.  floor: what noise alone would
-    leave [mm].  status: of the last fit.  beyond: its claim for poses where none was measured, by
-    its own formulas.  left_out: effects that the simulator has no element for.  written: where the last
-    rung's model was written, empty where it was not.
+    leave [mm], floor_from: how that is known.  status: of the last fit.  beyond: its claim for
+    poses where none was measured, by its own formulas.  left_out: effects that the simulator has no
+    element for.  written: where the last rung's model was written, empty where it was not.
     """
 
     model: str
@@ -61,6 +61,7 @@ class SimulatorGap:
     rungs: tuple[Rung, ...]
     commands: Rung | None
     floor: float
+    floor_from: str
     train_poses: int
     holdout_poses: int
     status: Status
@@ -88,6 +89,7 @@ class SimulatorGap:
             "rungs": [rung.to_dict() for rung in self.rungs],
             "with_commands": self.commands.to_dict() if self.commands else None,
             "noise_floor_mm": finite(self.floor),
+            "noise_floor_from": self.floor_from,
             "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
             "status": str(self.status),
             "beyond": dict(self.beyond),
@@ -102,10 +104,11 @@ class SimulatorGap:
     def from_dict(content: Mapping[str, Any], source: str = "gap") -> SimulatorGap:
         """From `to_dict`.  Raises CalibrationError."""
         part = checked(GapPart, content, source)
+        held, floor = part.poses, (part.noise_floor_mm, part.noise_floor_from)
         return SimulatorGap(
-            part.model, part.robot, part.rungs, part.with_commands, part.noise_floor_mm,
-            part.poses["train"], part.poses["holdout"], part.status, part.beyond, part.left_out,
-            part.notices, part.written, part.seconds, part.provenance,
+            part.model, part.robot, part.rungs, part.with_commands, *floor, held["train"],
+            held["holdout"], part.status, part.beyond, part.left_out, part.notices, part.written,
+            part.seconds, part.provenance,
         )  # fmt: skip
 
     def json(self) -> str:
@@ -124,7 +127,7 @@ class SimulatorGap:
             for r in every
         )
         if math.isfinite(self.floor):
-            noise = (math.nan, math.nan, math.nan, "what noise alone would leave")
+            noise = (math.nan, math.nan, math.nan, self.floor_from)
             rows = (*rows, ("noise floor", self.floor, *noise))
         header = ("model", "RMS mm", "max mm", "fit says mm", "joints off mrad", "")
         title = f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses"
@@ -173,6 +176,7 @@ class GapPart(Part):
     rungs: tuple[Recorded[Rung], ...] = Field(min_length=1)
     with_commands: Recorded[Rung] | None = None
     noise_floor_mm: Number = math.nan
+    noise_floor_from: str = ""
     poses: dict[str, int]
     status: Status = Status.CONVERGED
     beyond: dict[str, Any] = Field(default_factory=dict)
