@@ -30,6 +30,7 @@ from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
@@ -63,6 +64,7 @@ def calibrate(
     holdout: float = 0.2,
     seed: int = 0,
     holdout_by: str | None = None,
+    instrument: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
@@ -82,7 +84,8 @@ def calibrate(
     robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
     worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
     out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together.  fix, free: parameters as ``beta*``, a list or a text with
+    poses are held out together.  instrument: u95 of a coordinate, as 10um+2.5um/m, where the data
+    do not say.  fix, free: parameters as ``beta*``, a list or a text with
     commas.  priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of
     the least squares.  lever: what a radian counts as in the pose objective [m], the targets' own
     unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
@@ -101,6 +104,7 @@ def calibrate(
         holdout=holdout,
         seed=seed,
         holdout_by=holdout_by,
+        instrument=instrument,
         fix=listed(fix),
         free=listed(free),
         priors=priors or {},
@@ -149,7 +153,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     """Training and held-out poses; targets that hardly any pose shows are left out."""
     if options.effects:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
-    data = with_groups(data)
+    data = with_groups(with_instrument(data, options.instrument))
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES

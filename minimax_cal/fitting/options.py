@@ -63,6 +63,7 @@ class Options:
     qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
     seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
     region; None for poses that repeat each other or stand in a cluster.
+    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
     fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
@@ -86,6 +87,12 @@ class Options:
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "
         "left out in turn.",
         metavar="COLUMN",
+    )
+    instrument: str | None = option(
+        None,
+        "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
+        "the noise floor.",
+        metavar="10um+2.5um/m",
     )
     fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
     free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)

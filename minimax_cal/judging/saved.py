@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
@@ -82,8 +84,7 @@ def unseen(data: Measurements, fit: Fit) -> tuple[Array, tuple[str, ...]]:
         return np.zeros(data.poses, dtype=bool), (said,)
     if data.digest and data.digest == fit.provenance.data_sha256:
         return np.isin(data.line, fit.data.line[fit.held]), ()
-    joints = {row.tobytes() for row in np.round(fit.train.q, 9) + 0.0}
-    held = np.array([row.tobytes() not in joints for row in np.round(data.q, 9) + 0.0])
+    held = np.asarray(KDTree(fit.train.q).query(data.q)[0]) > REPEAT
     said = (
         f"{data.source}: is not the file of the fit; {int((~held).sum())} of its {data.poses} rows "
         "have the joints of a training pose, the others count as held out"
