@@ -86,6 +86,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
     ),
     "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
+    "simulator_gap": (
+        "experiments.simulator_gap",
+        "A simulated arm in MuJoCo: published gains, then corrected step by step, against the fit",
+    ),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

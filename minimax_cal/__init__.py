@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.planning.plan import plan
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
+    from minimax_cal.simulators.commands import load_commands
+    from minimax_cal.simulators.ladder import simulator_gap
+    from minimax_cal.simulators.result import SimulatorGap
     from minimax_cal.solvers.minimize import minimize_max
 
     __version__: str
@@ -51,6 +54,7 @@ __all__ = [
     "Robot",
     "RobotError",
     "Simulation",
+    "SimulatorGap",
     "Truth",
     "bootstrap",
     "builtin_robots",
@@ -63,6 +67,7 @@ __all__ = [
     "import_files",
     "iso9283",
     "load_cell",
+    "load_commands",
     "load_fit",
     "load_robot",
     "measurements",
@@ -73,6 +78,7 @@ __all__ = [
     "relative",
     "report",
     "simulate",
+    "simulator_gap",
     "tradeoff",
     "write_measurements",
 ]
@@ -114,6 +120,9 @@ MODULES = {  # name: where it is defined
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",
     "export": "correcting.export",
+    "SimulatorGap": "simulators.result",
+    "load_commands": "simulators.commands",
+    "simulator_gap": "simulators.ladder",
     "report": "reporting.report",
 }
 

@@ -18,6 +18,7 @@ FOLDERS = (
     "diagnosing",
     "planning",
     "correcting",
+    "simulators",
     "reporting",
     "cli",
 )

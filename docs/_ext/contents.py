@@ -14,7 +14,16 @@ from sphinx.application import Sphinx
 OTHERS = "*"  # stands for every page that no part names
 PARTS = {
     "Start": ("tutorial", "examples/index"),
-    "Guides": ("import", "planning", "diagnosis", "effects", OTHERS, "export", "compensate"),
+    "Guides": (
+        "import",
+        "planning",
+        "diagnosis",
+        "effects",
+        OTHERS,
+        "export",
+        "simulator",
+        "compensate",
+    ),
     "Extend": ("own_effect", "backends"),
     "Background": ("mathematics", "papers", "blind_study"),
     "Reference": ("api/cli", "api/minimax_cal", "api/parts", "api/qp_backends"),

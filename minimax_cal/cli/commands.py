@@ -78,6 +78,13 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "Write the robot of FIT (a saved calibration or a robot) as a file others can load.",
         ),
     },
+    "Simulate": {
+        "gap": (
+            "gap",
+            "How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and "
+            "why.",
+        ),
+    },
     "Report": {
         "report": (
             "report",
@@ -94,7 +101,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         "backends": ("backends", "The QP backends that are installed, with their versions."),
     },
 }
-WRITTEN = ("output", "figure", "path", "pdf", "truth")  # parameters that name outputs
+WRITTEN = ("output", "figure", "path", "pdf", "truth", "write")  # parameters that name outputs
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 
 

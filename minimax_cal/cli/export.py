@@ -7,9 +7,8 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import PATH, QUIET, Output, options_of, output, with_output
-from minimax_cal.correcting.export import exported
+from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.table import EXPORTERS
-from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.options import Option
 
 
@@ -22,9 +21,15 @@ from minimax_cal.ground.options import Option
     metavar="ORIGINAL",
     help="Correct the joint origins of this URDF; all else stays, byte for byte.",
 )
+@click.option(
+    "--mjcf",
+    type=PATH,
+    metavar="ORIGINAL",
+    help="Correct the bodies, gains and springs of this MJCF; all else stays.",
+)
 @options_of(
     exported,
-    tip=Option("Last link of the chain in that URDF.", metavar="LINK"),
+    tip=Option("Last link of the chain in that file.", metavar="LINK"),
     experimental=Option("Agree to a format whose frames its maker does not document (moc)."),
 )
 @output("the robot")
@@ -32,10 +37,9 @@ from minimax_cal.ground.options import Option
 @with_output
 def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     """Write the robot of FIT (a saved calibration or a robot) as a file others can load."""
-    made = exported(fit, kind, **chosen)
+    made = exported(fit, kind, to.path, **chosen)
+    written(made, to.path)
     to.notice(*made.notices)
-    if to.path:
-        write_whole(to.path, made.content)
-    else:
+    if not to.path:
         click.echo(made.content, nl=False)
     return 0

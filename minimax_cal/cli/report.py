@@ -35,7 +35,8 @@ from minimax_cal.reporting.report import report
 def report_command(results: Sequence[Path], path: Path, to: Output, **chosen: Any) -> int:
     """One HTML page of RESULTS: a calibration, a diagnosis, or both of the same measurements.
 
-    RESULTS are files that `calibrate -o` and `diagnose -o` wrote.  The page needs no network.
+    RESULTS are files that `calibrate -o` and `diagnose -o` wrote; that of `gap -o` may come with
+    them.  The page needs no network.
     """
     report(results, path, notify=to.notice, **chosen)
     return 0

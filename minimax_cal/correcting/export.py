@@ -10,6 +10,7 @@ from pathlib import Path
 from minimax_cal.correcting.exporters import table
 from minimax_cal.correcting.exporters.job import Export, read_job
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.robot import Robot
@@ -22,6 +23,7 @@ def export(
     path: Path | str | None = None,
     *,
     urdf: Path | str | None = None,
+    mjcf: Path | str | None = None,
     tip: str = "",
     experimental: bool = False,
     notify: Callable[[str], object] = warnings.warn,
@@ -29,8 +31,9 @@ def export(
     """The robot of a calibration in a format that other programs load.
 
     fit: a calibration, its cell or a robot, or the file or name of one.  to: urdf, ur-yaml,
-    ros-yaml, dh-csv, json or moc.  path: written to as well, where given.  urdf: a file whose joint
-    origins are corrected, all else left as it is.  tip: last link of the chain in that file.
+    ros-yaml, dh-csv, json, moc or mjcf.  path: written to as well, where given.  urdf: a file whose
+    joint origins are corrected, all else left as it is; mjcf: one whose bodies, gains and springs
+    are.  tip: last link of the chain in that file.
     experimental: agree to a format whose frames its maker does not document (moc).  notify: called
     with what the format cannot hold and other notices.  Lengths and angles are in the units of the
     format.  Raises CalibrationError for wrong input.
@@ -39,9 +42,9 @@ def export(
     """
     if path is not None:
         check_writable(path)
-    made = exported(fit, to, urdf=urdf, tip=tip, experimental=experimental)
-    if path is not None:
-        write_whole(path, made.content)
+    place = None if path is None else Path(path)
+    made = exported(fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental)
+    written(made, place)
     for notice in made.notices:
         notify(notice)
     return made.content.decode("utf-8")
@@ -50,12 +53,30 @@ def export(
 def exported(
     fit: Fit | Cell | Robot | Path | str,
     to: str,
+    path: Path | None = None,
     *,
     urdf: Path | str | None = None,
+    mjcf: Path | str | None = None,
     tip: str = "",
     experimental: bool = False,
 ) -> Export:
     """The bytes of the file and its notices; arguments as of `export`."""
     originals = () if urdf is None else (read_urdf(urdf),)
-    job = replace(read_job(fit), originals=originals, tip=tip, experimental=experimental)
+    model = None if mjcf is None else Path(mjcf)
+    job = replace(
+        read_job(fit), originals=originals, model=model, path=path, tip=tip,
+        experimental=experimental,
+    )  # fmt: skip
     return table.export(job, to)
+
+
+def written(made: Export, path: Path | None) -> None:
+    """Write a file and those beside it.  Raises OptionError where these have no place."""
+    if path is None and made.beside:
+        raise OptionError(
+            f"the file needs another beside it (*{', *'.join(made.beside)}); name it with -o"
+        )
+    if path is not None:
+        for ending, content in made.beside.items():
+            write_whole(path.with_suffix(ending), content)
+        write_whole(path, made.content)

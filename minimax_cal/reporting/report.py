@@ -23,6 +23,7 @@ from minimax_cal.reporting.html import (
 )
 from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
+from minimax_cal.simulators.result import SimulatorGap
 
 PAGES, PAPERS = (".html", ".htm"), (".pdf",)
 
@@ -40,12 +41,12 @@ def report(
 ) -> Path:
     """One HTML page of a calibration, a diagnosis, or both of the same measurements.
 
-    results: one or two, each itself or the file that it was saved to.  path: of the page, which
-    needs no network.  title: that of the robot unless given.  customer, author: who accepts, who
-    measured.  date: YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  pdf: printed to this file
-    as well, by an installed Chromium, Chrome or Edge.  notify: called with what the reader should
-    know of both together, which the page says too.  Lengths on the page are in mm, angles in mrad.
-    Returns the path of the page.  Raises CalibrationError for wrong input.
+    results: each itself or the file that it was saved to; a gap in a simulator may come with them.
+    path: of the page, which needs no network.  title: that of the robot unless given.  customer,
+    author: who accepts, who measured.  date: YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
+    pdf: printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called
+    with what the reader should know of both together, which the page says too.  Lengths on the page
+    are in mm, angles in mrad.  Returns its path.  Raises CalibrationError for wrong input.
 
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """
@@ -54,7 +55,7 @@ def report(
     if pdf is not None:
         check_writable(pdf, PAPERS)
     browser = find_browser() if pdf is not None else ""
-    if isinstance(results, Fit | Diagnosis | Path | str):
+    if isinstance(results, Fit | Diagnosis | SimulatorGap | Path | str):
         results = [results]
     sources = read_sources(results)
     content = compose(sources, Wording(date_of(date), title, customer, author))

@@ -9,6 +9,8 @@ from minimax_cal.robots.kinematics import Chain, cross
 
 G = 9.80665  # [m/s^2]
 MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
+LEAST_MASS = 1e-3  # of a link for simulators, which refuse one without any [kg]
+STOCKY = 0.1  # no link is taken to be shorter, for its inertia [m]
 
 
 def centres(links: Chain, com: Array) -> Array:
@@ -31,3 +33,23 @@ def torques(links: Chain, mass: Array, com: Array, up: Array) -> Array:
     lever = moment - load * links.before
     pull = np.broadcast_to(-G * up[:, None], lever.shape)
     return np.asarray((links.z * cross(lever, pull)).sum(axis=-2))
+
+
+def inertia_of(mdh: Array, link: int, mass: float) -> float:
+    """A moment of inertia that a link may have about any axis: a solid body as long as it is.
+
+    mdh: (n, 5) [m, rad].  mass: [kg].  [kg m^2]
+    """
+    length = max(float(np.hypot(mdh[link, 0], mdh[link, 1])), STOCKY)
+    return mass * length**2 / 6.0
+
+
+def tubes(mdh: Array) -> tuple[Array, Array]:
+    """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m]: uniform tubes.
+
+    For links whose masses nobody tells.  mdh: (n, 5) [m, rad].
+    """
+    # back from frame i towards frame i-1: half of a along x, half of d along the old z
+    ca, sa = np.cos(mdh[:, 3]), np.sin(mdh[:, 3])
+    halfway = -0.5 * np.stack([mdh[:, 0], mdh[:, 1] * sa, mdh[:, 1] * ca], axis=1)
+    return MASS_PER_METRE * np.hypot(mdh[:, 0], mdh[:, 1]), halfway

@@ -20,6 +20,7 @@ from minimax_cal.ground.files import read_raw, read_text
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.transforms import from_rpy, transform
 
+ASSUMED = "assumed"  # attribute of an <inertial> of ours whose mass nobody told
 MOVING = ("revolute", "continuous", "prismatic")
 ATTRIBUTE = re.compile(rb"""([^\s=<>"']+)\s*=\s*("[^"]*"|'[^']*')""")
 
@@ -244,7 +245,7 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
 def mass_of(element: Element, name: str, source: str) -> tuple[float, Array]:
     """Mass [kg] and centre of gravity in the link's frame [m]; mass 0 where none is given."""
     inertial, where = element.child("inertial"), f"link {name!r}"
-    if inertial is None:
+    if inertial is None or ASSUMED in inertial.attributes:
         return 0.0, np.zeros(3)
     mass = float(numbers(inertial.child("mass"), "value", (0.0,), where, source)[0])
     if mass < 0.0:

@@ -103,7 +103,7 @@ def test_new_urdf(name: str) -> None:
     mass, com = np.arange(robot.joints) + 1.0, np.ones((robot.joints, 3)) * [0.1, 0.2, 0.3]
     robot = replace(robot, mass=mass, com=com)
     made = export(job_of(robot), "urdf")
-    assert any("point masses" in notice for notice in made.notices)
+    assert any("inertias are assumed" in notice for notice in made.notices)
     q, poses = poses_of(robot)
     model = to_robot(parse_urdf(made.content))
     again = robot_from_dict(model.content)

@@ -646,8 +646,10 @@ def test_files_must_belong_together(
     one, other = results / "fit.json", results / "gap.json"
     with pytest.raises(CalibrationError, match="second calibration"):
         read_sources([one, one])
-    with pytest.raises(CalibrationError, match="one or two files"):
+    with pytest.raises(CalibrationError, match="second calibration"):
         read_sources([one, other, one])
+    with pytest.raises(CalibrationError, match="one to three files"):
+        read_sources([])
     with pytest.raises(CalibrationError, match="neither a calibration nor a diagnosis"):
         read_sources([write(tmp_path / "a.json", {"kind": "evaluation"})])
     changed = copy.deepcopy(gap)

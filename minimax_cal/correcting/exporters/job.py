@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ class Job:
     originals: the URDF to correct, or none.  tip: its last link, empty for the only end.
     experimental: whether the user agreed to what no maker documents.
     fitted: whether nominal is known.  notices: what of the source is not in the robot.
+    cell: base, targets and effects, None for a bare robot.  q: (m, n) poses of the fit [rad, m].
+    model: an MJCF to correct, None for a new one.  path: where the file goes, None for nowhere yet.
     """
 
     robot: Robot
@@ -41,14 +44,22 @@ class Job:
     experimental: bool = False
     fitted: bool = False
     notices: tuple[str, ...] = ()
+    cell: Cell | None = None
+    q: Array | None = None
+    model: Path | None = None
+    path: Path | None = None
 
 
 @dataclass(frozen=True)
 class Export:
-    """A file's content, and what people should know about it."""
+    """A file's content, and what people should know about it.
+
+    beside: contents of files that belong to it, by the ending that takes the place of its own.
+    """
 
     content: bytes
     notices: tuple[str, ...] = ()
+    beside: Mapping[str, bytes] = field(default_factory=dict)
 
     @staticmethod
     def of(text: str, *notices: str) -> Export:
@@ -83,7 +94,10 @@ def job_of(fit: Fit | Cell, source: str) -> Job:
     labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
     before = nominal.robot if nominal else cell.robot
     known = nominal is not None
-    return Job(cell.robot, before, source, labels, compliance_of(cell), fitted=known)
+    q = fit.train.q if isinstance(fit, Fit) and fit.data.poses else None
+    return Job(
+        cell.robot, before, source, labels, compliance_of(cell), fitted=known, cell=cell, q=q
+    )
 
 
 def compliance_of(cell: Cell) -> Array:

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
+from typing import cast
 
 from minimax_cal.correcting.exporters import dh_csv, moc, robot_json, ros_yaml, ur_yaml, urdf
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.ground.errors import OptionError
+
+
+def mjcf(job: Job) -> Export:
+    """MJCF, by the room of simulators, which stands on this one: imported at its first use."""
+    return cast(Export, import_module("minimax_cal.simulators.exporter").write(job))
+
 
 EXPORTERS: dict[str, Callable[[Job], Export]] = {
     "urdf": urdf.write,
@@ -16,6 +24,7 @@ EXPORTERS: dict[str, Callable[[Job], Export]] = {
     "dh-csv": dh_csv.write,
     "json": robot_json.write,
     "moc": moc.write,
+    "mjcf": mjcf,
 }
 
 
@@ -25,13 +34,15 @@ def export(job: Job, to: str) -> Export:
         raise OptionError(f"--to {to}: no such format; choose one of {', '.join(EXPORTERS)}")
     if job.originals and to != "urdf":
         raise OptionError(f"--urdf goes with --to urdf, not with --to {to}")
-    if job.tip and not job.originals:
-        raise OptionError("--tip names a link of the file given with --urdf")
+    if job.model and to != "mjcf":
+        raise OptionError(f"--mjcf goes with --to mjcf, not with --to {to}")
+    if job.tip and not (job.originals or job.model):
+        raise OptionError("--tip names a link of the file given with --urdf or --mjcf")
     found = EXPORTERS[to](job)
     if not job.originals:  # a given URDF keeps its own constants
         found = replace(found, notices=(*job.notices, *found.notices))
     lost = [label for label in job.effects if not (to == "moc" and is_written(job, label))]
-    if not lost:
+    if not lost or to == "mjcf":  # which tells itself what it holds
         return found
     said = (
         f"{', '.join(lost)}: effects beyond geometry are not in this file, which then does not "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from minimax_cal.correcting.exporters.correct import correct
@@ -15,8 +17,10 @@ from minimax_cal.correcting.exporters.job import (
     triple,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.gravity import LEAST_MASS, inertia_of, tubes
 from minimax_cal.robots.robot import LONGEST, Robot
 from minimax_cal.robots.transforms import tail, to_rpy
+from minimax_cal.robots.urdf_file import ASSUMED
 
 EFFORT, VELOCITY = 1000.0, 10.0  # URDF wants them; nothing here knows them
 
@@ -25,10 +29,16 @@ def write(job: Job) -> Export:
     """The original with corrected origins if there is one, else a new URDF."""
     if job.originals:
         return correct(job, job.originals[0])
-    notices = ["limits of effort and velocity are placeholders: the robot file has none"]
-    if np.isfinite(job.robot.mass).any():
-        notices.append("masses are written as point masses: the robot file has no inertias")
-    return Export.of(new_urdf(job.robot), *notices)
+    placeholders = "limits of effort and velocity are placeholders: the robot file has none"
+    return Export.of(new_urdf(job.robot), f"{placeholders}; {assumptions(job.robot)}")
+
+
+def assumptions(robot: Robot) -> str:
+    """What of masses and inertias nobody told, in a sentence."""
+    inertias = "inertias are assumed: of solid bodies as long as the links"
+    if np.isfinite(robot.mass).all() and np.isfinite(robot.com).all():
+        return inertias
+    return f"masses that the robot file does not tell are assumed (uniform tubes), and {inertias}"
 
 
 def new_urdf(robot: Robot) -> str:
@@ -70,17 +80,20 @@ def limit(lower: float, upper: float, kind: str) -> str:
 
 
 def body(robot: Robot, i: int, name: str) -> str:
-    """A <link>, with mass and centre of gravity where they are known."""
-    if not (np.isfinite(robot.mass[i]) and np.isfinite(robot.com[i]).all()):
-        return f'  <link name="{name}"/>'
-    zero = " ".join(f'{axes}="0"' for axes in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    """A <link> with its mass, as the robot tells it or assumed; simulators refuse one without."""
+    told = bool(np.isfinite(robot.mass[i]) and np.isfinite(robot.com[i]).all())
+    tube, halfway = tubes(robot.mdh)
+    mass = max(float(robot.mass[i] if told else tube[i]), LEAST_MASS)
+    com = robot.com if told else halfway
+    size = number(inertia_of(robot.mdh, i, mass))
+    inertia = f'ixx="{size}" ixy="0" ixz="0" iyy="{size}" iyz="0" izz="{size}"'
     return "\n".join(
         [
             f'  <link name="{name}">',
-            "    <inertial>",
-            f'      <origin xyz="{triple(in_link(robot, i))}" rpy="0 0 0"/>',
-            f'      <mass value="{number(robot.mass[i])}"/>',
-            f"      <inertia {zero}/>",
+            "    <inertial>" if told else f'    <inertial {ASSUMED}="true">',
+            f'      <origin xyz="{triple(in_link(replace(robot, com=com), i))}" rpy="0 0 0"/>',
+            f'      <mass value="{number(mass)}"/>',
+            f"      <inertia {inertia}/>",
             "    </inertial>",
             "  </link>",
         ]

@@ -13,7 +13,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import stood
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import MASS_PER_METRE, G, centres, torques
+from minimax_cal.robots.gravity import G, centres, torques, tubes
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
@@ -125,14 +125,10 @@ class Scene:
 
         Where the file does not tell them: a uniform tube along each link.
         """
-        mdh = self.robot.mdh
-        length = np.hypot(mdh[:, 0], mdh[:, 1])
-        # back from frame i towards frame i-1: half of a along x, half of d along the old z
-        ca, sa = np.cos(mdh[:, 3]), np.sin(mdh[:, 3])
-        halfway = -0.5 * np.stack([mdh[:, 0], mdh[:, 1] * sa, mdh[:, 1] * ca], axis=1)
+        tube, halfway = tubes(self.robot.mdh)
         mass, com = self.robot.mass, self.robot.com
         known = np.isfinite(mass) & np.isfinite(com).all(axis=1)
-        mass = np.where(known, mass, MASS_PER_METRE * length)
+        mass = np.where(known, mass, tube)
         return mass, np.where(known[:, None], com, halfway)
 
     def torque(self, mass: Array, com: Array) -> Array:

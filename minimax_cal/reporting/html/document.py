@@ -11,7 +11,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
-from minimax_cal.reporting.html import fit_sections, gap_sections
+from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
 from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
 from minimax_cal.reporting.html.fit_tables import glance_table, settings_table
 from minimax_cal.reporting.html.sources import Sources
@@ -46,6 +46,7 @@ SECTIONS = (  # name, title, what it holds
     ("causes", "Causes, and their rivals", of_gap(gap_sections.causes)),
     ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
     ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
+    ("simulator", "The arm in the simulator", simulator_section.blocks),
     ("suspects", "Suspect points", fit_sections.suspect_points),
     ("parameters", "Parameters", of_fit(fit_sections.parameters)),
     ("correlations", "How the parameters hang together", of_fit(fit_sections.correlated)),
@@ -74,7 +75,11 @@ def compose(sources: Sources, wording: Wording) -> Report:
     facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
     facts += [("Measurements", told.data or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
-    sections = (Section(name, title, tuple(made(sources))) for name, title, made in SECTIONS)
+    sections = (
+        Section(name, title, tuple(made(sources)))
+        for name, title, made in SECTIONS
+        if name != "simulator" or sources.simulator
+    )
     return Report(
         title=visible(wording.title) or f"{both} of {sources.robot}",
         robot=sources.robot,

@@ -20,10 +20,11 @@ from minimax_cal.ground.words import visible
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.simulators.result import KIND, SimulatorGap
 
 AGAIN = "write it again with minimax-cal"
 
-Result = Fit | Diagnosis | Path | str
+Result = Fit | Diagnosis | SimulatorGap | Path | str
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +64,16 @@ class File:
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """A calibration, a diagnosis, or both.  notices: what the reader should know of both."""
+    """A calibration, a diagnosis, or both, and the arm in a simulator.
+
+    notices: what the reader should know of both.
+    """
 
     fit: Fit | None
     gap: Diagnosis | None
     files: tuple[File, ...] = ()
     notices: tuple[str, ...] = ()
+    simulator: SimulatorGap | None = None
 
     @property
     def results(self) -> tuple[Fit | Diagnosis, ...]:
@@ -107,11 +112,15 @@ class Sources:
 
 
 def read_sources(results: Sequence[Result]) -> Sources:
-    """One or two results, each itself or its file.  Raises CalibrationError."""
-    if not 1 <= len(results) <= 2:
-        raise CalibrationError(f"a report takes one or two files, not {len(results)}")
+    """One or two results, each itself or its file, and a gap in a simulator.
+
+    Raises CalibrationError.
+    """
+    if not 1 <= len(results) <= 3:
+        raise CalibrationError(f"a report takes one to three files, not {len(results)}")
     fits: list[Fit] = []
     gaps: list[Diagnosis] = []
+    arms: list[SimulatorGap] = []
     files = []
     for result in results:
         content, path, digest = content_of(result)
@@ -120,6 +129,8 @@ def read_sources(results: Sequence[Result]) -> Sources:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
             gaps.append(Diagnosis.from_dict(content, path))
+        elif kind == KIND:
+            arms.append(SimulatorGap.from_dict(content, path))
         else:
             raise CalibrationError(
                 f"{path}: is neither a calibration nor a diagnosis; {AGAIN} calibrate -o or "
@@ -132,18 +143,29 @@ def read_sources(results: Sequence[Result]) -> Sources:
     ):
         if count > 1:
             raise CalibrationError(f"{path}: is a second {kind}; give one and one {other}")
+    if len(arms) > 1 or not (fits or gaps):
+        raise CalibrationError(
+            f"{path}: a report is of a calibration or a diagnosis: give one as well, and at most "
+            "one gap in a simulator"
+        )
     files.sort(key=lambda file: file.kind)
     fit, gap = fits[0] if fits else None, gaps[0] if gaps else None
-    return Sources(fit, gap, tuple(files), together(fit, gap, files))
+    arm = arms[0] if arms else None
+    notices = [*together(fit, gap, files)]
+    known = {part.provenance.data_sha256 for part in (fit, gap) if part}
+    if arm and arm.provenance.data_sha256 not in known:
+        notices.append("The gap in the simulator is of other measurements than the rest.")
+    return Sources(fit, gap, tuple(files), tuple(notices), arm)
 
 
 def content_of(result: Result) -> tuple[dict[str, Any], str, str]:
     """JSON, name and SHA-256 of a result, every text visible."""
-    if not isinstance(result, Fit | Diagnosis):
+    if isinstance(result, Path | str):
         content, digest = read_json(result)
         return content, str(result), digest
     text = result.json()
-    kind = "calibration" if isinstance(result, Fit) else "diagnosis"
+    kinds = {Fit: "calibration", Diagnosis: "diagnosis", SimulatorGap: "gap in a simulator"}
+    kind = kinds[type(result)]
     digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
     return clean(json.loads(text)), f"{kind}, not saved", digest
 

@@ -1,0 +1,202 @@
+"""A simulated arm in MuJoCo beside the real one: does the simulator do what the fit says?
+
+    python -m experiments.simulator_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
+
+Three arms, one of seven axes, that give way at their joints and foot, have play in their gears and
+encoders that count wrong; one of them again with masses unknown.  Their nominal models, with servo
+gains as published models have them, are corrected step by step; every figure is measured in the
+simulator, on poses that no fit has seen.  The last column drives the corrected file by a loop of
+its own.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import sweep
+from experiments.sweep import Study, study_options
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.optional import optional
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.table import Fitted, terms
+from minimax_cal.modelling.simulate import random_poses
+from minimax_cal.reporting.plots.simulator import simulator_figure
+from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.simulators.result import SimulatorGap
+
+PUBLISHED = (5000.0, 5000.0, 5000.0, 1000.0, 1000.0, 1000.0, 1000.0)  # gains of the size in use
+COMPLIANCE = 6e-6  # of each joint [rad/(N m)]
+GAIN, BASE, PLAY = 4e-4, 9e-7, 1.5e-4  # [-], [rad/(N m)], from stop to stop [rad]
+NOISE = 10e-6  # of a coordinate [m]
+EFFECTS = ("joint_compliance:all", "encoder_gain:all", "base_flex:frame", "backlash:all")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One arm.  poses: measured, a quarter of them held out.  known: whether its masses are."""
+
+    robot: str
+    poses: int
+    seed: int
+    known: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """gap: the ladder.  alone_mm: held-out RMS of the corrected file, by a loop of its own."""
+
+    gap: SimulatorGap
+    alone_mm: float
+
+
+def robot_called(name: str) -> mc.Robot:
+    """A built-in robot, or the arm of seven axes."""
+    if name != "seven_axes":
+        return mc.load_robot(name)
+    lengths, turn = (360.0, 0.0, 420.0, 0.0, 400.0, 0.0, 126.0), math.pi / 2.0
+    tilts = (-turn, turn, turn, -turn, -turn, turn, 0.0)
+    joints = [
+        {"a": 0.0, "d": d, "theta": 0.0, "alpha": alpha, "lower": -2.8, "upper": 2.8}
+        for d, alpha in zip(lengths, tilts, strict=True)
+    ]
+    units = {"length": "mm", "angle": "rad"}
+    return robot_from_dict({"name": "an arm of seven axes", "units": units, "joints": joints})
+
+
+def weighed(robot: mc.Robot) -> mc.Robot:
+    """The robot with masses: a third of what would be assumed, as real arms have."""
+    mass, com = tubes(robot.mdh)
+    return replace(robot, mass=np.maximum(mass / 3.0, 0.5), com=com)
+
+
+def measured(robot: mc.Robot, trial: Trial) -> mc.Measurements:
+    """What a tracker sees of an arm with all the effects, at poses in random order."""
+    rng = np.random.default_rng(trial.seed)
+    plain = mc.simulate(robot, 3, seed=trial.seed, truth=mc.Truth(noise=0.0)).cell
+    q = random_poses(robot, trial.poses, rng, 2.0)
+    data = mc.measurements(q, plain.predict(q), order=np.arange(len(q)))
+    data = with_history(data)
+    scene = plain.scene(data)
+    found = terms(scene, EFFECTS)
+    counts = [len(term.columns(scene).names) for term in found]
+    sizes = (COMPLIANCE, GAIN, BASE, PLAY)
+    values = tuple(s * rng.uniform(0.7, 1.3, n) for s, n in zip(sizes, counts, strict=True))
+    cell = mc.Cell(plain.robot, plain.base, plain.target_names, plain.target_positions,
+                   Fitted(found, values))  # fmt: skip
+    y = cell.follow(data)
+    held = np.where(np.arange(trial.poses) % 4 == 3, "holdout", "train")
+    return mc.measurements(q, y + NOISE * rng.normal(size=y.shape), order=np.arange(len(q)),
+                           split=held)  # fmt: skip
+
+
+def published(robot: mc.Robot, path: Path) -> None:
+    """The nominal model with gains of the size that published ones have."""
+    text = mc.export(robot, "mjcf", notify=lambda notice: None)
+    gains = iter(PUBLISHED)
+    text = re.sub(r'kp="[^"]*"', lambda _: f'kp="{next(gains)}"', text)
+    path.write_text(re.sub(r'kv="[^"]*"', 'kv="400"', text))
+
+
+def run(trial: Trial) -> Result:
+    """The ladder of one arm, and its corrected file by itself."""
+    robot = weighed(robot_called(trial.robot))
+    data = measured(robot, trial)
+    robot = robot if trial.known else robot_called(trial.robot)
+    fit = mc.calibrate(robot, data, objective="sum", effects=EFFECTS)
+    with tempfile.TemporaryDirectory() as folder:
+        model, corrected = Path(folder) / f"{trial.robot}.xml", Path(folder) / "corrected.xml"
+        published(robot, model)
+        gap = mc.simulator_gap(model, data, fit=fit, write=corrected)
+        alone = driven(corrected, fit)
+    return Result(gap, alone)
+
+
+def driven(path: Path, fit: mc.Fit) -> float:
+    """Held-out RMS of a corrected file: its targets where it rests, nothing fitted [mm]."""
+    mujoco = optional("mujoco", "the study", "minimax-cal[mujoco]")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, held = mujoco.MjData(model), with_history(fit.data).take(fit.held)
+    names = [f"joint{i + 1}" for i in range(held.q.shape[1])]
+    error = []
+    for row in range(held.poses):
+        mujoco.mj_resetData(model, data)
+        for i, name in enumerate(names):
+            data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = held.q[row, i]
+            play = model.joint(f"play{i + 1}")
+            side = held.columns[f"approach{i + 1}"][row]
+            model.qpos_spring[play.qposadr[0]] = side * play.range[1] / 1.01 * sign_of(fit, i)
+        mujoco.mj_step(model, data, round(3.0 / model.opt.timestep))
+        points = np.array([data.site(name).xpos for name in held.target_names])
+        seen = points @ fit.cell.base[:3, :3].T + fit.cell.base[:3, 3]
+        error.append(np.linalg.norm(held.y[row] - seen, axis=-1))
+    return 1e3 * rms(np.array(error))
+
+
+def sign_of(fit: mc.Fit, joint: int) -> float:
+    """Whether a joint stops short (-1) or runs ahead of its command (+1)."""
+    values: dict[str, Array] = {
+        term.effect: found
+        for term, found in zip(fit.cell.effects.terms, fit.cell.effects.values, strict=True)
+    }
+    return float(np.sign(values["backlash"][joint]))
+
+
+def rows_of(trial: Trial, result: Result) -> list[tuple[Cell, ...]]:
+    """A row a rung."""
+    out: list[tuple[Cell, ...]] = []
+    for rung in result.gap.rungs:
+        off = 1e3 * (rung.holdout_rms_mm - rung.predicted_rms_mm)
+        name = trial.robot if trial.known else f"{trial.robot}, masses unknown"
+        out.append((name, rung.name, rung.holdout_rms_mm, rung.holdout_max_mm,
+                    rung.predicted_rms_mm, off, rung.sag_mrad, math.nan))  # fmt: skip
+    out[-1] = (*out[-1][:-1], result.alone_mm)
+    return out
+
+
+def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
+    """All ladders."""
+    rows = [row for t, r in zip(trials, results, strict=True) for row in rows_of(t, r)]
+    return Table(
+        "held-out errors in the simulator, rung by rung, and what the fit says of the same poses",
+        ("arm", "model", "RMS mm", "max mm", "fit says mm", "off um", "joints off mrad",
+         "the file alone mm"),
+        tuple(rows),
+        ("", "", ".4f", ".4f", ".4f", "+.2f", ".3f", ".4f"),
+    )  # fmt: skip
+
+
+@click.command()
+@study_options("simulator_gap")
+@click.option("--poses", type=int, default=160, show_default=True)
+def main(study: Study, poses: int) -> None:
+    """How far simulated arms are from real ones, before and after."""
+    names = ("ur10",) if study.quick else ("ur10", "irb2600", "seven_axes")
+    poses = 80 if study.quick else poses
+    trials = [Trial(name, poses, study.seed + i) for i, name in enumerate(names)]
+    trials += [Trial("ur10", poses, study.seed, known=False)]
+    results = study.sweep(run, trials, "arms")
+    table = table_of(trials, results)
+    content = {
+        trial.robot + ("" if trial.known else "_unknown_masses"): {
+            **result.gap.to_dict(),
+            "alone_mm": result.alone_mm,
+        }
+        for trial, result in zip(trials, results, strict=True)
+    }
+    figures = {"simulator_gap_ladder": simulator_figure(results[0].gap)}
+    study.save([table], content, figures, packages=("mujoco",))
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)

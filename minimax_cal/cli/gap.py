@@ -1,0 +1,41 @@
+"""The command `minimax-cal gap`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from minimax_cal.cli import options
+from minimax_cal.cli.options import DATA, PATH, Output, options_from, options_of, result_options
+from minimax_cal.fitting.options import Options
+from minimax_cal.ground.options import Option
+from minimax_cal.reporting.plots.simulator import save_simulator_gap
+from minimax_cal.simulators.ladder import simulator_gap
+
+
+@click.command(name="gap")
+@click.argument("model", type=PATH)
+@DATA
+@click.option("--fit", type=PATH, metavar="FIT", help="A calibration of this arm.")
+@click.option("--diagnosis", type=PATH, metavar="D", help="A diagnosis of this arm.")
+@click.option("--write", type=PATH, metavar="XML", help="Write the corrected model to this MJCF.")
+@options_of(
+    simulator_gap, tip=Option("Last body of the arm, where there are several.", metavar="BODY")
+)
+@options_from(Options, "holdout", "seed")
+@result_options("the gap (JSON)", figure="the ladder")
+def gap_command(model: Path, data: Path, to: Output, **chosen: Any) -> int:
+    """How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and why.
+
+    The model is driven with the measured commands in MuJoCo, as given and then corrected step by
+    step; only base and targets are fitted.  Without --fit or --diagnosis a diagnosis is made.
+    """
+    with to.stages() as progress:
+        found = simulator_gap(model, data, progress=progress, **chosen)
+    to.notice(*found.notices)
+    if to.deliver(found.json):
+        options.show(found.table(), headline=found.headline())
+    to.draw(save_simulator_gap, found)
+    return options.exit_code(found.status)

@@ -1,0 +1,147 @@
+"""What a calibration says is wrong with an arm, as a series of fits: geometry, then each effect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.diagnosing.diagnose import diagnose
+from minimax_cal.diagnosing.result import Diagnosis, load_diagnosis
+from minimax_cal.fitting.calibrate import again, calibrate
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.options import Progress
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.floor import Floor
+from minimax_cal.measuring.grouping import held_out
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.robots.robot import Robot
+from minimax_cal.simulators.arm import ELEMENTS, assumed
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.given import told_masses
+
+
+@dataclass(frozen=True, eq=False)
+class Causes:
+    """names: of the rungs from geometry on.  fits: of each; the last holds what can be mapped too.
+
+    data: the measurements that the simulator is judged by, with their history; held: (m,) True
+    where held out.  floor: what noise alone would leave, None untold.  same: whether these are the
+    poses of the fits.
+    """
+
+    names: tuple[str, ...]
+    fits: tuple[Fit, ...]
+    whole: Fit
+    data: Measurements
+    held: Array
+    floor: Floor | None
+    same: bool
+
+
+def causes_of(
+    chain: Chain,
+    data: Measurements,
+    fit: Fit | Path | str | None,
+    diagnosis: Diagnosis | Path | str | None,
+    chosen: tuple[float, int],
+    progress: Progress,
+) -> Causes:
+    """From a fit, a diagnosis, or both; without either a diagnosis is made.
+
+    chain: the arm in the model.  A fit without masses is made again with those of the model: then
+    its springs are the model's.  chosen: share and seed of the held-out poses, for a new diagnosis.
+    """
+    robot = chain.robot
+    fit = load_fit(fit) if isinstance(fit, Path | str) else fit
+    told = load_diagnosis(diagnosis) if isinstance(diagnosis, Path | str) else diagnosis
+    if fit is None and told is None:
+        told = diagnose(robot, data, holdout=chosen[0], seed=chosen[1], progress=progress)
+    terms = established(told) if told else fit.cell.effects.terms if fit else ()
+    if fit is None:
+        assert told is not None
+        terms = carried_over(terms, robot)
+        rows = replace(told.data, digest=told.provenance.data_sha256)
+        fit = calibrate(robot, marked(rows, told.held), objective="sum")
+    elif not assumed(robot) and assumed(fit.before.robot):
+        progress("fit with the masses of the model")
+        terms = carried_over(terms, robot)
+        fit = weighed(fit, chain, [t.label if not t.choice else t for t in terms])
+        terms = fit.cell.effects.terms
+    firm = [term for term in terms if term.effect in ELEMENTS]
+    labels = list(dict.fromkeys(term.label for term in firm))
+    fits = [fit if not fit.cell.effects.terms else again(fit, effects=())]
+    for i in range(len(labels)):
+        progress(f"fit with {labels[i]}")
+        fits.append(fitted(fit, [t for t in firm if t.label in labels[: i + 1]]))
+    others = [term for term in terms if term not in firm and maps(term, fit)]
+    whole = fitted(fit, [*firm, *others]) if others else fits[-1]
+    rows, held, same = judged_by(fit, data, chosen)
+    floor = told.floor if told else None
+    names = ("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels))
+    return Causes(names, tuple(fits), whole, rows, held, floor, same)
+
+
+def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
+    """The same fit, effects given, of a robot that has the masses of a simulator's model."""
+    nominal = fit.before.robot
+    mass, com = told_masses(chain, nominal)
+    settings = {**vars(fit.options), "effects": tuple(effects)}
+    rows = marked(fit.data, fit.held)
+    return calibrate(replace(nominal, mass=mass, com=com), rows, **settings)
+
+
+def established(told: Diagnosis) -> tuple[Term, ...]:
+    """The effects that a diagnosis is sure of, in the order of its ladder."""
+    sure = {
+        term.text
+        for finding in told.findings
+        if getattr(finding, "established", True)
+        for term in finding.terms
+        if term.effect in EFFECTS
+    }
+    fitted_terms = told.cells[-1].effects.terms if told.cells else ()
+    return tuple(term for term in fitted_terms if term.text in sure)
+
+
+def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
+    """Terms for a robot whose masses may be known: then each joint has one torque."""
+    return tuple(
+        replace(term, choice={}) if term.effect == "joint_compliance" and not assumed(robot)
+        else term
+        for term in terms
+    )  # fmt: skip
+
+
+def fitted(fit: Fit, terms: Sequence[Term]) -> Fit:
+    """The same poses fitted with some effects; that fit itself where they are its own."""
+    if [t.text for t in terms] == [t.text for t in fit.cell.effects.terms]:
+        return fit
+    given = [t if t.choice or t.effect != "joint_compliance" else t.label for t in terms]
+    return again(fit, effects=tuple(given))
+
+
+def maps(term: Term, fit: Fit) -> bool:
+    """Whether an effect without an element turns joints only."""
+    told = with_history(fit.data)
+    return not term.columns(fit.cell.scene(told)).shift.size
+
+
+def marked(data: Measurements, held: Array) -> Measurements:
+    """The measurements with a split column that says what is held out."""
+    column = np.where(held, "holdout", "train")
+    return replace(data, columns={**data.columns, "split": column})
+
+
+def judged_by(
+    fit: Fit, data: Measurements, chosen: tuple[float, int]
+) -> tuple[Measurements, Array, bool]:
+    """The poses to judge by, which of them are held out, and whether they are those of the fit."""
+    if fit.data.poses and fit.provenance.data_sha256 == data.digest:
+        return with_history(fit.data), fit.held, True
+    data = with_history(data)
+    return data, held_out(data, *chosen)[0], False

@@ -1,0 +1,245 @@
+"""The arm in a model that MuJoCo has compiled: its joints in order, and the robot they make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.correcting.exporters.correct import match
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError, OptionError, RobotError
+from minimax_cal.ground.files import json_of
+from minimax_cal.ground.optional import optional
+from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.transforms import inverse, transform
+from minimax_cal.robots.urdf import UrdfRobot, to_robot
+from minimax_cal.robots.urdf_file import Element, Joint, Urdf
+
+ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its robot whole
+DRIVES_TENDON = 3  # mjTRN_TENDON
+SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
+Bodies = Sequence[int]
+
+
+def mujoco() -> Any:
+    """The package.  Raises OptionError without it."""
+    return optional("mujoco", "a simulator's model", "minimax-cal[mujoco]")
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """An arm in a compiled model.
+
+    model: of MuJoCo.  joints: their n ids, from the foot.  seen: the same arm as a URDF's would be,
+    world to last body.  robot: that it is, nominal; masses NaN where they are assumed.
+    base: (4, 4) frame 0 of the robot in the world [m].  gravity: [m/s^2].
+    """
+
+    model: Any
+    joints: tuple[int, ...]
+    seen: UrdfRobot
+    robot: Robot
+    base: Array
+    gravity: float
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids of the bodies that the joints carry."""
+        return tuple(int(self.model.jnt_bodyid[j]) for j in self.joints)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the joints."""
+        return tuple(self.model.joint(j).name for j in self.joints)
+
+    def servo(self, joint: int) -> int:
+        """Id of the position actuator of a joint; -1 where there is none."""
+        m = self.model
+        for i in range(m.nu):
+            is_servo = m.actuator_biasprm[i, 1] < 0.0 < m.actuator_gainprm[i, 0]
+            if is_servo and drives(m, i, joint):
+                return i
+        return -1
+
+
+def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: bool = False) -> Chain:
+    """The arm of so many joints in a model.
+
+    tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
+    """
+    joints = joints_of(model, count, source, tip)
+    seen = as_urdf(model, joints, source)
+    down = np.array(model.opt.gravity)
+    size = float(np.linalg.norm(down))
+    robot = robot_from_dict(seen.content, source)
+    if size > 0.0:
+        robot = replace(robot, up=-(seen.base[:3, :3].T @ down) / size)
+    if unknown:
+        robot = replace(robot, mass=robot.mass * np.nan, com=robot.com * np.nan)
+    base = seen.base
+    told = told_robot(model, source)
+    if told is not None and told.joints == count:
+        with suppress(OptionError):  # the bodies were moved since: then they count
+            place, off = match(told, seen)
+            if off < SAME_ROBOT:
+                robot, base = told, place
+    return Chain(model, joints, seen, robot, base, size)
+
+
+def told_robot(model: Any, source: str) -> Robot | None:
+    """The robot that a file of ours holds whole."""
+    number = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_TEXT, ROBOT)
+    if number < 0:
+        return None
+    start, size = int(model.text_adr[number]), int(model.text_size[number])
+    try:
+        raw = bytes(model.text_data[start : start + size]).rstrip(b"\0")
+        return robot_from_dict(json_of(raw), source)
+    except (ValueError, CalibrationError):
+        return None
+
+
+def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
+    """Ids of the joints from the foot to the tip, or of the only arm of so many joints.
+
+    Where more lie on the way, those that an actuator drives.
+    """
+    found: dict[tuple[int, ...], list[str]] = {}
+    for body in range(1, model.nbody):
+        name = model.body(body).name
+        if tip and name != tip:
+            continue
+        way = way_to(model, body)
+        if len(way) > count:
+            way = tuple(j for j in way if driven(model, j))
+        if len(way) == count:
+            found.setdefault(way, []).append(name)
+    if tip and not any(model.body(i).name == tip for i in range(model.nbody)):
+        raise RobotError(f"{source}: has no body {tip!r}")
+    if len(found) == 1:
+        return next(iter(found))
+    if not found:
+        most = max((len(way_to(model, b)) for b in range(1, model.nbody)), default=0)
+        raise RobotError(
+            f"{source}: no chain of {count} hinges and slides, as the measurements have joints "
+            f"(the longest has {most})"
+        )
+    ends = ", ".join(names[0] or "a body without a name" for names in found.values())
+    raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body with --tip")
+
+
+def way_to(model: Any, body: int) -> tuple[int, ...]:
+    """Ids of the hinges and slides from the world to a body."""
+    out: list[int] = []
+    while body > 0:
+        first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        own = [j for j in range(first, first + number) if model.jnt_type[j] in (2, 3)]
+        out = [*own, *out]
+        body = int(model.body_parentid[body])
+    return tuple(out)
+
+
+def driven(model: Any, joint: int) -> bool:
+    """Whether an actuator drives a joint."""
+    return any(drives(model, i, joint) for i in range(model.nu))
+
+
+def drives(model: Any, actuator: int, joint: int) -> bool:
+    """Whether an actuator drives a joint, itself or by a tendon of ours."""
+    kind, number = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind == DRIVES_TENDON:
+        name = model.joint(joint).name
+        return bool(name) and bool(model.tendon(number).name == f"{name}_drive")
+    return kind == 0 and number == joint
+
+
+def at_zero(model: Any, joints: Sequence[int]) -> Any:
+    """The model's data with the arm at joint values 0, all else as the file has it."""
+    data = mujoco().MjData(model)
+    for joint in joints:
+        data.qpos[model.jnt_qposadr[joint]] = 0.0
+    mujoco().mj_kinematics(model, data)
+    return data
+
+
+def body_pose(data: Any, body: int) -> Array:
+    """(4, 4) of a body in the world [m]."""
+    return transform(np.array(data.xmat[body]).reshape(3, 3), np.array(data.xpos[body]))
+
+
+def shifted(point: Array) -> Array:
+    """A translation (4, 4)."""
+    return transform(np.eye(3), np.asarray(point, dtype=float))
+
+
+def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
+    """The chain as a URDF would hold it, world to the last body."""
+    data = at_zero(model, joints)
+    bodies = [int(model.jnt_bodyid[j]) for j in joints]
+    poses = [body_pose(data, b) @ shifted(model.jnt_pos[j])
+             for b, j in zip(bodies, joints, strict=True)]  # fmt: skip
+    nothing, parts = Element("joint", {}, 0, 0, 0), []
+    before, parent = np.eye(4), "world"
+    for i, (joint, pose) in enumerate(zip(joints, poses, strict=True)):
+        slides = model.jnt_type[joint] == 2
+        limited = bool(model.jnt_limited[joint])
+        low, high = model.jnt_range[joint] if limited else (-np.inf, np.inf)
+        parts.append(
+            Joint(
+                name=model.joint(joint).name or f"joint {i + 1}",
+                kind="prismatic" if slides else "revolute" if limited else "continuous",
+                parent=parent,
+                child=f"link_{i + 1}",
+                origin=inverse(before) @ pose,
+                axis=np.array(model.jnt_axis[joint]),
+                lower=float(low),
+                upper=float(high),
+                mimics=False,
+                element=nothing,
+            )
+        )
+        before, parent = pose, f"link_{i + 1}"
+    end = inverse(before) @ body_pose(data, bodies[-1])
+    parts.append(
+        Joint("tip", "fixed", parent, "tip", end, np.array([0.0, 0.0, 1.0]), -np.inf, np.inf,
+              False, nothing)
+    )  # fmt: skip
+    name = Path(source).stem
+    urdf = Urdf(source, b"", name, "world", tuple(parts), masses(model, data, bodies, poses))
+    return to_robot(urdf)
+
+
+def masses(
+    model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]
+) -> dict[str, tuple[float, Array]]:
+    """Mass [kg] and centre of gravity in the link's frame [m] of what each joint alone carries."""
+    holder = np.full(model.nbody, -1)
+    for body in range(1, model.nbody):
+        own = bodies.index(body) if body in bodies else -1
+        holder[body] = max(own, int(holder[model.body_parentid[body]]))
+    out = {}
+    for i, pose in enumerate(poses):
+        mine = np.flatnonzero(holder == i)
+        total = float(model.body_mass[mine].sum())
+        if total > 0.0:
+            centre = (model.body_mass[mine, None] * data.xipos[mine]).sum(axis=0) / total
+            out[f"link_{i + 1}"] = (total, inverse(pose)[:3, :3] @ (centre - pose[:3, 3]))
+    return out
+
+
+def own_pose(attributes: dict[str, str], compiler: dict[str, str]) -> Array:
+    """(4, 4) that position and orientation of an element mean, in whatever form they stand."""
+    keys = ("pos", "quat", "axisangle", "euler", "xyaxes", "zaxis")
+    kept = " ".join(f'{k}="{attributes[k]}"' for k in keys if k in attributes)
+    told = " ".join(f'{k}="{compiler[k]}"' for k in ("angle", "eulerseq") if k in compiler)
+    model = mujoco().MjModel.from_xml_string(
+        f"<mujoco><compiler {told}/><worldbody><body {kept}/></worldbody></mujoco>"
+    )
+    turn = Rotation.from_quat(model.body_quat[1], scalar_first=True).as_matrix()
+    return transform(turn, np.array(model.body_pos[1]))

@@ -1,0 +1,342 @@
+"""The parts of an MJCF that make it bend, sag and play as an arm does; written into its tree.
+
+Every spring has a damper of TIME times its stiffness: the simulator takes dampers implicitly, so
+that no spring is too stiff for its timestep, however light what hangs on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.gravity import G
+from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import head, inverse, link, tail
+from minimax_cal.simulators.arm import Arm
+
+TIME = 0.02  # in which a spring comes to rest [s]
+SAG = 2e-6  # gravity moves the tool of a joint that gives way to nothing by no more [m]
+ROTOR = 0.01  # inertia of a spring itself, of what it carries: parallel hinges need some
+FOOT = 1e-4  # mass of each weight that makes the tool sag [kg]
+LEVER = 0.1  # its distance from the flange [m]
+ANCHOR = 0.3  # distance of the balancing spring's anchor from joint 2 [m]
+NOTHING = 1e-12
+GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where an arm stands in an MJCF.
+
+    root: of the tree.  names: of the n joints.  bodies: that carry them.  joints: their elements.
+    seats: (n, 4, 4) frame of joint i (z its axis, at joint value 0) in its body [m].
+    anchors, axes: (n, 3) a point on each joint's axis [m] and its direction, in its body.
+    degrees: whether the file counts angles in degrees.  implicit: whether its integrator takes the
+    dampers of servos implicitly, as it does those of joints.
+    """
+
+    root: ET.Element
+    names: tuple[str, ...]
+    bodies: tuple[ET.Element, ...]
+    joints: tuple[ET.Element, ...]
+    seats: Array
+    anchors: Array
+    axes: Array
+    degrees: bool = False
+    implicit: bool = True
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers as they are read back."""
+    return " ".join(repr(float(v) + 0.0) for v in np.ravel(values))
+
+
+def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
+    """A new element; arrays become numbers."""
+    text = {
+        key: value if isinstance(value, str) else numbers(np.asarray(value, dtype=float))
+        for key, value in attributes.items()
+    }
+    return ET.SubElement(parent, tag, text)
+
+
+def section(root: ET.Element, tag: str) -> ET.Element:
+    """A section of the file, made where it is missing."""
+    found = root.find(tag)
+    return ET.SubElement(root, tag) if found is None else found
+
+
+def frames(robot: Robot) -> Array:
+    """(n, 4, 4) frame of each joint in the base at joint values 0, z its axis [m]."""
+    out, at = [], np.eye(4)
+    for row in robot.mdh:
+        out.append(at @ head(row))
+        at = at @ link(row)
+    return np.array(out)
+
+
+def carried(arm: Arm) -> tuple[Array, Array, Array]:
+    """For each joint: weight beyond it [N], largest lever of that [m], largest inertia [kg m^2]."""
+    robot = arm.robot
+    length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(arm.com, axis=1)
+    slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
+    reach = np.cumsum((length + slide)[::-1])[::-1] + LEVER
+    mass = np.cumsum(arm.mass[::-1])[::-1]
+    return mass * G, reach, mass * reach**2
+
+
+def gains(arm: Arm) -> Array:
+    """(n,) position gain of each servo: 1/c, or what lets gravity move the tool by SAG at most.
+
+    [N m/rad, N/m]
+    """
+    weight, reach, _ = carried(arm)
+    held = np.where(arm.robot.prismatic, weight, weight * reach**2) / SAG
+    return np.where(arm.turn > NOTHING, 1.0 / np.maximum(arm.turn, NOTHING), held)
+
+
+def damping(stiffness: Array, inertia: Array) -> Array:
+    """Dampers that let springs come to rest without swinging [N m s/rad]."""
+    return np.asarray(TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia))
+
+
+def equip(layout: Layout, arm: Arm) -> None:
+    """Write the elements of an arm into a tree; its actuators and springs are replaced."""
+    stiffness = gains(arm)
+    servos(layout, arm, stiffness)
+    plays(layout, arm)
+    bends(layout, arm)
+    base(layout, arm)
+    balancer(layout, arm, stiffness[1:2])
+
+
+def servos(layout: Layout, arm: Arm, stiffness: Array) -> None:
+    """A position actuator a joint, of its name or of that which drives it now."""
+    tendons = ET.Element("tendon")
+    _, _, inertia = carried(arm)
+    damper = damping(stiffness, np.where(arm.robot.prismatic, carried(arm)[0] / G, inertia))
+    for i, name in enumerate(layout.names):
+        servo = servo_of(layout, name)
+        gear = 1.0 / (1.0 + arm.gain[i])
+        if layout.implicit:
+            tune(servo, stiffness[i] / gear**2, damper[i] / gear**2)
+        else:
+            layout.joints[i].set("damping", numbers([damper[i]]))
+            tune(servo, stiffness[i] / gear**2, 0.0)
+        if arm.gain[i]:
+            servo.set("gear", numbers([gear]))
+        others = [(j, c) for k, j, c in arm.coupled if k == i]
+        if others:
+            fixed = part(tendons, "fixed", name=f"{name}_drive")
+            part(fixed, "joint", joint=name, coef=1.0)
+            for j, c in others:
+                part(fixed, "joint", joint=layout.names[j], coef=-c)
+            servo.attrib.pop("joint", None)
+            servo.set("tendon", f"{name}_drive")
+    if len(tendons):
+        section(layout.root, "tendon").extend(tendons)
+
+
+def servo_of(layout: Layout, joint: str) -> ET.Element:
+    """The position actuator of a joint, a new one where there is none."""
+    actuators = section(layout.root, "actuator")
+    for element in actuators:
+        if element.get("joint") == joint and element.tag in ("position", "general"):
+            return element
+    return part(actuators, "position", name=joint, joint=joint)
+
+
+def tune(servo: ET.Element, gain: float, damper: float) -> None:
+    """Give a position actuator another gain and damper."""
+    if servo.tag == "position":
+        for name in ("dampratio", "timeconst", "inheritrange"):
+            servo.attrib.pop(name, None)
+        servo.set("kp", numbers([gain]))
+        servo.set("kv", numbers([damper]))
+    else:
+        servo.set("gainprm", numbers([gain]))
+        servo.set("biastype", "affine")
+        servo.set("biasprm", numbers([0.0, -gain, -damper]))
+
+
+def spring(
+    body: ET.Element, name: str, kind: str, at: Array, axis: Array, stiffness: float, inertia: float
+) -> ET.Element:
+    """A passive joint with a spring, the last of its body's joints."""
+    new = ET.Element(
+        "joint",
+        {
+            "name": name, "type": kind, "pos": numbers(at), "axis": numbers(axis),
+            "stiffness": numbers([stiffness]), "springref": "0", "ref": "0", "limited": "false",
+            "damping": numbers([damping(np.array(stiffness), np.array(inertia))]),
+            "frictionloss": "0", "armature": numbers([ROTOR * inertia]),
+        },
+    )  # fmt: skip
+    places = [i for i, child in enumerate(body) if child.tag == "joint"]
+    body.insert(places[-1] + 1 if places else 0, new)
+    return new
+
+
+def plays(layout: Layout, arm: Arm) -> None:
+    """A hinge with stops half the play away on either side, and a spring that holds it."""
+    weight, reach, inertia = carried(arm)
+    for i in np.flatnonzero(arm.play):
+        half = 0.5 * abs(arm.play[i])
+        new = spring(
+            layout.bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
+            float(weight[i] * reach[i] ** 2 / SAG), float(inertia[i]),
+        )  # fmt: skip
+        new.set("limited", "true")
+        ends = np.array([-1.01, 1.01]) * half  # the spring ends inside the stops
+        new.set("range", numbers(np.degrees(ends) if layout.degrees else ends))
+
+
+def bends(layout: Layout, arm: Arm) -> None:
+    """Hinges at the Gauss points of a link: together the compliance of a cantilever, exactly."""
+    _, _, inertia = carried(arm)
+    for i, flexibility in arm.bend.items():
+        row = arm.robot.mdh[i]
+        start, end = np.array([0.0, 0.0, -row[1]]), np.array([row[0], 0.0, 0.0])
+        length = float(np.linalg.norm(end - start))
+        seat = layout.seats[i]
+        along = (end - start) / length
+        across = np.linalg.svd(along[None])[2][1:]
+        body = wrapped(layout.bodies[i], layout.bodies[i + 1], f"bend{i + 1}")
+        for point, share in enumerate(GAUSS):
+            at = seat[:3, :3] @ (start + share * (end - start)) + seat[:3, 3]
+            twist = [along] if point == 0 else []  # one hinge for the whole link
+            for letter, axis in zip("yzx", (*across, *twist), strict=False):
+                soft = flexibility * length * (1.0 if letter == "x" else 0.5)
+                spring(
+                    body, f"bend{i + 1}_{letter}{point + 1}", "hinge", at, seat[:3, :3] @ axis,
+                    1.0 / soft, float(inertia[i + 1]),
+                )  # fmt: skip
+
+
+def wrapped(parent: ET.Element, child: ET.Element, name: str) -> ET.Element:
+    """A new body in parent, in the same place, that holds what carries child from now on."""
+    branch = next(b for b in parent if any(e is child for e in b.iter()))
+    body = ET.Element("body", {"name": name})
+    part(body, "inertial", pos=[0.0, 0.0, 0.0], mass=1e-6, diaginertia=[1e-9] * 3)
+    parent.insert(list(parent).index(branch), body)
+    parent.remove(branch)
+    body.append(branch)
+    return body
+
+
+def base(layout: Layout, arm: Arm) -> None:
+    """Two level hinges at the foot, and its height."""
+    body, robot = layout.bodies[0], arm.robot
+    foot = layout.seats[0] @ inverse(head(robot.mdh[0]))
+    if arm.base > 0.0:
+        _, _, inertia = carried(arm)
+        level = np.linalg.svd(robot.up[None])[2][1:]
+        first = next(i for i, child in enumerate(body) if child.tag in ("joint", "freejoint"))
+        for letter, axis in zip("xy", level, strict=True):
+            new = spring(
+                body, f"base_flex_{letter}", "hinge", foot[:3, 3], foot[:3, :3] @ axis,
+                1.0 / arm.base, float(inertia[0]),
+            )  # fmt: skip
+            body.remove(new)
+            body.insert(first, new)
+
+
+def balancer(layout: Layout, arm: Arm, stiffness: Array) -> None:
+    """A tendon with a spring from the column to the upper arm [effects.compliance.spring]."""
+    if not arm.balance:
+        return
+    robot, told = arm.robot, arm.balance
+    at = frames(robot)
+    axis, start = at[1][:3, 2], at[1][:3, 3] - robot.mdh[1, 1] * at[1][:3, 2]
+    level = robot.up - axis * (axis @ robot.up)
+    up = level / np.linalg.norm(level)
+    arm_end = at[1] @ tail(robot.mdh[1])
+    along = arm_end[:3, 3] - start
+    along = along - axis * (axis @ along)
+    along = along / np.linalg.norm(along)
+    anchor = start + ANCHOR * (np.cos(told.zero) * up + np.sin(told.zero) * np.cross(axis, up))
+    eye = start + ANCHOR * told.eye * along
+    for i, point, name in ((0, anchor, "anchor"), (1, eye, "eye")):
+        inside = layout.seats[i] @ inverse(at[i])
+        part(layout.bodies[i], "site", name=f"balancer_{name}",
+             pos=inside[:3, :3] @ point + inside[:3, 3], size=0.005)  # fmt: skip
+    pull = -told.k * float(stiffness[0]) / (told.eye * ANCHOR**2)
+    tendon = part(section(layout.root, "tendon"), "spatial", name="balancer", stiffness=pull,
+                  springlength=told.rest * ANCHOR)  # fmt: skip
+    part(tendon, "site", site="balancer_anchor")
+    part(tendon, "site", site="balancer_eye")
+
+
+# ---- targets, and the tool that carries them ---------------------------------------------------
+
+
+def targets(layout: Layout, arm: Arm, names: Sequence[str]) -> None:
+    """The flange, and a site for each target on the tool."""
+    end = layout.seats[-1] @ tail(arm.robot.mdh[-1])
+    mark(layout.bodies[-1], "flange", end)
+    soft = bool(np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0)
+    body = sagging(layout.bodies[-1], end, arm) if soft else layout.bodies[-1]
+    for name, point in zip(names, arm.spots, strict=True):
+        at = np.eye(4)
+        at[:3, 3] = point
+        mark(body, name, at if soft else end @ at)
+
+
+def mark(body: ET.Element, name: str, pose: Array) -> None:
+    """A site."""
+    part(body, "site", name=name, pos=pose[:3, 3], quat=quaternion(pose), size=0.005, group="4")
+
+
+def quaternion(pose: Array) -> Array:
+    """(4,) as MuJoCo writes it, w first."""
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+
+
+def sagging(body: ET.Element, end: Array, arm: Arm) -> ET.Element:
+    """A tool whose weights turn it about the flange by sag times the direction of gravity.
+
+    A hinge about n with the first moment R beyond it turns by (n x R) . g / k, which is across n:
+    axes are chosen in whose directions sag has no part along themselves.
+    """
+    axes = across_themselves(arm.sag)
+    wanted = axes @ arm.sag  # (3, 3) row i: turn about axis i per direction of gravity
+    size = np.linalg.norm(wanted, axis=1)
+    moment = np.cross(wanted, axes) / np.maximum(size, NOTHING)[:, None] * FOOT * LEVER
+    spots = (moment - np.vstack([moment[1:], np.zeros((1, 3))])) / FOOT
+    for i in range(3):
+        body = part(body, "body", name="tool" if i == 2 else f"tool_{i + 1}")
+        if i == 0:
+            body.set("pos", numbers(end[:3, 3]))
+            body.set("quat", numbers(quaternion(end)))
+        part(body, "inertial", pos=spots[i], mass=FOOT, diaginertia=[FOOT * LEVER**2] * 3)
+        if size[i] > NOTHING:
+            spring(body, f"tool_{'xyz'[i]}", "hinge", np.zeros(3), axes[i],
+                   G * FOOT * LEVER / size[i], 3.0 * FOOT * LEVER**2)  # fmt: skip
+    for i in range(3):
+        if arm.drawn[i] <= 0.0:
+            continue
+        spring(body, f"tool_slide_{'xyz'[i]}", "slide", np.zeros(3), np.eye(3)[i],
+               G * FOOT / float(arm.drawn[i]), FOOT)  # fmt: skip
+    return body
+
+
+def across_themselves(matrix: Array) -> Array:
+    """(3, 3) orthonormal rows n with n . matrix n = 0, of a matrix whose trace is 0."""
+    half = 0.5 * (matrix + matrix.T)
+    if np.abs(np.diag(half)).max() < NOTHING:
+        return np.eye(3)
+    _, vectors = np.linalg.eigh(half)
+    first = vectors.sum(axis=1) / np.sqrt(3.0)
+    plane = np.linalg.svd(first[None])[2][1:]
+    _, turned = np.linalg.eigh(plane @ half @ plane.T)
+    both = (
+        (turned[:, 0] + turned[:, 1]) / np.sqrt(2.0),
+        (turned[:, 0] - turned[:, 1]) / np.sqrt(2.0),
+    )
+    return np.array([first, *(way @ plane for way in both)])

@@ -1,0 +1,39 @@
+"""The exporter `mjcf`: a new file of an arm, or a given one with the calibrated arm in it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.correcting.exporters.urdf import assumptions
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.simulators.arm import arm_of, assumed
+from minimax_cal.simulators.chain import chain_of
+from minimax_cal.simulators.given import corrected, moved_to, read_model, told_masses
+from minimax_cal.simulators.mjcf import beside, new_tree, text_of, told
+
+
+def write(job: Job) -> Export:
+    """A new MJCF, or the given one corrected; a command map beside it where effects need one."""
+    if job.model:
+        return correct(job)
+    cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
+    arm = arm_of(cell, job.q)
+    content = text_of(new_tree(arm, cell.target_names))
+    return Export(content, (assumptions(job.robot), *told(arm)), beside(cell, arm))
+
+
+def correct(job: Job) -> Export:
+    """The MJCF of a job with the calibrated arm in it: with its own masses, unless assumed."""
+    if job.cell is None or not job.fitted or job.model is None:
+        raise OptionError(f"{job.source}: --mjcf corrects by a calibration; give one as FIT")
+    given = read_model(job.model)
+    chain = chain_of(
+        given.compiled(), job.robot.joints, given.source, job.tip, unknown=given.assumed
+    )
+    own = None if assumed(chain.robot) else told_masses(chain, job.nominal)
+    arm = arm_of(job.cell, job.q, own)
+    tree, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
+    content = text_of(moved_to(tree, given.folder, job.path))
+    return Export(content, (*notices, *told(arm)), beside(job.cell, arm))

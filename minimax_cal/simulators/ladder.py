@@ -1,0 +1,250 @@
+"""The gap between a simulator's model and a real arm, measured in the simulator itself."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from minimax_cal.correcting.exporters.job import Export
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.fit import Fit, Provenance
+from minimax_cal.fitting.options import Progress, silent
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.robots.transforms import inverse
+from minimax_cal.simulators.arm import Arm, arm_of, assumed
+from minimax_cal.simulators.causes import Causes, causes_of
+from minimax_cal.simulators.chain import Chain, chain_of, mujoco
+from minimax_cal.simulators.commands import Commands
+from minimax_cal.simulators.given import Given, corrected, moved_to, read_model, told_masses
+from minimax_cal.simulators.mjcf import beside, text_of, told
+from minimax_cal.simulators.placing import placed_error
+from minimax_cal.simulators.rest import at_rest
+from minimax_cal.simulators.result import Rung, SimulatorGap
+from minimax_cal.solvers.status import Status
+
+TRAINING = 200  # poses that place base and targets
+SAGGING = 1e-4  # a joint that stands farther from its command is told [rad, m]
+
+
+def simulator_gap(
+    model: Path | str,
+    data: Measurements | str | Path,
+    *,
+    fit: Fit | Path | str | None = None,
+    diagnosis: Diagnosis | Path | str | None = None,
+    write: Path | str | None = None,
+    tip: str = "",
+    holdout: float = 0.2,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> SimulatorGap:
+    """Say how far a simulated arm is from the real one, and why, in the simulator itself.
+
+    model: an MJCF, or a URDF that MuJoCo loads.  data: measurements, or their file.  fit,
+    diagnosis: of the same arm; a diagnosis is made where neither is given.  write: where the
+    corrected model goes.  tip: last body of the arm, where the model has several.  holdout, seed:
+    of the poses kept out, for a new diagnosis.  progress: called with a word on each stage.
+    Lengths of the result are in mm, angles in mrad.  Raises CalibrationError for wrong input.
+
+    >>> print(mc.simulator_gap("arm.xml", "poses.csv", write="corrected.xml").summary())
+    """
+    began = time.perf_counter()
+    if write is not None:
+        check_writable(write, (".xml", ".mjcf"))
+    mujoco()
+    progress("reading the model")
+    rows = data if isinstance(data, Measurements) else read_measurements(data)
+    given = read_model(model)
+    chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
+    causes = causes_of(chain, rows, fit, diagnosis, (holdout, seed), progress)
+    if not causes.held.any():
+        raise OptionError(f"{causes.data.source}: no pose is held out; give --holdout 0.2")
+    run = Run(given, chain, causes, progress)
+    rungs = [*run.before(), *run.corrected()]
+    failed = causes.fits[-1].status is Status.FAILED
+    path = None if write is None or failed else Path(write)
+    made = run.last(rungs[-1], path)
+    return SimulatorGap(
+        model=str(model),
+        robot=chain.robot.name,
+        rungs=(*rungs[:-1], made.rung),
+        commands=made.commands,
+        floor=causes.floor.value if causes.floor else float("nan"),
+        floor_from=causes.floor.source if causes.floor else "",
+        train_poses=int((~causes.held).sum()),
+        holdout_poses=int(causes.held.sum()),
+        status=causes.fits[-1].status,
+        beyond=causes.fits[-1].beyond.to_dict(),
+        left_out=made.arm.left_out,
+        notices=tuple(dict.fromkeys((*rows.notices, *run.notices, *made.notices))),
+        written="" if path is None else str(path),
+        seconds=time.perf_counter() - began,
+        provenance=Provenance.of(chain.robot, rows, {"model": str(model), "holdout": holdout,
+                                                     "seed": seed}),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Last:
+    """The last rung, measured from the file that holds it, and with its command map."""
+
+    rung: Rung
+    commands: Rung | None
+    arm: Arm
+    notices: tuple[str, ...]
+
+
+class Run:
+    """One ladder in the making: model, poses and fits, and what is to be told."""
+
+    def __init__(self, given: Given, chain: Chain, causes: Causes, progress: Progress) -> None:
+        self.given, self.chain, self.causes, self.progress = given, chain, causes, progress
+        train = np.flatnonzero(~causes.held)
+        some = train[np.linspace(0, len(train) - 1, min(len(train), TRAINING)).astype(int)]
+        self.rows = np.sort(np.concatenate([some, np.flatnonzero(causes.held)]))
+        self.data = causes.data.take(self.rows)
+        self.held = causes.held[self.rows]
+        self.nominal = causes.fits[0].before
+        self.notices: list[str] = []
+
+    def before(self) -> list[Rung]:
+        """The model as given, and without the sag of its servos."""
+        first = self.rung("as given", self.chain, self.nominal)
+        if not first[1]:
+            self.notices.append(
+                f"{self.given.source}: not every joint has a position servo: joints are set, not "
+                "driven, in the model as given"
+            )
+            return [replace(first[0], why="joints set, not driven")]
+        tree, notices = corrected(self.given, self.chain, self.nominal.robot, None)
+        self.notices += notices
+        stiff = self.rung("servo sag removed", self.of(tree), self.nominal)[0]
+        fall = first[0].sag_mrad
+        return [
+            replace(first[0], why=f"servos give way by up to {fall:.3g} mrad"),
+            replace(stiff, why="gains that hold the arm where it is commanded"),
+        ]
+
+    def corrected(self) -> list[Rung]:
+        """A rung for geometry, and for each effect that has an element."""
+        out = []
+        for name, fit in zip(self.causes.names, self.causes.fits, strict=True):
+            arm = self.arm(fit)
+            out.append(self.rung(name, self.of(self.tree(arm, fit)), fit.cell, arm, fit)[0])
+        return out
+
+    def last(self, before: Rung, path: Path | None) -> Last:
+        """The last rung from its file, with targets, and what its command map does."""
+        cell = self.causes.fits[-1].cell
+        whole = self.arm(self.causes.whole)
+        arm = self.arm(self.causes.fits[-1])
+        tree, notices = corrected(
+            self.given, self.chain, self.nominal.robot, arm, cell.target_names
+        )
+        content = text_of(moved_to(tree, self.given.folder, path))
+        made = Export(content, (), beside(self.causes.whole.cell, whole))
+        chain = self.chain_in(self.given.compiled(tree))
+        if path is not None:
+            write_whole(path, made.content)
+            for ending, more in made.beside.items():
+                write_whole(path.with_suffix(ending), more)
+            chain = self.chain_in(mujoco().MjModel.from_xml_path(str(path)))
+        rung, _ = self.rung(before.name, chain, cell, arm, self.causes.fits[-1])
+        mapped = None
+        if whole.mapped.terms:
+            mapped = self.with_commands(whole)
+        return Last(
+            replace(rung, why=before.why),
+            mapped,
+            whole,
+            (*notices, *told(replace(whole, remainder=0.0))),
+        )
+
+    def with_commands(self, whole: Arm) -> Rung:
+        """The arm with all effects, driven with mapped commands."""
+        fit = self.causes.whole
+        tree = self.tree(whole, fit)
+        commands = Commands(replace(fit.cell, effects=whole.mapped)).follow(self.data)
+        rung, _ = self.rung("with its command map", self.of(tree), fit.cell, whole, fit, commands)
+        return replace(rung, why="commands corrected for " + ", ".join(
+            dict.fromkeys(term.label for term in whole.mapped.terms)))  # fmt: skip
+
+    def arm(self, fit: Fit) -> Arm:
+        """The elements of a fit, with the model's own masses unless those are assumed."""
+        own = None
+        if not assumed(self.chain.robot):
+            own = told_masses(self.chain, self.nominal.robot)
+        some = fit.train.take(np.arange(0, fit.train.poses, max(1, fit.train.poses // TRAINING)))
+        return arm_of(fit.cell, masses=own, measured=some)
+
+    def tree(self, arm: Arm, fit: Fit) -> ET.Element:
+        """The model's tree with an arm and its targets in it."""
+        names = fit.cell.target_names
+        return corrected(self.given, self.chain, self.nominal.robot, arm, names)[0]
+
+    def of(self, tree: ET.Element) -> Chain:
+        """The arm in a changed tree."""
+        return self.chain_in(self.given.compiled(tree))
+
+    def chain_in(self, model: Any) -> Chain:
+        """The same joints in another compiled model."""
+        joints = tuple(model.joint(name).id for name in self.chain.names)
+        return replace(self.chain, model=model, joints=joints)
+
+    def rung(
+        self,
+        name: str,
+        chain: Chain,
+        start: Cell,
+        arm: Arm | None = None,
+        fit: Fit | None = None,
+        commands: Array | None = None,
+    ) -> tuple[Rung, bool]:
+        """Drive a model to every pose and judge where it comes to rest; whether servos drove it."""
+        q = self.data.q
+        asked = q if commands is None else commands
+        play = None
+        if arm is not None and arm.play.any():
+            sides = [self.data.columns[f"approach{i + 1}"] for i in range(q.shape[1])]
+            play = 0.5 * arm.play * np.stack(sides, axis=1)
+        count = len(q)
+
+        def heard(done: int) -> None:
+            if done % 20 == 0 or done == count:
+                self.progress(f"{name}: {done} of {count} poses")
+
+        rested = at_rest(chain, q, asked, play, heard)
+        self.tell(name, rested.moving, rested.touching)
+        error = placed_error(
+            rested.poses, self.data, ~self.held, guess(start, rested.poses[0], q[0])
+        )
+        held, train = accuracy(error[:, self.held]), accuracy(error[:, ~self.held])
+        told = fit.accuracy["holdout"].rms_mm if fit and self.causes.same else float("nan")
+        off = np.abs(rested.q - asked)[:, ~chain.robot.prismatic]
+        return Rung(name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
+                    1e3 * float(off.max(initial=0.0)), told), rested.driven  # fmt: skip
+
+    def tell(self, name: str, moving: Array, touching: Array) -> None:
+        """Notices on poses that did not come to rest, or where something touched the arm."""
+        for rows, what in ((moving, "did not come to rest"), (touching, "touched something")):
+            if rows.any():
+                lines = ", ".join(str(line) for line in self.data.line[rows][:8])
+                self.notices.append(
+                    f"{name}: the simulated arm {what} at {rows.sum()} poses (lines {lines})"
+                )
+
+
+def guess(cell: Cell, pose: Array, q: Array) -> tuple[Array, Array]:
+    """Base and targets to begin with, from those of a cell.  pose: of the carrier at q, near it."""
+    end = inverse(pose) @ cell.robot.pose(q)
+    return cell.base, cell.target_positions @ end[:3, :3].T + end[:3, 3]

@@ -1,0 +1,192 @@
+"""How far a simulated arm is from the real one, rung by rung."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from minimax_cal.fitting.fit import Provenance
+from minimax_cal.ground.files import finite, json_text, write_whole
+from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.tables import Table
+from minimax_cal.modelling.cell import saved_content
+from minimax_cal.solvers.status import Status
+
+KIND = "simulator_gap"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """How far the simulator misses with a model, base and targets fitted to the training poses.
+
+    why: what is wrong, or what this rung mends.  holdout_*, train_*: distances [mm].  sag_mrad:
+    largest that a joint stands from its command.  predicted_rms_mm: held out, by the formulas of
+    the fit, NaN where there is none.
+    """
+
+    name: str
+    holdout_rms_mm: float
+    holdout_max_mm: float
+    train_rms_mm: float
+    train_max_mm: float
+    sag_mrad: float
+    predicted_rms_mm: float = math.nan
+    why: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {k: finite(v) if isinstance(v, float) else v for k, v in vars(self).items()}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SimulatorGap:
+    """The gap between a simulator's model and measurements, as a ladder in the simulator itself.
+
+    rungs: as given, without servo sag, with calibrated geometry, with each effect.  commands: the
+    last of them with its command map, None where nothing is mapped.  floor: what noise alone would
+    leave [mm], floor_from: how that is known.  status: of the last fit.  beyond: its claim for
+    poses where none was measured, by its own formulas.  left_out: effects that the simulator has no
+    element for.  written: where the last rung's model was written, empty where it was not.
+    """
+
+    model: str
+    robot: str
+    rungs: tuple[Rung, ...]
+    commands: Rung | None
+    floor: float
+    floor_from: str
+    train_poses: int
+    holdout_poses: int
+    status: Status
+    beyond: Mapping[str, Any]
+    left_out: tuple[str, ...]
+    notices: tuple[str, ...]
+    written: str
+    seconds: float
+    provenance: Provenance
+
+    def __repr__(self) -> str:
+        return f"<SimulatorGap of {self.model}: {self.headline()}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        return f"<p>{escape(self.headline())}</p>\n{self.table().html()}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back."""
+        return {
+            "schema": 1,
+            "kind": KIND,
+            "model": self.model,
+            "robot": self.robot,
+            "rungs": [rung.to_dict() for rung in self.rungs],
+            "with_commands": self.commands.to_dict() if self.commands else None,
+            "noise_floor_mm": finite(self.floor),
+            "noise_floor_from": self.floor_from,
+            "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
+            "status": str(self.status),
+            "beyond": dict(self.beyond),
+            "left_out": list(self.left_out),
+            "notices": list(self.notices),
+            "written": self.written,
+            "seconds": self.seconds,
+            "provenance": vars(self.provenance),
+        }
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "gap") -> SimulatorGap:
+        """From `to_dict`.  Raises CalibrationError."""
+        part = checked(GapPart, content, source)
+        held, floor = part.poses, (part.noise_floor_mm, part.noise_floor_from)
+        return SimulatorGap(
+            part.model, part.robot, part.rungs, part.with_commands, *floor, held["train"],
+            held["holdout"], part.status, part.beyond, part.left_out, part.notices, part.written,
+            part.seconds, part.provenance,
+        )  # fmt: skip
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())
+
+    def table(self) -> Table:
+        """The ladder."""
+        every = (*self.rungs, *([self.commands] if self.commands else []))
+        rows = tuple(
+            (r.name, r.holdout_rms_mm, r.holdout_max_mm, r.predicted_rms_mm, r.sag_mrad, r.why)
+            for r in every
+        )
+        if math.isfinite(self.floor):
+            noise = (math.nan, math.nan, math.nan, self.floor_from)
+            rows = (*rows, ("noise floor", self.floor, *noise))
+        header = ("model", "RMS mm", "max mm", "fit says mm", "joints off mrad", "")
+        title = f"{self.robot} in the simulator: errors on {self.holdout_poses} held-out poses"
+        return Table(title, header, rows, ("", ".4f", ".4f", ".4f", ".3f", ""))
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        first, last = self.rungs[0], self.rungs[-1]
+        text = (
+            f"As given, the simulated arm misses the real one by {first.holdout_rms_mm:.3f} mm RMS "
+            f"on {self.holdout_poses} held-out poses (largest {first.holdout_max_mm:.3f} mm)"
+        )
+        falls = [a.holdout_rms_mm - b.holdout_rms_mm for a, b in steps(self.rungs)]
+        if falls:
+            most = max(range(len(falls)), key=falls.__getitem__)
+            text += (
+                f"; corrected, by {last.holdout_rms_mm:.3f} mm (largest {last.holdout_max_mm:.3f} "
+                f"mm). Most is gained by: {self.rungs[most + 1].name}"
+            )
+        if self.commands:
+            text += f". With its command map {self.commands.holdout_rms_mm:.3f} mm remain"
+        typical, worst = (self.beyond.get(key) for key in ("typical_mm", "worst_mm"))
+        if typical is not None and worst is not None:
+            text += (
+                f". Beyond the measured poses its fit claims {typical:.3f} mm, at worst "
+                f"{worst:.3f} mm ({self.beyond.get('worst_where')})"
+            )
+        return text + "."
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return f"{self.headline()}\n\n{self.table().text(width)}"
+
+
+def steps(rungs: Sequence[Rung]) -> list[tuple[Rung, Rung]]:
+    """Each rung and the next."""
+    return list(pairwise(rungs))
+
+
+class GapPart(Part):
+    """The file of `minimax-cal gap -o`."""
+
+    kind: Literal["simulator_gap"]
+    model: str
+    robot: str
+    rungs: tuple[Recorded[Rung], ...] = Field(min_length=1)
+    with_commands: Recorded[Rung] | None = None
+    noise_floor_mm: Number = math.nan
+    noise_floor_from: str = ""
+    poses: dict[str, int]
+    status: Status = Status.CONVERGED
+    beyond: dict[str, Any] = Field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+    written: str = ""
+    seconds: Number = math.nan
+    provenance: Provenance
+
+
+def load_simulator_gap(path: Path | str) -> SimulatorGap:
+    """What `SimulatorGap.save` or `minimax-cal gap -o` wrote.  Raises CalibrationError."""
+    return SimulatorGap.from_dict(saved_content(path), str(path))

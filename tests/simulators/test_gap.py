@@ -1,0 +1,138 @@
+"""The gap in a simulator: rung by rung what the fit says, and the corrected file keeps it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import minimax_cal as mc
+from minimax_cal.diagnosing.result import load_diagnosis
+from minimax_cal.simulators.result import SimulatorGap, load_simulator_gap
+from tests.conftest import run, shared
+from tests.problems_mjcf import published_like
+
+mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+
+from experiments import simulator_gap as study  # noqa: E402
+from minimax_cal.simulators.chain import chain_of  # noqa: E402
+from minimax_cal.simulators.given import read_model  # noqa: E402
+
+AGREES = 0.01  # between simulator and fit, held-out RMS [mm]
+WITHIN = 1.1  # of the rung that holds only effects with an element
+KEYS = {"name", "holdout_rms_mm", "holdout_max_mm"}
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A published-like model, poses that its real twin took, and a fit of them."""
+    folder = tmp_path_factory.mktemp("arm")
+    robot = mc.load_robot("ur10")
+    given = read_model(published_like(folder, robot))
+    weighs = chain_of(given.compiled(), 6, given.source).robot
+    truth = mc.Truth(compliance=3e-6)
+    mc.write_measurements(folder / "poses.csv", mc.simulate(weighs, 60, seed=3, truth=truth).data)
+    fit = mc.calibrate(robot, folder / "poses.csv", "sum", effects="joint_compliance:all")
+    fit.save(folder / "fit.json")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def gap(arm: Path) -> SimulatorGap:
+    return mc.simulator_gap(
+        arm / "arm.xml", arm / "poses.csv", fit=arm / "fit.json", write=arm / "corrected.xml"
+    )
+
+
+def test_the_ladder_falls_to_what_the_fit_says(arm: Path, gap: SimulatorGap) -> None:
+    names = [rung.name for rung in gap.rungs]
+    assert names == ["as given", "servo sag removed", "calibrated geometry",
+                     "+ joint_compliance all"]  # fmt: skip
+    held = [rung.holdout_rms_mm for rung in gap.rungs]
+    assert sorted(held, reverse=True) == held
+    assert held[0] > 3.0 * held[1]  # published gains: the sag is most of it
+    assert gap.rungs[0].sag_mrad > 5.0
+    for rung in gap.rungs[2:]:
+        assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
+    fit = mc.load_fit(arm / "fit.json")
+    assert gap.holdout_poses == int(fit.held.sum())
+    assert abs(held[-1] - fit.accuracy["holdout"].rms_mm) < AGREES
+
+
+def test_the_corrected_file_reproduces_the_last_rung(arm: Path, gap: SimulatorGap) -> None:
+    again = mc.simulator_gap(arm / "corrected.xml", arm / "poses.csv", fit=arm / "fit.json")
+    assert abs(again.rungs[0].holdout_rms_mm - gap.rungs[-1].holdout_rms_mm) < 1e-3
+
+
+def test_the_file_of_a_gap_reads_back(gap: SimulatorGap, tmp_path: Path) -> None:
+    gap.save(tmp_path / "gap.json")
+    content = json.loads((tmp_path / "gap.json").read_text())
+    assert content["kind"] == "simulator_gap"
+    assert all(rung.keys() >= KEYS for rung in content["rungs"])
+    assert load_simulator_gap(tmp_path / "gap.json").json() == gap.json()
+    with pytest.raises(mc.CalibrationError, match="kind"):
+        SimulatorGap.from_dict({**content, "kind": "diagnosis"})
+
+
+def test_the_command_and_the_report(
+    arm: Path, gap: SimulatorGap, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("plotly")
+    pytest.importorskip("matplotlib")
+    mc.export("ur10", "urdf", tmp_path / "arm.urdf", notify=lambda notice: None)
+    ways = (arm / "poses.csv", "--fit", arm / "fit.json", "--write", tmp_path / "corrected.xml")
+    more = ("--json", "-o", tmp_path / "gap.json", "--figure", tmp_path / "gap.svg")
+    assert run("gap", tmp_path / "arm.urdf", *ways, *more) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert "joints are set" in said.err  # a URDF has no servos
+    assert [rung["name"] for rung in found["rungs"]][:2] == ["as given", "calibrated geometry"]
+    last = found["rungs"][-1]
+    assert abs(last["holdout_rms_mm"] - gap.rungs[-1].holdout_rms_mm) < AGREES
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml")).nu == 6
+    assert "<svg" in (tmp_path / "gap.svg").read_text()
+    page = tmp_path / "report.html"
+    assert run("report", arm / "fit.json", tmp_path / "gap.json", "-o", page) == 0
+    assert "The arm in the simulator" in page.read_text()
+    assert run("report", tmp_path / "gap.json", "-o", page) == 2
+
+
+def test_models_that_do_not_fit_are_refused(
+    arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.xml"
+    mc.export("scara_600", "mjcf", other, notify=lambda notice: None)
+    broken, empty = tmp_path / "broken.xml", tmp_path / "empty.xml"
+    broken.write_text("<mujoco><worldbody><body><joint type='no'/></body></worldbody></mujoco>")
+    empty.write_text("<mujoco><include file='gone.xml'/></mujoco>")
+    for model, said in (
+        (other, "no chain of 6 hinges"),
+        (broken, "MuJoCo refuses"),
+        (empty, "includes 'gone.xml'"),
+        (arm / "poses.csv", "is not XML"),
+        (tmp_path / "absent.xml", "cannot be read"),
+    ):
+        assert run("gap", model, arm / "poses.csv", "--fit", arm / "fit.json") == 2
+        assert said in capsys.readouterr().err
+    mc.export("irb2600", "mjcf", other, notify=lambda notice: None)
+    assert run("gap", other, arm / "poses.csv", "--fit", arm / "fit.json") == 2
+    assert "moves otherwise than the nominal robot" in capsys.readouterr().err
+
+
+def test_the_study_in_its_quick_form() -> None:
+    result = study.run(study.Trial("ur10", 48, 0))
+    for rung in result.gap.rungs[2:]:
+        assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
+    assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < AGREES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["irb120", "ur10_b"])
+def test_real_arms_end_where_effects_with_an_element_end(name: str, tmp_path: Path) -> None:
+    robot, data = shared(name)
+    mc.export(robot, "mjcf", tmp_path / "arm.xml", notify=lambda notice: None)
+    mc.diagnose(robot, data).save(tmp_path / "diagnosis.json")
+    gap = mc.simulator_gap(tmp_path / "arm.xml", data, diagnosis=tmp_path / "diagnosis.json")
+    assert gap.rungs[-1].holdout_rms_mm < WITHIN * gap.rungs[-1].predicted_rms_mm
+    ladder = load_diagnosis(tmp_path / "diagnosis.json").ladder
+    assert np.isclose(gap.rungs[2].predicted_rms_mm, ladder[1].holdout.rms_mm, rtol=0.02)

@@ -1,0 +1,189 @@
+"""A given MJCF is corrected in place: the arm is the calibrated one, all else is as it was."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.modelling.cell import still
+from minimax_cal.modelling.effects.table import Fitted, terms
+from minimax_cal.simulators.given import read_model
+from tests.problems_mjcf import published_like
+
+mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+
+from minimax_cal.simulators.chain import Chain, chain_of  # noqa: E402
+from minimax_cal.simulators.placing import placed_error  # noqa: E402
+from minimax_cal.simulators.rest import at_rest  # noqa: E402
+
+EXACT = dict(rtol=0, atol=1e-9)  # [m]
+FIRST_ORDER = 5e-6  # what the laws of a fit leave out: sag of sag [m]
+CHANGED = {  # what a correction may change, by element
+    "body": {"pos", "quat", "euler"},
+    "joint": {"damping", "stiffness"},
+    "general": {"gainprm", "biasprm", "biastype", "gear"},
+}
+
+
+def joints(robot: mc.Robot, count: int = 12) -> np.ndarray:
+    return np.random.default_rng(2).uniform(-1.5, 1.5, (count, robot.joints))
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> tuple[Path, Chain]:
+    path = published_like(tmp_path, mc.load_robot("ur10"))
+    return path, chain_of(read_model(path).compiled(), 6, str(path))
+
+
+def bent_cell(robot: mc.Robot, texts: dict[str, list[float]]) -> mc.Cell:
+    """An arm that is not quite its drawing, with effects."""
+    mdh = robot.mdh.copy()
+    mdh[:5] += 1e-3 * np.random.default_rng(1).normal(size=(5, 5))
+    spots = np.array([[0.1, 0.0, 0.03], [-0.05, 0.08, 0.03], [-0.05, -0.08, 0.03]])
+    cell = mc.Cell(robot.with_mdh(mdh), np.eye(4), ("smr1", "smr2", "smr3"), spots)
+    scene = cell.scene(still(joints(robot), cell.target_names, robot))
+    chosen = terms(scene, list(texts))
+    values = tuple(np.array(v) for v in texts.values())
+    return replace(cell, effects=Fitted(chosen, values))
+
+
+def corrected(path: Path, chain: Chain, cell: mc.Cell, out: Path) -> Any:
+    from minimax_cal.correcting.exporters.job import job_of
+    from minimax_cal.simulators.exporter import write
+
+    job = replace(job_of(cell, "fit"), nominal=chain.robot, fitted=True, model=path, path=out)
+    out.write_bytes(write(job).content)
+    return mujoco.MjModel.from_xml_path(str(out))
+
+
+def sites(model: Any, chain: Chain, q: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """The sites where the model comes to rest, in the robot's base frame."""
+    ids = tuple(model.joint(name).id for name in chain.names)
+    moved, data, out = replace(chain, model=model, joints=ids), mujoco.MjData(model), []
+    for row in q:
+        mujoco.mj_resetData(model, data)
+        for i, joint in enumerate(ids):
+            data.qpos[model.jnt_qposadr[joint]] = row[i]
+            data.ctrl[moved.servo(joint)] = row[i]
+        while data.time < 8.0:
+            mujoco.mj_step(model, data, 100)
+            if np.abs(data.qvel).max() < 1e-7:
+                break
+        out.append([data.site(name).xpos.copy() for name in names])
+    points = np.array(out) - chain.base[:3, 3]
+    return np.asarray(points @ chain.base[:3, :3])
+
+
+def test_the_robot_of_a_model_moves_as_the_model_does(given: tuple[Path, Chain]) -> None:
+    _, chain = given
+    model, data = chain.model, mujoco.MjData(chain.model)
+    assert chain.names == tuple(f"axis{i}" for i in range(6))
+    nominal = mc.load_robot("ur10")
+    q = joints(nominal)
+    frame = []
+    for row in q:
+        for i, joint in enumerate(chain.joints):
+            data.qpos[model.jnt_qposadr[joint]] = row[i]
+        mujoco.mj_kinematics(model, data)
+        frame.append(data.body("part5").xpos.copy())
+    ours = (chain.base @ chain.robot.pose(q) @ chain.seen.tool)[:, :3, 3]
+    assert_allclose(ours, frame, **EXACT)
+    assert_allclose(chain.robot.up, [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_everything_stays_but_what_was_corrected(given: tuple[Path, Chain], tmp_path: Path) -> None:
+    path, chain = given
+    cell = bent_cell(chain.robot, {"joint_compliance:all": [2e-6] * 5, "encoder_gain:J4": [1e-3]})
+    corrected(path, chain, cell, tmp_path / "out.xml")
+    before = read_model(path).tree
+    after = ET.fromstring((tmp_path / "out.xml").read_bytes())
+    own = {"smr1", "smr2", "smr3", "flange"}
+    for parent in list(after.iter("body")):
+        for site in [e for e in parent.findall("site") if e.get("name") in own]:
+            parent.remove(site)
+    old = [e for e in before.iter() if isinstance(e.tag, str)]
+    new = list(after.iter())
+    assert [(e.tag, e.get("name")) for e in old] == [(e.tag, e.get("name")) for e in new]
+    touched = set()
+    for one, other in zip(old, new, strict=True):
+        keys = one.attrib.keys() | other.attrib.keys()
+        differing = {key for key in keys if one.get(key) != other.get(key)}
+        assert differing <= CHANGED.get(one.tag, set()), (one.tag, one.get("name"), differing)
+        touched |= {(one.tag, one.get("name"))} if differing else set()
+    assert ("body", "part4") in touched
+    assert not touched & {("body", "tool_plate"), ("body", "finger_body"), ("position", "fingers")}
+    assert "<!-- a remark -->" in (tmp_path / "out.xml").read_text()
+
+
+def test_a_corrected_model_in_another_folder_finds_its_meshes(
+    given: tuple[Path, Chain], tmp_path: Path
+) -> None:
+    path, chain = given
+    (tmp_path / "elsewhere").mkdir()
+    model = corrected(path, chain, bent_cell(chain.robot, {}), tmp_path / "elsewhere" / "arm.xml")
+    assert model.nmesh == chain.model.nmesh
+
+
+EFFECTS = {
+    "geometry alone": {},
+    "joints": {"joint_compliance:all": [2e-6, 3e-6, 5e-6, 4e-6, 4e-6]},
+    "structure": {"base_flex:frame": [2e-7], "link_bending:L2": [2e-6]},
+    "gears": {"encoder_gain:J2": [1e-3], "joint_coupling:J5:source=4": [5e-3]},
+    "tool": {"tool_flex:all:lever=0": [1e-3, -2e-5]},
+    "spring": {"gravity_compensator:J2:zero=0.1:eye=0.4:rest=0.5": [-1e-3]},
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_a_corrected_model_rests_where_the_fit_says(
+    given: tuple[Path, Chain], tmp_path: Path, name: str
+) -> None:
+    path, chain = given
+    cell = bent_cell(chain.robot, EFFECTS[name])
+    model = corrected(path, chain, cell, tmp_path / "out.xml")
+    q = joints(chain.robot, 6)
+    off = sites(model, chain, q, cell.target_names) - cell.predict(q)
+    assert np.linalg.norm(off, axis=-1).max() < FIRST_ORDER
+
+
+def test_published_gains_sag(given: tuple[Path, Chain]) -> None:
+    _, chain = given
+    q = joints(chain.robot, 6)
+    rested = at_rest(chain, q, q)
+    assert rested.driven
+    assert not rested.moving.any()
+    # the servo is a spring: each joint stands off by its torque over its gain
+    torque = still_torque(chain, rested.q)
+    gains = np.array([chain.model.actuator_gainprm[chain.servo(j), 0] for j in chain.joints])
+    assert_allclose(rested.q - q, torque / gains, rtol=0, atol=1e-6)
+
+
+def still_torque(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Gravity's torque by MuJoCo's own inverse dynamics."""
+    data, out = mujoco.MjData(chain.model), []
+    at = [int(chain.model.jnt_qposadr[j]) for j in chain.joints]
+    dofs = [int(chain.model.jnt_dofadr[j]) for j in chain.joints]
+    for row in q:
+        data.qpos[at] = row
+        mujoco.mj_forward(chain.model, data)
+        out.append(-data.qfrc_bias[dofs])
+    return np.array(out)
+
+
+def test_base_and_targets_are_found_from_poses() -> None:
+    robot = mc.load_robot("irb120")
+    simulation = mc.simulate(
+        robot, 30, truth=mc.Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0)
+    )
+    cell = simulation.cell
+    start = cell.base.copy()
+    start[:3, 3] += 0.02
+    train = np.arange(30) < 20
+    poses = cell.robot.pose(simulation.data.q)
+    error = placed_error(poses, simulation.data, train, (start, cell.target_positions + 0.01))
+    assert_allclose(error, 0.0, **EXACT)
