@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.options import Options
     from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
     from minimax_cal.judging.bootstrap import bootstrap
+    from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
     from minimax_cal.judging.tradeoff import tradeoff
     from minimax_cal.measuring import datasets
@@ -27,7 +28,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
         read_measurements,
         write_measurements,
     )
-    from minimax_cal.modelling.cell import Cell, evaluate, load_cell
+    from minimax_cal.modelling.cell import Cell, load_cell
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
     from minimax_cal.planning.plan import plan
@@ -93,7 +94,6 @@ MODULES = {  # name: where it is defined
     "import_files": "measuring.importers",
     "datasets": "measuring.datasets",  # the module itself
     "Cell": "modelling.cell",
-    "evaluate": "modelling.cell",
     "load_cell": "modelling.cell",
     "EFFECTS": "modelling.effects.table",
     "register": "modelling.effects.table",
@@ -106,6 +106,7 @@ MODULES = {  # name: where it is defined
     "calibrate": "fitting.calibrate",
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
+    "evaluate": "judging.saved",
     "iso9283": "judging.standard",
     "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",

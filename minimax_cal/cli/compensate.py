@@ -11,6 +11,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     FIT,
     PATH,
+    RUNG,
     WIDTH,
     Output,
     options_of,
@@ -42,6 +43,7 @@ from minimax_cal.robots.robot import load_robot
     lever=Option("What a radian counts as [default: the targets' own].", "mm"),
     clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
 )
+@RUNG
 @result_options("the targets (CSV)")
 def compensate_command(
     fit: Path, targets: Path, robot: str | None, to: Output, **chosen: Any

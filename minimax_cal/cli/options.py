@@ -31,6 +31,12 @@ ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
+RUNG = click.option(
+    "--rung",
+    type=int,
+    metavar="N",
+    help="Of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: the last].",
+)
 JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.correcting.reach import Outcome, Reach, bent, motion, seen
-from minimax_cal.fitting.fit import Fit, opened
+from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.tables import Cell as TableCell
@@ -142,7 +141,7 @@ class Compensation:
 
 
 def compensate(
-    fit: Fit | Cell | Path | str,
+    fit: Result,
     targets: Measurements | Array | Sequence[Sequence[float]],
     nominal: Robot | None = None,
     *,
@@ -151,22 +150,23 @@ def compensate(
     most_change: float = np.pi / 36.0,
     lever: float = np.nan,
     clock: float = 0.0,
+    rung: int | None = None,
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
 
-    fit: a calibration, its cell, or its file.  targets: (m, n) commanded joints in the order of the
-    path [rad, m], or measurements, whose columns (payload, approach ...) then count.
-    nominal: the arm the controller believes in; that of the fit unless given.
-    frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of the
-    orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
+    fit: a calibration, its cell, a diagnosis, a relative calibration, or its file.  targets: (m, n)
+    commanded joints in the order of the path [rad, m], or measurements, whose columns (payload,
+    approach ...) then count. nominal: the arm the controller believes in; that of the fit unless
+    given. frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of
+    the orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
     lever: what a radian counts as [m], NaN for the targets' own.  clock: moment of the
-    calibration's session, 0 to 1, that effects of time are taken at.  Raises CalibrationError for
-    wrong input.
+    calibration's session, 0 to 1, that effects of time are taken at.  rung: of a diagnosis, the
+    last unless given.  Raises CalibrationError for wrong input.
 
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)
-    cell, robot, drawn = cells_of(fit)
+    cell, robot, drawn = cells_of(fit, rung)
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None
     if robot is None:
@@ -218,12 +218,12 @@ def lever_of(cell: Cell) -> float:
     return own if own > LEAST_LEVER else USUAL_LEVER
 
 
-def cells_of(source: Fit | Cell | Path | str) -> tuple[Cell, Robot | None, Cell | None]:
-    """The calibrated cell; the nominal robot and its cell, where the fit tells them."""
-    fit = opened(source)
-    if isinstance(fit, Cell):
-        return fit, None, None
-    return fit.cell, fit.nominal.robot if fit.nominal else None, fit.nominal
+def cells_of(source: Result, rung: int | None) -> tuple[Cell, Robot | None, Cell | None]:
+    """The calibrated cell; the nominal robot, and its cell, where the result tells them."""
+    known = open_result(source, rung)
+    nominal = known.nominal
+    robot = nominal.robot if nominal else None
+    return known.cell, robot, nominal if known.placed else None
 
 
 def same(one: Robot, other: Robot) -> bool:

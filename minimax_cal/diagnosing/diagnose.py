@@ -122,6 +122,7 @@ def examined(
         data=clean.data,
         held=np.isin(clean.data.line, held.line),
         cells=gap.cells,
+        nominal=study.nominal,
     )
 
 

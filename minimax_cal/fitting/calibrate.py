@@ -14,6 +14,7 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
+from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
@@ -74,7 +75,7 @@ def calibrate(
     distance: str = "two-sided",
     distance_tolerance: float | None = None,
     resolution: float = identify.RESOLUTION,
-    effects: str | Sequence[str | Term] = (),
+    effects: str | Path | Writes | Sequence[str | Path | Term] = (),
     loss: str = SQUARE,
     trim: float = 0.0,
     progress: Progress = silent,
@@ -84,15 +85,16 @@ def calibrate(
     robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
     worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
     out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together.  fix, free: parameters as ``beta*``, a list or a text with
-    commas.  priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of
-    the least squares.  lever: what a radian counts as in the pose objective [m], the targets' own
-    unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
-    two-sided, squared or off; distance_tolerance: theirs [m], as measured unless given.
-    resolution: relative singular value that counts as not measured.  effects: beyond geometry, as
-    joint_compliance:J2.  loss: square, huber, cauchy or tukey.  trim: share of the points that may
-    be set aside.  progress: called with a word on each stage.
-    Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
+    poses are held out together.  fix, free: parameters as ``beta*``, a list or a text with commas.
+    priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of the least
+    squares.  lever: what a radian counts as in the pose objective [m], the targets' own unless
+    given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints, two-sided,
+    squared or off; distance_tolerance: theirs [m], as measured unless given. resolution: relative
+    singular value that counts as not measured.  effects: beyond geometry, as joint_compliance:J2,
+    or a diagnosis (or its file), whose established effects are taken.  loss: square, huber, cauchy
+    or tukey.  trim: share of the points that may be set aside.  progress: called with a word on
+    each stage. Raises CalibrationError for wrong input; how the numbers ended is in the result's
+    `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
@@ -112,7 +114,7 @@ def calibrate(
         distance=distance,
         distance_tolerance=distance_tolerance,
         resolution=resolution,
-        effects=listed(effects),
+        effects=listed_effects(effects),
         loss=loss,
         trim=trim,
     )

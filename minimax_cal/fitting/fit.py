@@ -31,7 +31,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
+from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
 from minimax_cal.robots.robot import Robot
@@ -496,15 +496,3 @@ def load_fit(path: Path | str) -> Fit:
     >>> print(mc.load_fit("fit.json").summary())
     """
     return Fit.from_dict(saved_content(path), str(path))
-
-
-def opened(source: Fit | Cell | Path | str) -> Fit | Cell:
-    """A fit, or the bare cell where a file tells no more (the truth of a simulation).
-
-    Raises CalibrationError.
-    """
-    if isinstance(source, Fit | Cell):
-        return source
-    content = saved_content(source)
-    whole = {"parameters", "accuracy", "provenance"} <= set(content)
-    return (Fit.from_dict if whole else cell_from_dict)(content, str(source))

@@ -13,6 +13,7 @@ import numpy as np
 from minimax_cal.fitting.fit import ACCURACIES, Parameter, Provenance, parameter_table
 from minimax_cal.fitting.fit_file import SCHEMA
 from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Cell, Table
@@ -20,7 +21,6 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
-KIND = "relative calibration"
 QUANTITY = {
     "distances": "length of a wire",
     "closures": "ball about its socket",
@@ -135,7 +135,7 @@ class RelativeCalibration:
             accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
         content = {
             "schema": SCHEMA,
-            "kind": KIND,
+            "kind": RELATIVE,
             "measured": self.kind,
             "robot": self.robot.to_dict(),
             "nominal_robot": self.nominal.to_dict(),
