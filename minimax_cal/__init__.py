@@ -15,7 +15,13 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.instruments.kinds import relative
     from minimax_cal.fitting.options import Options
-    from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
+    from minimax_cal.ground.errors import (
+        CalibrationError,
+        CalibrationWarning,
+        DataError,
+        OptionError,
+        RobotError,
+    )
     from minimax_cal.judging.bootstrap import bootstrap
     from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
@@ -41,6 +47,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
 __all__ = [
     "EFFECTS",
     "CalibrationError",
+    "CalibrationWarning",
     "Cell",
     "Compensation",
     "DataError",
@@ -80,6 +87,7 @@ __all__ = [
 
 MODULES = {  # name: where it is defined
     "CalibrationError": "ground.errors",
+    "CalibrationWarning": "ground.errors",
     "DataError": "ground.errors",
     "OptionError": "ground.errors",
     "RobotError": "ground.errors",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import sys
+import warnings
 from collections.abc import Sequence
 
 import click
 
 from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.words import one_line
 
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130  # exit codes
@@ -31,7 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the letter shows another
     try:
-        code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CalibrationWarning)  # the notices say the same
+            code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except CalibrationError as error:
         code = complain(str(error))
     except click.exceptions.NoArgsIsHelpError as error:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
+from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed, few_poses
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
@@ -28,9 +30,10 @@ from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.grouping import groups, parts, split, with_groups
+from minimax_cal.measuring.grouping import clusters, grouped, groups, parts, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
@@ -66,6 +69,7 @@ def calibrate(
     holdout: float = 0.2,
     seed: int = 0,
     holdout_by: str | None = None,
+    cv: bool = False,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
     priors: Mapping[str, float] | None = None,
@@ -85,16 +89,17 @@ def calibrate(
     robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
     worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
     out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together.  fix, free: parameters as ``beta*``, a list or a text with commas.
-    priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of the least
-    squares.  lever: what a radian counts as in the pose objective [m], the targets' own unless
-    given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints, two-sided,
-    squared or off; distance_tolerance: theirs [m], as measured unless given. resolution: relative
-    singular value that counts as not measured.  effects: beyond geometry, as joint_compliance:J2,
-    or a diagnosis (or its file), whose established effects are taken.  loss: square, huber, cauchy
-    or tukey.  trim: share of the points that may be set aside.  progress: called with a word on
-    each stage. Raises CalibrationError for wrong input; how the numbers ended is in the result's
-    `status`.
+    poses are held out together.  cv: judge every pose by a fit without it, which is done anyway
+    where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list or a text
+    with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method:
+    of the least squares.  lever: what a radian counts as in the pose objective [m], the targets'
+    own unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
+    two-sided, squared or off; distance_tolerance: theirs [m], as measured unless given. resolution:
+    relative singular value that counts as not measured.  effects: beyond geometry, as
+    joint_compliance:J2, or a diagnosis (or its file), whose established effects are taken.  loss:
+    square, huber, cauchy or tukey.  trim: share of the points that may be set aside.  progress:
+    called with a word on each stage. Raises CalibrationError for wrong input; how the numbers ended
+    is in the result's `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
@@ -105,6 +110,7 @@ def calibrate(
         holdout=holdout,
         seed=seed,
         holdout_by=holdout_by,
+        cv=cv,
         fix=listed(fix),
         free=listed(free),
         priors=priors or {},
@@ -124,7 +130,10 @@ def calibrate(
     poses = parted(robot, data, options)
     progress("start")
     solved = fit_cell(robot, poses.train, options, progress)
-    return judged(robot, options, poses, solved, began)
+    fit = judged(robot, options, poses, solved, began)
+    for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
+        warnings.warn(doubt, CalibrationWarning, stacklevel=2)
+    return fit
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -178,7 +187,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
-        *doubts(robot, solved, before[:, ~held]),
+        *alarms(robot, poses, solved, before[:, ~held]),
     )
     return Fit(
         cell=calibrated,
@@ -213,32 +222,68 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
         beyond=beyond_of(robot, options, data, held, solved),
+        error_crossed=crossed_of(robot, options, data, held, solved)
+        if is_crossed(options, poses.held)
+        else NOT_CROSSED,
     )
 
 
-def beyond_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Beyond:
-    """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
-    terms, k = solved.effects.terms, len(data.target_names)
+def is_crossed(options: Options, held: Measurements) -> bool:
+    """Whether to cross-validate: asked for, or few poses are held out."""
+    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < FEW)
+
+
+def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
+    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
+    terms = solved.effects.terms
     scene = Cell.of(robot, solved.state, data.target_names).scene(data)
 
     def error_of(state: State, rows: Array) -> Array:
         effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
         return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
 
+    return error_of
+
+
+def crossed_of(
+    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
+) -> Array:
+    """Errors (k, m, 3) of every pose by a fit without it [m]."""
+    group = grouped(data, options.holdout_by)
+    return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
+                   options.seed)  # fmt: skip
+
+
+def beyond_of(
+    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
+) -> Beyond:
+    """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
     geometric = None
-    if terms:
-        train = data.take(~held)
+    if solved.effects.terms:
+        train, k = data.take(~held), len(data.target_names)
         active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
         state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
         geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
     found = parts(data, options.holdout_by)
+    error_of = errors_of(robot, data, solved)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
+
+
+def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:
+    """Why the result should not be used as it is.  nominal_error: (k, training poses, 3) [m]."""
+    free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
+    if few := few_poses(poses.train, int(free.sum())):
+        yield few
+    yield from doubts(robot, solved, nominal_error)
 
 
 def remarks(options: Options, poses: Parts) -> Iterator[str]:
     """What the reader should know about the data behind a result."""
+    if is_crossed(options, poses.held) and not options.cv:
+        yield (
+            f"only {poses.held.poses} poses are held out: the result is cross-validated, every "
+            "pose judged by a fit without it"
+        )
     if not poses.held.poses:
         yield "no pose is held out: nothing here says how the fit does on new poses"
     if options.objective == "minimax" and len(poses.data.target_names) == 1:

@@ -16,6 +16,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
@@ -28,7 +29,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.measuring.accuracy import Accuracy, before_and_after
+from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, saved_content
@@ -258,6 +259,7 @@ class Fit:
     weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
+    error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated.
     """
 
     cell: Cell
@@ -288,6 +290,7 @@ class Fit:
     provenance: Provenance
     beyond: Beyond
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
+    error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
 
     def __repr__(self) -> str:
         return f"<Fit of {self.robot.name}: {self.objective}. {self.headline()}>"
@@ -387,15 +390,33 @@ class Fit:
             for key in ("nominal", "holdout")
         }
 
+    @cached_property
+    def within(self) -> Within:
+        """Before and after on poses that the fit had not seen: cross-validated, or held out."""
+        group = grouped(self.data, self.options.holdout_by) if self.data.poses else np.zeros(0)
+        if self.error_crossed.size:
+            judged = np.isfinite(self.error_crossed).any(axis=(0, 2))
+            before, after = accuracy(self.error_nominal[:, judged]), accuracy(self.error_crossed)
+            where = f"{after.poses} poses, each judged by a fit without it"
+            ends = intervals_of(self.error_crossed, group, self.options.seed)
+            return Within(before, after, where, len(np.unique(group[judged])), *ends)
+        before, after, where = before_and_after(self.accuracy)
+        if not self.accuracy["holdout"].poses:
+            return Within(before, after, where)
+        poses = len(np.unique(group[self.held])) or after.poses
+        return Within(before, after, where, poses, *self.intervals["holdout"])
+
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
+        every = [(title, self.accuracy[key]) for title, key in ACCURACIES]
+        if self.error_crossed.size:
+            every.insert(0, ("cross-validated", self.within.after))
         rows: list[tuple[TableCell, ...]] = [
-            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
-            for title, a in ((title, self.accuracy[key]) for title, key in ACCURACIES)
+            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target()) for title, a in every
         ]
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(
@@ -438,7 +459,7 @@ class Fit:
 
     def headline(self) -> str:
         """The result in a sentence or two."""
-        before, after, where = before_and_after(self.accuracy)
+        before, after, where = self.within.before, self.within.after, self.within.where
         identified = sum(p.identifiable for p in self.parameters)
         beyond = f"{self.beyond.sentence()} " if self.beyond.worst else ""
         text = (

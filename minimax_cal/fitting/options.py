@@ -63,6 +63,7 @@ class Options:
     qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
     seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
     region; None for poses that repeat each other or stand in a cluster.
+    cv: judge every pose by a fit without it, however many are held out.
     fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
@@ -86,6 +87,11 @@ class Options:
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "
         "left out in turn.",
         metavar="COLUMN",
+    )
+    cv: bool = option(
+        False,
+        "Cross-validate: judge every pose by a fit without it [default: when fewer than 20 are "
+        "held out].",
     )
     fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
     free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)

@@ -15,3 +15,7 @@ class DataError(CalibrationError):
 
 class OptionError(CalibrationError):
     """A choice that does not exist or does not fit the data."""
+
+
+class CalibrationWarning(UserWarning):
+    """A result that should not be used before its reason has been looked at."""
