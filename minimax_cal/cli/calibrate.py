@@ -37,7 +37,7 @@ def calibrate_command(
         fit = calibrate(robot, data, progress=progress, **chosen)
         more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
-    if to.deliver(lambda: text_of(fit, *more)):
+    if to.deliver(lambda: text_of(fit, *more), fit.status):
         tables = (*fit.tables(), *(found.table() for found in more))
         options.show(*tables, headline=fit.headline())
     to.draw(save_errors, fit)

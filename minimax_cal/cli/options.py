@@ -141,10 +141,13 @@ class Output:
         if self.figure:
             save(result, self.figure)
 
-    def deliver(self, text: Callable[[], str]) -> bool:
-        """Write the JSON of a result where it was asked for; whether people want to read it too."""
+    def deliver(self, text: Callable[[], str], status: Status = Status.CONVERGED) -> bool:
+        """Write the JSON of a result where it was asked for; whether people want to read it too.
+
+        A result that failed goes into no file: nobody shall load it.
+        """
         made = text() if self.path or self.as_json else ""
-        if self.path:
+        if self.path and status is not Status.FAILED:
             write_whole(self.path, made)
         if self.as_json:
             click.echo(made, nl=False)

@@ -13,7 +13,8 @@ from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import ENOUGH, alternatives
-from minimax_cal.evidence.selection import Choice, Library
+from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.table import Term
@@ -44,22 +45,22 @@ def causes_of(
 ) -> Causes:
     """The effects that explain a study's errors, beside faults that are known."""
     progress("effects")
-    library, choice = chosen(study, exclude)
+    lib, choice = chosen(study, exclude)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
-        library, choice = chosen(study, (*exclude, "backlash"))
+        lib, choice = chosen(study, (*exclude, "backlash"))
     progress("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(study, choice)])
-    return Causes((*faults, *read_back), choice, tuple(effects), traces, library.untestable)
+    return Causes((*faults, *read_back), choice, tuple(effects), traces, lib.untestable)
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
     """The library and what it explains."""
-    library = selection.library(study.scene, study.rows, exclude)
-    return library, selection.select(library, ripple="gear_ripple" not in exclude)
+    lib = library(study.scene, study.rows, exclude)
+    return lib, selection.select(lib, ripple="gear_ripple" not in exclude)
 
 
 def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
@@ -111,7 +112,7 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
             rival = found[i][0].candidate.term
             advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
     columns = one.candidate.term.columns(table.library.scene)
-    size, _ = table.setting(one).likeness(one, one.candidate)
+    size, _ = table.likeness(one, one.candidate)
     return Finding(
         terms=(one.candidate.term,),
         names=columns.names,

@@ -16,8 +16,8 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.where import Where, where
-from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import resemblances
+from minimax_cal.evidence.library import library
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
@@ -206,4 +206,4 @@ def resemblance(
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)
     moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
-    return resemblances(selection.library(study.scene, study.rows), moved)
+    return resemblances(library(study.scene, study.rows), moved)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from minimax_cal.evidence.bench import Added, Bench
+from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.selection import LEVEL, Added, Bench, Library
+from minimax_cal.evidence.selection import LEVEL
 from minimax_cal.ground.arrays import Array
 
 LIGHT = 4.0  # of fit, in the same sense
@@ -27,7 +29,7 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
         alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one
         if not close and (alike or other.evidence < one.evidence - LUCK):
             continue
-        size, rho2 = table.setting(one).likeness(one, other.candidate)
+        size, rho2 = table.likeness(one, other.candidate)
         power = size * (1.0 - rho2)
         if close or power < ENOUGH:
             seen.add(other.candidate.key)

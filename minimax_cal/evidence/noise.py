@@ -9,6 +9,7 @@ Thompson 1971].
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
+FREE = 3  # degrees of freedom below which no noise is told from another
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 17)])
 
 
@@ -124,32 +126,47 @@ class Noise:
 def restricted(rows: Rows, known: Array) -> Noise:
     """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
-    p = columns.shape[1] - 1
-    dof = rows.count - p
-    if dof < 3:
+    dof = rows.count - columns.shape[1] + 1
+    if dof < FREE:
         return Noise(0.0, float(rows.error @ rows.error) / max(rows.count, 1) + 1e-18, 0.0)
 
-    def parts(ratio: float) -> tuple[float, float]:
-        spread = 1.0 + ratio * rows.variance_ratio
-        gram = columns.T @ (columns / spread[:, None])
-        gram[-1, -1] += 1e-300
-        scale = np.sqrt(np.diag(gram))
-        factor = np.linalg.cholesky(gram / np.outer(scale, scale) + 1e-13 * np.eye(p + 1))
-        logs = np.log(np.diag(factor)) + np.log(scale)
-        squares = float(np.exp(2.0 * logs[-1]))
-        cost = dof * np.log(squares) + np.log(spread).sum() + 2.0 * logs[:-1].sum()
-        return float(cost), squares
+    def grams(ratios: Array) -> Array:
+        halves = (columns / np.sqrt(1.0 + r * rows.variance_ratio)[:, None] for r in ratios)
+        return np.array([half.T @ half for half in halves])
 
-    costs = [parts(ratio)[0] for ratio in RATIOS]
-    best = int(np.argmin(costs))
+    return likeliest(grams, rows, dof)
+
+
+def likeliest(
+    grams: Callable[[Array], Array], rows: Rows, dof: int, kept: Array | None = None
+) -> Noise:
+    """Noise at which rows are likeliest [Patterson and Thompson 1971].
+
+    grams: of (r,) ratios, the weighted products (r, p + 1, p + 1) of what is fitted and, last, the
+    error.  kept: (N,) rows that count, None for all.
+    """
+    varied = rows.variance_ratio if kept is None else rows.variance_ratio[kept]
+
+    def parts(ratios: Array) -> tuple[Array, Array]:
+        gram = grams(ratios)
+        gram[:, -1, -1] += 1e-300
+        scale = np.sqrt(np.einsum("rpp->rp", gram))
+        eye = 1e-13 * np.eye(gram.shape[-1])
+        factor = np.linalg.cholesky(gram / (scale[:, :, None] * scale[:, None, :]) + eye)
+        logs = np.log(np.einsum("rpp->rp", factor)) + np.log(scale)
+        squares = np.exp(2.0 * logs[:, -1])
+        spread = np.log1p(ratios[:, None] * varied).sum(axis=1)
+        return dof * np.log(squares) + spread + 2.0 * logs[:, :-1].sum(axis=1), squares
+
+    best = int(np.argmin(parts(RATIOS)[0]))
     ratio = float(RATIOS[best])
     if best:
         low, high = np.log(RATIOS[max(best - 1, 1)]), np.log(RATIOS[min(best + 1, len(RATIOS) - 1)])
         if high > low:
             found = minimize_scalar(
-                lambda x: parts(float(np.exp(x)))[0], bounds=(low, high), method="bounded",
+                lambda x: float(parts(np.exp([x]))[0][0]), bounds=(low, high), method="bounded",
                 options={"xatol": 0.05},
             )  # fmt: skip
             ratio = float(np.exp(found.x))
-    variance = parts(ratio)[1] / dof
+    variance = float(parts(np.array([ratio]))[1][0]) / dof
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))

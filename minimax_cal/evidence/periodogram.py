@@ -14,9 +14,8 @@ SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has f
 DENSITY = 4.0  # frequencies tried for each one that is independent
 
 
-def leftover(rows: Rows, noise: Noise, known: Array) -> Array:
+def leftover(rows: Rows, weight: Array, known: Array) -> Array:
     """(N,) weighted residual W r of the generalised least squares on geometry and known columns."""
-    weight = noise.weights(rows)
     columns = np.concatenate([rows.basis, known], axis=1)
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     columns = columns / scale
@@ -26,14 +25,20 @@ def leftover(rows: Rows, noise: Noise, known: Array) -> Array:
 
 
 def strongest_lines(
-    scene: Scene, rows: Rows, noise: Noise, known: Array, *, most: int = 1
+    scene: Scene,
+    rows: Rows,
+    noise: Noise,
+    known: Array,
+    *,
+    most: int = 1,
+    kept: Array | None = None,
 ) -> list[tuple[Term, float]]:
     """The strongest line of each joint, with the number of independent frequencies tried.
 
-    known: (N, q) columns that are fitted already.
+    known: (N, q) columns that are fitted already.  kept: (N,) rows that count, None for all.
     """
-    pull = leftover(rows, noise, known)
-    weight = noise.weights(rows)
+    weight = noise.weights(rows) * (1.0 if kept is None else kept)
+    pull = leftover(rows, weight, known)
     arms = rows.of(scene.jacobian)
     poses = scene.poses
     found = []
@@ -44,19 +49,32 @@ def strongest_lines(
         tries = float(len(turns)) / DENSITY * 2.0
         score = (arms[:, j] * pull).reshape(poses, -1).sum(axis=1)
         size = (arms[:, j] ** 2 * weight).reshape(poses, -1).sum(axis=1)
-        gain = power(turns, scene.q[j], score, size)
+        gain = power(*sums(turns, scene.q[j], score, size))
         for at in np.argsort(-gain)[:most]:
             near = turns[at] + step * np.linspace(-1.0, 1.0, 41)
-            best = near[int(np.argmax(power(near, scene.q[j], score, size)))]
+            best = near[int(np.argmax(power(*sums(near, scene.q[j], score, size))))]
             found.append((Term("gear_ripple", f"J{j + 1}", {"turns": float(best)}), tries))
     return found
 
 
-def power(turns: Array, q: Array, score: Array, size: Array) -> Array:
-    """(f,) gain of a wave of each frequency.  score, size: (m,) pull and information of a pose."""
-    angle = np.outer(turns, q)
-    c, s = np.cos(angle), np.sin(angle)
-    a, b = c @ score, s @ score
-    cc, ss, cs = (c * c) @ size, (s * s) @ size, (c * s) @ size
+def sums(turns: Array, q: Array, score: Array, size: Array) -> tuple[Array, Array, float]:
+    """Sums over poses of score e^(i k q) and of size e^(2 i k q) for turns k (f,), and of size.
+
+    turns: equally spaced, so that every wave is a product of one from a coarse grid and one of the
+    few between: the sums over poses are products of two small matrices.
+    """
+    count = int(np.ceil(np.sqrt(len(turns))))
+    step = turns[1] - turns[0]
+    coarse = np.exp(1j * np.outer(turns[::count], q))
+    fine = np.exp(1j * np.outer(step * np.arange(count), q))
+    pull = (coarse * score) @ fine.T
+    square = (coarse**2 * size) @ (fine**2).T
+    return pull.reshape(-1)[: len(turns)], square.reshape(-1)[: len(turns)], float(size.sum())
+
+
+def power(pull: Array, square: Array, whole: float) -> Array:
+    """(f,) gain of a wave of each frequency.  pull, square, whole: as `sums` has them."""
+    cc, ss, cs = 0.5 * (whole + square.real), 0.5 * (whole - square.real), 0.5 * square.imag
     det = np.maximum(cc * ss - cs * cs, 1e-12 * cc * ss + 1e-300)
-    return np.asarray((ss * a * a - 2.0 * cs * a * b + cc * b * b) / det)
+    top = ss * pull.real**2 - 2.0 * cs * pull.real * pull.imag + cc * pull.imag**2
+    return np.asarray(top / det)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,9 +12,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
-from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed, few_poses
+from minimax_cal.fitting.claims import (
+    bad_rows,
+    beyond_of,
+    contradiction,
+    crossed_of,
+    is_crossed,
+    unseen_suspects,
+)
+from minimax_cal.fitting.crossed import few_poses
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
@@ -28,20 +35,18 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
-from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.grouping import clusters, grouped, groups, parts, split, with_groups
+from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import NOTHING, Term
-from minimax_cal.modelling.joint_fit import fitted, refitted
-from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
@@ -182,19 +187,23 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
     calibrated = Cell.of(robot, solved.state, data.target_names, solved.effects)
     nominal = Cell.of(robot, solved.nominal, data.target_names)
     before, after = nominal.error(data), calibrated.error(data)
+    suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    wrong = contradiction(robot, data, after, held, suspects)
     notices = (
         *poses.notices,
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *alarms(robot, poses, solved, before[:, ~held]),
+        *bad_rows(suspects, data.source),
+        *([wrong] if wrong else []),
     )
     return Fit(
         cell=calibrated,
         nominal=nominal,
         objective=options.objective,
         qp=usable(options.qp)[0],  # the one that ran
-        status=solved.status,
+        status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
         parameters=parameter_table(robot, solved),
@@ -215,58 +224,15 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         error=after,
         notices=notices,
         loss=options.loss,
-        suspects=solved.robust.suspects,
+        suspects=suspects,
         weights=solved.robust.weights,
         share=solved.estimator.share,
         prior=solved.estimator.model.prior.weight,
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
-        beyond=beyond_of(robot, options, data, held, solved),
-        error_crossed=crossed_of(robot, options, data, held, solved)
-        if is_crossed(options, poses.held)
-        else NOT_CROSSED,
+        beyond=beyond_of(robot, options, data, held, solved, suspects),
+        error_crossed=crossed_of(robot, options, data, held, solved),
     )
-
-
-def is_crossed(options: Options, held: Measurements) -> bool:
-    """Whether to cross-validate: asked for, or few poses are held out."""
-    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < FEW)
-
-
-def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
-    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
-    terms = solved.effects.terms
-    scene = Cell.of(robot, solved.state, data.target_names).scene(data)
-
-    def error_of(state: State, rows: Array) -> Array:
-        effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
-        return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
-
-    return error_of
-
-
-def crossed_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Array:
-    """Errors (k, m, 3) of every pose by a fit without it [m]."""
-    group = grouped(data, options.holdout_by)
-    return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
-                   options.seed)  # fmt: skip
-
-
-def beyond_of(
-    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
-) -> Beyond:
-    """How the fit does on parts of the poses that it has not seen.  held: (m,) not of the fit."""
-    geometric = None
-    if solved.effects.terms:
-        train, k = data.take(~held), len(data.target_names)
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
-        geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
-    found = parts(data, options.holdout_by)
-    error_of = errors_of(robot, data, solved)
-    return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
 
 
 def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:

@@ -21,7 +21,7 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.suspects import Suspect, table_of
+from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
@@ -321,6 +321,11 @@ class Fit:
         }
 
     @property
+    def trusted(self) -> Accuracy:
+        """On the held-out points that do not stand out."""
+        return accuracy(aside(self.error, self.data, self.suspects)[:, self.held])
+
+    @property
     def covariance(self) -> Array:
         """(p, p) of all parameters, NaN where not identified [SI, base in its own axes]."""
         return self.known.covariance
@@ -410,13 +415,20 @@ class Fit:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
+        """What the table of accuracy tells, with titles."""
+        if self.error_crossed.size:
+            yield "cross-validated", self.within.after
+        for title, key in ACCURACIES:
+            yield title, self.accuracy[key]
+            if key == "holdout" and any(one.held for one in self.suspects):
+                yield f"{title}, without suspects", self.trusted
+
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
-        every = [(title, self.accuracy[key]) for title, key in ACCURACIES]
-        if self.error_crossed.size:
-            every.insert(0, ("cross-validated", self.within.after))
         rows: list[tuple[TableCell, ...]] = [
-            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target()) for title, a in every
+            (title, a.poses, a.rms_mm, a.mean_mm, a.max_mm, *a.by_target())
+            for title, a in self.accuracies()
         ]
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(

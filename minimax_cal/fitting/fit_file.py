@@ -164,6 +164,7 @@ class SuspectPart(Part):
     score: Number = math.nan
     chance: Number = math.nan
     together: bool = False
+    held: bool = False
 
 
 class FitPart(Part):
@@ -211,6 +212,7 @@ def written(fit: Fit) -> dict[str, Any]:
         "parameters": [p.to_dict() for p in fit.parameters],
         "accuracy": {
             **{key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+            "holdout_trusted": fit.trusted.to_dict(),
             "beyond": fit.beyond.to_dict(),
             **({"cv": crossed_to_dict(fit)} if fit.error_crossed.size else {}),
         },
@@ -378,7 +380,7 @@ def assembled(
         error=after,
         notices=part.notices,
         loss=part.loss,
-        suspects=tuple(suspect_of(suspect, train) for suspect in part.suspects),
+        suspects=tuple(suspect_of(suspect, data, held) for suspect in part.suspects),
         weights=arrays.get("weights", train.seen.T.astype(float)),
         share=arrays.get("share", np.ones(k)),
         prior=arrays.get("prior", np.zeros(names.count)),
@@ -603,9 +605,9 @@ def certificate_of(part: CertificatePart | None) -> Certificate | None:
     )
 
 
-def suspect_of(part: SuspectPart, train: Measurements) -> Suspect:
+def suspect_of(part: SuspectPart, data: Measurements, held: Array) -> Suspect:
     """A point that stands out."""
-    rows = np.flatnonzero(train.line == part.line)
+    rows = np.flatnonzero(data.line[held == part.held] == part.line)
     return Suspect(
         line=part.line,
         target=part.target,
@@ -614,4 +616,5 @@ def suspect_of(part: SuspectPart, train: Measurements) -> Suspect:
         score=part.score,
         p_value=part.chance,
         together=part.together,
+        held=part.held,
     )

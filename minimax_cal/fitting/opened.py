@@ -26,6 +26,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.solvers.status import Status
 
 RELATIVE = "relative calibration"  # kind of a file
 NOMINAL, CALIBRATED, GEOMETRIC = "nominal", "calibrated", "geometric"
@@ -73,6 +74,7 @@ class Opened:
     digest: str = ""
     uncertainty: Uncertainty | None = None
     placed: bool = True
+    status: Status | None = None
 
     @property
     def cell(self) -> Cell:
@@ -160,7 +162,7 @@ def of_fit(fit: Fit, source: str) -> Opened:
     """A calibration: nominal and calibrated."""
     rungs = (Rung(NOMINAL, fit.nominal, fit.error_nominal), Rung(CALIBRATED, fit.cell, fit.error))
     digest = fit.provenance.data_sha256
-    return Opened(source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty)
+    return Opened(source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty, status=fit.status)
 
 
 def of_relative(content: Mapping[str, Any], source: str) -> Opened:

@@ -17,6 +17,7 @@ from scipy.special import betaln, fdtr
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
@@ -24,6 +25,7 @@ from minimax_cal.solvers.least_squares import solve_normal
 LEVEL = 0.01  # share of a list that is expected to be ordinary points
 FOLLOWED = 0.01  # a fit that leaves less of a direction's variance hides what is wrong there
 RIDGE = 1e-10  # of each parameter's own weight: one that the kept points do not tell is open
+BEYOND = 1.5  # times what any point of the fit is off: a held-out point that is suspect
 LEAST_SCALE = 1e-7  # no instrument tells less [m]
 TAILS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
 CLEARLY = 2.0  # gain in log-likelihood that makes tails heavier than the Gaussian's
@@ -189,6 +191,7 @@ class Suspect:
     line: of the file.  pose: index of the row.  distance: from the prediction [m].  score: the
     distance standardised by scale and leverage.  p_value: that an ordinary point scores as much.
     together: whether all targets of the pose are suspects: then its joint values may be wrong.
+    held: whether the fit has not seen the pose; `pose` then counts those held out.
     """
 
     line: int
@@ -198,6 +201,7 @@ class Suspect:
     score: float
     p_value: float
     together: bool
+    held: bool = False
 
     def to_dict(self) -> dict[str, object]:
         """For JSON, in millimetres."""
@@ -208,6 +212,7 @@ class Suspect:
             "score": self.score,
             "chance": self.p_value,
             "together": self.together,
+            "held": self.held,
         }
 
 
@@ -234,15 +239,42 @@ def suspects_of(
     )
 
 
+def held_suspects(
+    model: Model, state: State, weights: Array, held: Array, spread: Spread, line: Array
+) -> tuple[Suspect, ...]:
+    """The points that stand out among those that the fit has not seen, judged by those it has.
+
+    A model's own errors are larger at poses that it has not seen: those listed are also `BEYOND`
+    times farther off than any point of the fit.
+    model: of all poses, with the fit's free parameters.  weights: (k, m) 0 where held out.
+    spread: of ordinary points of the fit.  held: (m,).  line: (m,) of the file.
+    """
+    if not held.any():
+        return ()
+    every = scores(model, state, weights)
+    found = Scores(every.square[:, held], every.directions[:, held])
+    most = BEYOND * np.sqrt(every.square[weights > 0.0].max(initial=0.0)) / spread.scale
+    told = suspects_of(model.take(held), state, found, spread, line[held])
+    return tuple(replace(one, held=True) for one in told if one.score > most)
+
+
+def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Array:
+    """Errors (k, m, 3) without those of suspects, NaN there [m]."""
+    out = error.copy()
+    for one in suspects:
+        out[data.target_names.index(one.target), data.line == one.line] = np.nan
+    return out
+
+
 def table_of(suspects: Sequence[Suspect]) -> Table:
     """The list for people."""
     return Table(
         "points that stand out (may be real effects: run minimax-cal diagnose)",
-        ("line", "target", "distance mm", "score", "chance", "of the pose"),
+        ("line", "target", "distance mm", "score", "chance", "pose", "of the pose"),
         tuple(
             (s.line, s.target, 1e3 * s.distance, s.score, s.p_value,
-             "all targets" if s.together else "")
+             "held out" if s.held else "training", "all targets" if s.together else "")
             for s in suspects
         ),
-        ("d", "", ".4f", ".1f", ".1e", ""),
+        ("d", "", ".4f", ".1f", ".1e", "", ""),
     )  # fmt: skip

@@ -54,17 +54,9 @@ class Estimator:
 
     def at(self, rows: Array) -> Estimator:
         """The same on some poses.  rows: indices, possibly repeated."""
-        model = self.model
-        few = replace(
-            model,
-            q=model.q[rows],
-            y=model.y[..., rows],
-            weight=model.weight[:, rows],
-            fields=model.fields[..., rows] if len(model.fields) else model.fields,
-            moved=model.moved[..., rows] if len(model.moved) else model.moved,
-        )
         share = self.share if self.share.ndim == 1 else self.share[:, rows]
-        return Estimator(few, share, self.mix[rows] if len(self.mix) else self.mix)
+        mix = self.mix[rows] if len(self.mix) else self.mix
+        return Estimator(self.model.take(rows), share, mix)
 
     def thinned(self, group: Array, most: int) -> tuple[Estimator, Array]:
         """About so many rows at most, whole poses drawn at random; as much less of the prior.

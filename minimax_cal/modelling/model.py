@@ -118,6 +118,18 @@ class Model:
         """The same model with another prior."""
         return replace(self, prior=prior)
 
+    def take(self, rows: Array) -> Model:
+        """The model at some poses.  rows: indices, possibly repeated, or a mask."""
+        return replace(
+            self,
+            q=self.q[rows],
+            y=self.y[..., rows],
+            weight=self.weight[:, rows],
+            fields=self.fields[..., rows] if len(self.fields) else self.fields,
+            moved=self.moved[..., rows] if len(self.moved) else self.moved,
+            mix=self.mix[rows] if len(self.mix) else self.mix,
+        )
+
     def emphasise(self, share: Array) -> Model:
         """The same model with the points of target i weighted by share_i too.  share: (k,)."""
         return replace(self, weight=self.weight * share[:, None])

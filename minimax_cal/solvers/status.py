@@ -28,5 +28,6 @@ ADVICE = {
     "another QP backend, or (in a calibration) fix weakly determined parameters or give priors",
     Status.INFEASIBLE: "the constraints could not be met and may contradict each other; loosen "
     "them (in a calibration the distance tolerance)",
-    Status.FAILED: "the numbers broke down; check units and joint signs, try another QP backend",
+    Status.FAILED: "the numbers broke down, or the result contradicts its own data; check the "
+    "robot file, units and joint signs, or try another QP backend",
 }

@@ -10,6 +10,8 @@ from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
+from minimax_cal.evidence.library import library
+from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
@@ -84,7 +86,7 @@ def test_lambda_is_the_one_that_was_asked_for() -> None:
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
     _, choice = chosen(made, ())
     one, table = choice.fits[0], choice.benches[0]
-    size, rho2 = table.setting(one).likeness(one, one.candidate)
+    size, rho2 = table.likeness(one, one.candidate)
     assert abs(size / 400.0 - 1.0) < 0.35
     assert rho2 > 1.0 - 1e-6
 
@@ -92,20 +94,20 @@ def test_lambda_is_the_one_that_was_asked_for() -> None:
 def test_values_are_those_of_least_squares() -> None:
     """Without jitter the fit beside the geometry is plain least squares on both."""
     made = opened(Cause("encoder_gain", "J2", 500.0), seed=8)
-    lib = selection.library(made.scene, made.rows)
+    lib = library(made.scene, made.rows)
     c = next(c for c in lib.candidates if c.key == ("encoder_gain", "J2"))
-    table = selection.bench(lib, ())
-    still = next(s for s in table.settings if s.ratio == 0.0)
-    value, _, gain = still.solve(c.main[None], np.zeros((1, 1)))
+    settings = selection.bench(lib, ()).settings
+    still = int(np.flatnonzero(settings.ratios == 0.0)[0])
+    gain, value, *_ = (x[still] for x in settings.added_all([c], 1))
     matrix = np.concatenate([made.rows.basis, lib.columns[:, c.main]], axis=1)
     expected, squares, *_ = np.linalg.lstsq(matrix, made.rows.error, rcond=None)
     assert_allclose(value[0, 0], expected[-1], rtol=1e-8)
-    assert_allclose(still.total - gain[0], squares[0], rtol=1e-8)
+    assert_allclose(settings.total[still] - gain[0], squares[0], rtol=1e-8)
 
 
 def test_a_line_is_found_by_its_frequency() -> None:
     made = opened(Cause("gear_ripple", "J4", 300.0), seed=3)
-    noise = selection.restricted(made.rows, np.zeros((len(made.rows.error), 0)))
+    noise = restricted(made.rows, np.zeros((len(made.rows.error), 0)))
     found = {
         t.place: t for t, _ in strongest_lines(made.scene, made.rows, noise, made.rows.basis[:, :0])
     }

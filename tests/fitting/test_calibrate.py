@@ -206,8 +206,15 @@ def test_saved_fit_comes_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path
         assert (p["sigma"] is None) == (not p["identifiable"])
         if not p["identifiable"]:
             assert p["value"] == pytest.approx(p["nominal"], abs=1e-12)
-    judged = {"nominal", "train", "holdout", "nominal_train", "beyond", "cv"}
-    assert set(content["accuracy"]) == judged
+    assert set(content["accuracy"]) == {
+        "nominal",
+        "train",
+        "holdout",
+        "nominal_train",
+        "holdout_trusted",
+        "beyond",
+        "cv",
+    }
 
 
 def test_no_holdout_is_said(robot: mc.Robot, noisy: Simulation) -> None:

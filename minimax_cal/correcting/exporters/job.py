@@ -10,11 +10,13 @@ import numpy as np
 
 from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
+from minimax_cal.solvers.status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,9 @@ def read_job(source: Result | Robot, rung: int | None = None) -> Job:
 
 
 def job_of(known: Opened) -> Job:
-    """Of a rung of a result; its nominal robot may be unknown."""
+    """Of a rung of a result; its nominal robot may be unknown.  Raises OptionError."""
+    if known.status is Status.FAILED:
+        raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell, nominal = known.cell, known.nominal
     labels = tuple(term.label for term in cell.effects.terms)
     before = nominal.robot if nominal else cell.robot

@@ -51,11 +51,14 @@ def bent(scene: Scene, link: int, mass: Array, com: Array) -> Array:
     return np.asarray(sag + turned_about(scene, turn, links.after[link]))
 
 
-def differing(scene: Scene, shift: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """The displacement that a law gives for the masses told, and how it may differ."""
-    whole = shift(*scene.masses)
-    others = np.array([shift(*other) - whole for other in scene.other_masses])
-    return whole[None], principal(others)
+def differing(scene: Scene, shift: Callable[[Array, Array], Array]) -> Callable[[], Array]:
+    """How the displacement that a law gives for the masses told may differ: asked for rarely."""
+
+    def doubt() -> Array:
+        whole = shift(*scene.masses)
+        return principal(np.array([shift(*other) - whole for other in scene.other_masses]))
+
+    return doubt
 
 
 def link_columns(scene: Scene, place: str, choice: Choice) -> Columns:
@@ -64,8 +67,12 @@ def link_columns(scene: Scene, place: str, choice: Choice) -> Columns:
     theta = (L^2/2 l x F + L M) / EI,  delta = (L^3/3 F_across + L^2/2 M x l) / EI, l along it.
     """
     link = joint_of(place)
-    shift, doubt = differing(scene, lambda mass, com: bent(scene, link, mass, com))
-    return Columns(("1/EI",), ("1/(N m^2)",), shift=shift, doubt_shift=(doubt,))
+
+    def shift(mass: Array, com: Array) -> Array:
+        return bent(scene, link, mass, com)
+
+    whole, doubt = shift(*scene.masses)[None], differing(scene, shift)
+    return Columns(("1/EI",), ("1/(N m^2)",), shift=whole, doubt_shift=(doubt,))
 
 
 LINK_BENDING = Effect(
@@ -88,8 +95,12 @@ def tilted(scene: Scene, mass: Array, com: Array) -> Array:
 
 def base_columns(scene: Scene, place: str, choice: Choice) -> Columns:
     """The base turns by C times the overturning moment."""
-    shift, doubt = differing(scene, lambda mass, com: tilted(scene, mass, com))
-    return Columns(("C",), ("rad/(N m)",), shift=shift, doubt_shift=(doubt,))
+
+    def shift(mass: Array, com: Array) -> Array:
+        return tilted(scene, mass, com)
+
+    whole, doubt = shift(*scene.masses)[None], differing(scene, shift)
+    return Columns(("C",), ("rad/(N m)",), shift=whole, doubt_shift=(doubt,))
 
 
 BASE_FLEX = Effect(

@@ -47,6 +47,11 @@ class Scene:
         points = kinematics.points(links, spots)
         return Scene(robot, with_history(data), links, spots, points, *base)
 
+    @cached_property
+    def laws(self) -> dict[str, Columns]:
+        """Columns of effects that were asked for here, by the text of their terms."""
+        return {}
+
     @property
     def joints(self) -> int:
         """n."""
@@ -193,7 +198,7 @@ class Columns:
     turn: (d, n, m) by how much each joint turns or slides [rad or m per unit]; empty for none.
     shift: (d, k, 3, m) by how much each target moves besides [m per unit]; empty for none.
     doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
-    doubt_shift: for each parameter (r, k, 3, m) how `shift` may differ; empty for none.
+    doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
     """
 
@@ -202,7 +207,7 @@ class Columns:
     turn: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     shift: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     doubt: tuple[Array, ...] = ()
-    doubt_shift: tuple[Array, ...] = ()
+    doubt_shift: tuple[Callable[[], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def displacement(self, scene: Scene) -> Array:
@@ -221,7 +226,8 @@ class Columns:
             for owner, part in enumerate(self.doubt)
             if len(part)
         ]
-        return turned + [(i, part) for i, part in enumerate(self.doubt_shift) if len(part)]
+        shifted = [(owner, doubt()) for owner, doubt in enumerate(self.doubt_shift)]
+        return turned + [(owner, part) for owner, part in shifted if len(part)]
 
 
 DOUBTS = 3  # independent ways in which a law may differ from the one computed

@@ -83,7 +83,9 @@ class Term:
 
     def columns(self, scene: Scene) -> Columns:
         """How points move per unit of its parameters."""
-        return EFFECTS[self.effect].columns(scene, self.place, self.choice)
+        if self.text not in scene.laws:
+            scene.laws[self.text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
+        return scene.laws[self.text]
 
 
 def parse(text: str) -> tuple[str, str, dict[str, float]]:

@@ -1,0 +1,155 @@
+"""All effects that data can test: candidates with the columns of their motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from minimax_cal.evidence.noise import Rows
+from minimax_cal.evidence.products import Columns, Products
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import EFFECTS, Term
+
+FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A term with its columns in the matrix of all candidates.
+
+    main: (d,) columns.  doubt: (r,) further columns, one sigma each per unit of main[owner].
+    tries: how many variants like this one were looked at to find it.
+    """
+
+    term: Term
+    main: Array
+    doubt: Array
+    owner: Array
+    tries: float = 1.0
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Effect and place."""
+        return self.term.effect, self.term.place
+
+
+@dataclass(frozen=True, eq=False)
+class Library:
+    """All candidates that these data can test.
+
+    products: of their columns, which all libraries of the same data share.  untestable: effect and
+    what the data lack.  found: candidates added later, by the text of their terms.
+    """
+
+    scene: Scene
+    rows: Rows
+    products: Products
+    candidates: tuple[Candidate, ...]
+    untestable: tuple[tuple[str, str], ...] = ()
+    found: dict[str, Candidate] = field(default_factory=dict)
+
+    @staticmethod
+    def empty(scene: Scene, rows: Rows) -> Library:
+        """No candidates yet."""
+        return Library(scene, rows, Products(Columns(rows), np.ones(len(rows.error), bool)), ())
+
+    @property
+    def columns(self) -> Array:
+        """(N, D) fields of all candidates as rows."""
+        return self.products.columns.raw
+
+    def with_terms(self, terms: Sequence[tuple[Term, float]]) -> list[Candidate]:
+        """Candidates of further terms, their columns stored.  terms: with their tries."""
+        stack = Stack(self.scene, self.rows, self.products.columns.count)
+        out = []
+        for term, tries in terms:
+            c = self.found.get(term.text) or stack.add(term, tries)
+            if c is not None:
+                self.found[term.text] = c
+                out.append(c)
+        self.products.columns.append(stack.columns)
+        return out
+
+    def only(self, poses: Array) -> Library:
+        """The library for some of the poses, of which the others' columns are taken away.
+
+        poses: (m,) whether each counts.
+        """
+        kept = np.repeat(np.asarray(poses, dtype=bool), self.rows.weight.shape[1])
+        return replace(self, products=self.products.of(kept)).shown()
+
+    def shown(self) -> Library:
+        """The library without candidates that geometry imitates."""
+        products, count = self.products, self.products.columns.count
+        across, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
+        fixed = products.columns.fixed
+        own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
+        left = own - ((products.span.T @ across[0, : fixed - 1, fixed:]) ** 2).sum(axis=0)
+        clear = left > FAINT * whole[0]
+        shown = tuple(c for c in self.candidates if clear[c.main].all())
+        gone = {c.term.effect for c in self.candidates} - {c.term.effect for c in shown}
+        lacking = [(name, "poses at which geometry does not imitate it") for name in sorted(gone)]
+        return replace(self, candidates=shown, untestable=(*self.untestable, *lacking))
+
+
+class Stack:
+    """Columns as they are gathered, each stored once."""
+
+    def __init__(self, scene: Scene, rows: Rows, count: int = 0) -> None:
+        self.scene, self.rows, self.count = scene, rows, count
+        self.blocks: list[Array] = [np.zeros((len(rows.error), 0))]
+        self.seen: dict[bytes, int] = {}
+
+    @property
+    def columns(self) -> Array:
+        """(N, d) all of them."""
+        return np.concatenate(self.blocks, axis=1)
+
+    def place(self, fields: Array) -> Array:
+        """Indices of the columns of fields (d, k, 3, m)."""
+        out = []
+        for column in self.rows.of(fields).T:
+            mark = np.float32(column[:: max(1, len(column) // 64)]).tobytes()
+            if mark not in self.seen:
+                self.seen[mark] = self.count
+                self.blocks.append(column[:, None])
+                self.count += 1
+            out.append(self.seen[mark])
+        return np.array(out, dtype=int)
+
+    def add(self, term: Term, tries: float = 1.0) -> Candidate | None:
+        """One candidate; None if nothing of it moves a point."""
+        columns = term.columns(self.scene)
+        fields = columns.displacement(self.scene)
+        if not np.any(fields):
+            return None
+        doubts, owners = [np.zeros((0, *fields.shape[1:]))], []
+        for number, doubt in columns.doubts(self.scene):
+            doubts.append(doubt)
+            owners += [number] * len(doubt)
+        main, doubt = self.place(fields), self.place(np.concatenate(doubts))
+        return Candidate(term, main, doubt, np.array(owners, dtype=int), tries)
+
+
+def library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:
+    """Every effect at every place in every variant that the data can test."""
+    terms, untestable = [], []
+    for name, effect in EFFECTS.items():
+        if name in exclude:
+            continue
+        if missing := effect.needs(scene):
+            untestable.append((name, missing))
+            continue
+        places = effect.places(scene)
+        for place in places:
+            terms += [Term(name, place, c) for c in effect.choices(scene, place)]
+        if not places:
+            untestable.append((name, "poses or joints at which it would show"))
+    lib = Library.empty(scene, rows)
+    stack = Stack(scene, rows)
+    candidates = tuple(c for c in map(stack.add, terms) if c is not None)
+    lib.products.columns.append(stack.columns)
+    return replace(lib, candidates=candidates, untestable=tuple(untestable)).shown()

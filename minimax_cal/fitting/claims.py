@@ -1,0 +1,127 @@
+"""What a fit may claim: how it does on poses it has not seen, and whether it is one at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from minimax_cal.fitting.beyond import Beyond, left_out
+from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed
+from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.solve import Solved
+from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
+from minimax_cal.fitting.uncertainty import Estimator
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import clusters, grouped, parts
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import NOTHING
+from minimax_cal.modelling.joint_fit import extended, fitted, refitted
+from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot
+
+GROSS = 0.01  # of the reach: a fit that misses by more contradicts its own data
+LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
+
+
+def unseen_suspects(
+    robot: Robot, data: Measurements, held: Array, solved: Solved
+) -> tuple[Suspect, ...]:
+    """The held-out points that stand out.  held: (m,)."""
+    model, state = model_of(robot, data), solved.state
+    if solved.effects.terms:
+        model, state = extended(model, robot, data, state, solved.effects.terms)
+    weights = np.zeros(model.weight.shape)
+    weights[:, ~held] = solved.robust.weights
+    model = model.only(solved.identification.active).with_prior(solved.estimator.model.prior)
+    spread = solved.robust.judged[1]
+    return held_suspects(model, state, weights, held, spread, data.line)
+
+
+def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
+    """Notice of held-out points that stand out: they judge the fit."""
+    held = [one for one in suspects if one.held]
+    if held:
+        named = ", ".join(f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held[:5])
+        more = f" and {len(held) - 5} more" if len(held) > 5 else ""
+        yield (
+            f"{source}: held-out points that stand out: {named}{more}; they stay in the held-out "
+            "accuracy, which also stands there without them"
+        )
+
+
+def contradiction(
+    robot: Robot, data: Measurements, error: Array, held: Array, suspects: Sequence[Suspect]
+) -> str:
+    """Why the fit contradicts its own data; empty where it does not.
+
+    error: (k, m, 3) of all poses [m].  held: (m,).
+    """
+    limit = 1e3 * GROSS * robot.reach()
+    rest = aside(error, data, suspects)
+    for name, rows in (("training", ~held), ("held-out", held)):
+        whole, left = accuracy(error[:, rows]), accuracy(rest[:, rows])
+        few = sum(left.counts) < LEFT * sum(whole.counts)
+        miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
+        if miss > limit:
+            return (
+                f"the fit misses the {name} poses by {miss:.3g} mm, more than {100 * GROSS:g} % of "
+                "the arm's reach, suspects aside: it is no calibration of this arm; check the "
+                "robot file, joint signs, units and the sign of each coordinate"
+            )
+    return ""
+
+
+def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
+    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
+    terms = solved.effects.terms
+    scene = Cell.of(robot, solved.state, data.target_names).scene(data)
+
+    def error_of(state: State, rows: Array) -> Array:
+        effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
+        return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
+
+    return error_of
+
+
+def is_crossed(options: Options, held: Measurements) -> bool:
+    """Whether to cross-validate: asked for, or few poses are held out."""
+    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < FEW)
+
+
+def crossed_of(
+    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
+) -> Array:
+    """Errors (k, m, 3) of every pose by a fit without it [m]; empty unless cross-validated."""
+    if not is_crossed(options, data.take(held)):
+        return NOT_CROSSED
+    group = grouped(data, options.holdout_by)
+    return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
+                   options.seed)  # fmt: skip
+
+
+def beyond_of(
+    robot: Robot,
+    options: Options,
+    data: Measurements,
+    held: Array,
+    solved: Solved,
+    suspects: Sequence[Suspect],
+) -> Beyond:
+    """How the fit does on parts of the poses that it has not seen.
+
+    held: (m,) not of the fit; points that stand out among them do not judge it here.
+    """
+    wrong = [one for one in suspects if one.held]
+    data = data.with_y(np.moveaxis(aside(np.moveaxis(data.y, 1, 0), data, wrong), 0, 1))
+    geometric = None
+    if solved.effects.terms:
+        train, k = data.take(~held), len(data.target_names)
+        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
+        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
+        geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
+    found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
+    return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)

@@ -1,0 +1,79 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.simulate import Simulation, simulate
+
+
+def mirrored(data: Measurements) -> Measurements:
+    """One coordinate of one target with the wrong sign."""
+    y = data.y.copy()
+    y[:, 1, 0] *= -1.0
+    return data.with_y(y)
+
+
+def stuck(robot: mc.Robot, data: Measurements) -> tuple[Measurements, np.ndarray]:
+    """A joint that was not read anew for some of the held-out rows, and those rows."""
+    rows = np.flatnonzero(mc.calibrate(robot, data, "sum").held)[:5]
+    q = data.q.copy()
+    q[rows, 2] = q[rows[0], 2]
+    return replace(data, q=q), rows[1:]
+
+
+def test_a_fit_that_contradicts_its_data_has_failed(robot: mc.Robot, noisy: Simulation) -> None:
+    fit = mc.calibrate(robot, mirrored(noisy.data), "sum")
+    assert fit.status == "failed"
+    assert "no calibration of this arm" in fit.notices[-1]
+    with pytest.raises(mc.OptionError, match="contradicts its own data"):
+        mc.export(fit, "json")
+
+
+def test_a_failed_fit_writes_no_robot(
+    noisy: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "d.csv", tmp_path / "fit.json"
+    mc.write_measurements(data, mirrored(noisy.data))
+    assert run("calibrate", "irb2600", data, "--json", "-o", out) == 1
+    assert json.loads(capsys.readouterr().out)["status"] == "failed"
+    assert not out.exists()
+
+
+def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation) -> None:
+    data, wrong = stuck(robot, noisy.data)
+    fit = mc.calibrate(robot, data, "sum")
+    assert fit.status == "converged"
+    assert {one.line for one in fit.suspects if one.held} >= set(data.line[wrong].tolist())
+    assert any("held-out points that stand out" in text for text in fit.notices)
+    assert fit.accuracy["holdout"].rms_mm > 20.0
+    clean = mc.calibrate(robot, noisy.data, "sum")
+    # the same arm judged by the rows that are left
+    assert_allclose(fit.trusted.rms_mm, clean.accuracy["holdout"].rms_mm, rtol=0.15)
+    assert fit.beyond.worst_mm < 3.0 * clean.beyond.worst_mm
+
+
+def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:
+    named = [
+        one
+        for seed in range(6)
+        for one in mc.calibrate(robot, simulate(robot, 80, seed=seed).data, "sum").suspects
+        if one.held
+    ]
+    assert not named  # errors of the model are larger at new poses, and no fault of the rows
+
+
+def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path) -> None:
+    data, _ = stuck(robot, noisy.data)
+    fit = mc.calibrate(robot, data, "sum")
+    fit.save(tmp_path / "fit.json")
+    again = mc.load_fit(tmp_path / "fit.json")
+    keys = [[(s.line, s.target, s.pose, s.held) for s in one.suspects] for one in (fit, again)]
+    assert keys[0] == keys[1]
+    assert again.beyond == fit.beyond
+    assert again.trusted == fit.trusted
