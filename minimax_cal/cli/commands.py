@@ -81,7 +81,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
     "Report": {
         "report": (
             "report",
-            "One HTML page of RESULTS: a calibration, a diagnosis, or both of the same "
+            "A page to sign of RESULTS: a calibration, a diagnosis, or both of the same "
             "measurements.",
         ),
     },

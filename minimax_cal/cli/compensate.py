@@ -60,6 +60,7 @@ def compensate_command(
     text = given.corrected(found)
     if to.path:
         write_whole(to.path, text)
+        to.wrote(to.path)
     if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
     elif to.path:

@@ -37,6 +37,7 @@ def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     to.notice(*made.notices)
     if to.path:
         write_whole(to.path, made.content)
+        to.wrote(to.path)
     else:
         click.echo(made.content, nl=False)
     return 0

@@ -136,10 +136,17 @@ class Output:
         if shown and len(texts) > MOST_NOTICES:
             click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
 
+    def wrote(self, *paths: Path | None) -> None:
+        """Say on stderr which files were written."""
+        for path in paths:
+            if path and not self.quiet:
+                click.echo(f"written: {path}", err=True)
+
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
         if self.figure:
             save(result, self.figure)
+            self.wrote(self.figure)
 
     def deliver(self, text: Callable[[], str], status: Status = Status.CONVERGED) -> bool:
         """Write the JSON of a result where it was asked for; whether people want to read it too.
@@ -149,6 +156,7 @@ class Output:
         made = text() if self.path or self.as_json else ""
         if self.path and status is not Status.FAILED:
             write_whole(self.path, made)
+            self.wrote(self.path)
         if self.as_json:
             click.echo(made, nl=False)
         return not self.as_json

@@ -65,9 +65,14 @@ class Judgement:
     verdict: str
     why: str
 
+    @property
+    def plain(self) -> bool:
+        """Whether the numbers alone say why."""
+        return self.verdict == PASSED or self.bound.value > self.limit.size_mm
+
     def sentence(self) -> str:
         """For a terminal."""
-        kind = KINDS[self.limit.kind]
+        kind = {"rms": "RMS", "max": "Largest"}[self.limit.kind]
         return f"{kind} error at most {self.limit.size_mm:g} mm: {self.verdict} ({self.why})"
 
 

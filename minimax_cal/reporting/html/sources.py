@@ -1,4 +1,4 @@
-"""What a report is made of: a calibration, a diagnosis, or both, with every text visible."""
+"""What a report is made of: a calibration, a diagnosis, or both; or a relative calibration."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
+from minimax_cal.fitting.instruments import RelativeCalibration
+from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
@@ -23,7 +25,7 @@ from minimax_cal.modelling.cell import Cell
 
 AGAIN = "write it again with minimax-cal"
 
-Result = Fit | Diagnosis | Path | str
+Result = Fit | Diagnosis | RelativeCalibration | Path | str
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +65,20 @@ class File:
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """A calibration, a diagnosis, or both.  notices: what the reader should know of both."""
+    """A calibration, a diagnosis, or both; or a relative calibration alone.
+
+    notices: what the reader should know of both.
+    """
 
     fit: Fit | None
     gap: Diagnosis | None
     files: tuple[File, ...] = ()
     notices: tuple[str, ...] = ()
+    relative: RelativeCalibration | None = None
 
     @property
     def results(self) -> tuple[Fit | Diagnosis, ...]:
-        """Those that there are."""
+        """Those of measured points that there are."""
         return tuple(result for result in (self.fit, self.gap) if result)
 
     @property
@@ -80,12 +86,14 @@ class Sources:
         """Name of the robot."""
         if self.fit:
             return self.fit.robot.name
+        if self.relative:
+            return self.relative.robot.name
         return self.gap.robot if self.gap else ""
 
     @property
     def provenance(self) -> Provenance:
         """Of the calibration, or else of the diagnosis."""
-        return self.results[0].provenance
+        return (self.relative or self.results[0]).provenance
 
     @property
     def poses(self) -> Poses | None:
@@ -116,6 +124,11 @@ def read_sources(results: Sequence[Result]) -> Sources:
     for result in results:
         content, path, digest = content_of(result)
         kind = content.get("kind", "calibration" if "parameters" in content else "")
+        if kind == RELATIVE:
+            if len(results) > 1:
+                raise CalibrationError(f"{path}: is a {RELATIVE}; report it alone")
+            told = RelativeCalibration.from_dict(content, path)
+            return Sources(None, None, (File(kind, path, digest),), relative=told)
         if kind == "calibration" and "parameters" in content:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
@@ -139,13 +152,13 @@ def read_sources(results: Sequence[Result]) -> Sources:
 
 def content_of(result: Result) -> tuple[dict[str, Any], str, str]:
     """JSON, name and SHA-256 of a result, every text visible."""
-    if not isinstance(result, Fit | Diagnosis):
+    if isinstance(result, Path | str):
         content, digest = read_json(result)
         return content, str(result), digest
     text = result.json()
-    kind = "calibration" if isinstance(result, Fit) else "diagnosis"
+    content = clean(json.loads(text))
     digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-    return clean(json.loads(text)), f"{kind}, not saved", digest
+    return content, f"{content['kind']}, not saved", digest
 
 
 def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> tuple[str, ...]:
