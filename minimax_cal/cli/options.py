@@ -9,7 +9,7 @@ from functools import reduce, wraps
 from inspect import signature
 from math import isnan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -21,6 +21,9 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import one_line, visible
 from minimax_cal.solvers.status import Status
 
+if TYPE_CHECKING:
+    from minimax_cal.measuring.measurements import Measurements
+
 WIDTH = 110  # of text that goes to no terminal
 MOST_NOTICES = 50
 Command = Callable[..., Any]
@@ -31,6 +34,12 @@ ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
+ROWS = click.option(
+    "--rows-in-visit-order",
+    "in_rows",
+    is_flag=True,
+    help="The file tells no order: its rows stand as the poses were visited.",
+)
 RUNG = click.option(
     "--rung",
     type=int,
@@ -179,6 +188,15 @@ def with_output(command: Command) -> Command:
         return command(*given, to=Output(output, as_json, figure, quiet), **more)
 
     return handed
+
+
+def measured(path: Path, in_rows: bool) -> Measurements:
+    """The measurements of a file; in_rows: visited row by row, where it tells no order."""
+    from minimax_cal.measuring.history import ordered
+    from minimax_cal.measuring.measurements import read_measurements
+
+    data = read_measurements(path)
+    return data.in_visit_order() if in_rows and not ordered(data) else data
 
 
 def result_options(what: str, *, figure: str = "") -> Decorator:

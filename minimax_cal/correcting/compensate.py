@@ -19,6 +19,7 @@ from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.history import ordered
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
@@ -271,6 +272,7 @@ def path_of(
     if not data.poses:
         raise DataError(f"{data.source}: holds no targets")
     check_joints(robot, data)
+    data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
 
 

@@ -388,7 +388,7 @@ def assembled(
         provenance=part.provenance,
         beyond=part.accuracy.beyond.beyond(),
         stated=intervals_of(part, arrays),
-        error_crossed=arrays.get("crossed", NOT_CROSSED),
+        error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
     )
 
 

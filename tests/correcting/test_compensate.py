@@ -232,7 +232,7 @@ def test_every_kind_of_effect_is_corrected(
 ) -> None:
     q = regular(robot, random_poses(robot, 60, rng))
     columns = {"temperature": np.full(len(q), 32.0), "payload": np.full(len(q), 12.0)}
-    data = replace(path_of(q, robot, 0.0), columns=columns)
+    data = replace(path_of(q, robot, 0.0), columns=columns).in_visit_order()
     cell = cell_of(off(robot, rng), effects)
     found = compensate(cell, data, robot, frame="own")
     assert set(found.outcome) == {Outcome.REACHED}
