@@ -33,7 +33,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, where_tabl
 @click.command(name="diagnose")
 @ROBOT
 @DATA
-@options_from(Options, "holdout", "seed")
+@options_from(Options, "holdout", "seed", "holdout_by")
 @options_of(
     diagnose,
     exclude=Option(
@@ -42,6 +42,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, where_tabl
         flag="--without",
         many=tuple,
     ),
+    quick=Option("Leave no parts of the poses out in turn: no claim beyond the measured poses."),
 )
 @ROWS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")

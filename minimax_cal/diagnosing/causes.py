@@ -53,7 +53,7 @@ def causes_of(
     traces = structure(study.scene, study.rows, choice.noise, choice.known)
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
-    effects = merged([finding(study, choice, i) for i in by_weight(study, choice)])
+    effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     return Causes((*faults, *read_back), choice, tuple(effects), traces, lib.untestable)
 
 
@@ -80,23 +80,36 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     return in_lines(study.data, found, "readback")
 
 
-def by_weight(study: Study, choice: Choice) -> list[int]:
+def by_weight(choice: Choice) -> list[int]:
     """The effects in the order in which each takes most of what is left, points weighing alike."""
-    rows, columns = study.rows, choice.library.columns
-    fields = [columns[:, one.candidate.main] for one in choice.fits]
-    fields = [field - rows.basis @ (rows.basis.T @ field) for field in fields]
-    rest, order = rows.error, []
-    waiting = list(range(len(fields)))
-    taken = np.zeros((len(rest), 0))
+    lib = choice.library
+    fields = [lib.products.clear(one.candidate.main) for one in choice.fits]
+    sizes = [len(field) for field in fields]
+    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    columns = np.concatenate([np.zeros((0, len(lib.rows.error))), *fields])
+    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    gram, pull = columns @ columns.T, columns @ lib.rows.error
+    waiting, order = list(range(len(fields))), []
+    taken = np.zeros(0, dtype=int)
     while waiting:
-        left = []
+        gains = []
         for i in waiting:
-            basis = np.linalg.qr(np.concatenate([taken, fields[i]], axis=1))[0]
-            left.append(float(((rest - basis @ (basis.T @ rest)) ** 2).sum()))
-        best = waiting.pop(int(np.argmin(left)))
-        taken = np.concatenate([taken, fields[best]], axis=1)
+            both = np.concatenate([taken, parts[i]])
+            value = np.linalg.lstsq(gram[np.ix_(both, both)], pull[both], rcond=1e-12)[0]
+            gains.append(float(pull[both] @ value))
+        best = waiting.pop(int(np.argmax(gains)))
+        taken = np.concatenate([taken, parts[best]])
         order.append(best)
     return order
+
+
+def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
+    """The terms of each effect selected, the weightiest first, all lines of a joint together."""
+    out: dict[tuple[str, str], list[Term]] = {}
+    for number in by_weight(choice):
+        term = choice.fits[number].candidate.term
+        out.setdefault((term.effect, term.place), []).append(term)
+    return [tuple(terms) for terms in out.values()]
 
 
 def finding(study: Study, choice: Choice, number: int) -> Finding:

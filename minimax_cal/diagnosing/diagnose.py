@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import causes_of, explained, fault_findings, judged
-from minimax_cal.diagnosing.gap import blocked, gap_of, with_shares
-from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
+from minimax_cal.diagnosing.folds import beyond_of
+from minimax_cal.diagnosing.gap import (
+    FAULTS,
+    Judges,
+    Ladder,
+    climbed,
+    closed,
+    shaky,
+    valued,
+    with_shares,
+)
+from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
+from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
@@ -27,12 +40,15 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended
-from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.floor import floor_of
+from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot
+
+NOT_ASKED = Beyond(reason="not asked for")
 
 
 def diagnose(
@@ -41,14 +57,18 @@ def diagnose(
     *,
     seed: int = 0,
     holdout: float = 0.2,
+    holdout_by: str | None = None,
     exclude: Sequence[str] = (),
+    quick: bool = False,
     progress: Progress = silent,
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
     robot, data: loaded, or a name or path.  seed, holdout: of the poses kept out of the fit, and
-    their share.  exclude: effects that are not to be considered.  progress: called with a word on
-    each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
+    their share; holdout_by: a column (session, group ...) or region, whose poses are held out
+    together.  exclude: effects that are not to be considered.  quick: leave no parts of the poses
+    out in turn, so that there is no claim beyond the measured poses.  progress: called with a
+    word on each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
     CalibrationError for wrong input.
 
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
@@ -61,69 +81,137 @@ def diagnose(
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
     checks.check_joints(robot, given)
     checks.check_spread(given)
-    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
-        return examined(robot, given, seed, holdout, exclude, progress, began)
-
-
-def examined(
-    robot: Robot,
-    given: Measurements,
-    seed: int,
-    holdout: float,
-    exclude: Sequence[str],
-    progress: Progress,
-    began: float,
-) -> Diagnosis:
-    """The diagnosis of checked measurements.  began: when the work did [s]."""
-    progress("data faults")
-    raw = with_history(given)
-    clean = cleaned(robot, raw, seed, holdout, progress)
-    train, held, notices = split(clean.data, holdout, seed)
-    if not held.poses:
+    options = DiagnosisOptions(seed, holdout, holdout_by, tuple(exclude), quick)
+    raw = with_groups(with_history(given))
+    held, notices = held_out(raw, holdout, seed, holdout_by)
+    if not held.any():
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
+    with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
+        return examined(Asked(robot, raw, held, options), notices, progress, began)
+
+
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """Arguments of `diagnose`."""
+
+    seed: int
+    holdout: float
+    holdout_by: str | None
+    exclude: tuple[str, ...]
+    quick: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is to be diagnosed.  held: (m,) of the poses as given, True for those no fit may see."""
+
+    robot: Robot
+    data: Measurements
+    held: Array
+    options: DiagnosisOptions
+
+    def train(self, data: Measurements) -> Measurements:
+        """Of some of the rows those that fits may see."""
+        return data.take(~np.isin(data.line, self.data.line[self.held]))
+
+
+def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: float) -> Diagnosis:
+    """The diagnosis of checked measurements.  began: when the work did [s]."""
+    progress("data faults")
+    robot, options = asked.robot, asked.options
+    clean = cleaned(asked, progress)
+    train = asked.train(clean.data)
+    judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
-    causes = causes_of(study, clean.faults, exclude, progress)
-    progress("gap ladder")
-    gap = gap_of(study, raw, clean.data, held, causes, seed, holdout)
-    findings = with_shares([*fault_findings(causes.faults), *causes.effects], gap.steps, gap.floor)
-    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
-    if verdict == "none" and gap.shaky(noise):
-        verdict = "not_repeatable"
-    lies = located(study)
-    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
-    settings = {"seed": seed, "holdout": holdout, "exclude": list(exclude)}
-    told = reasons(
-        verdict, gap.steps, gap.floor, findings, gap.closed, gap.closed_ci, structure_left
+    progress("gap ladder")
+    ladder = climbed(study, [finding.terms for finding in causes.effects], noise)
+    steps = steps_of(asked, study, judges, causes, ladder)
+    floor = floor_of(
+        clean.data,
+        ladder.last.cell.error(clean.data),
+        robot.repeatability,
+        min(noise_mm(study.rows, noise), ladder.last.train.rms_mm),
     )
+    share, interval = closed(ladder, judges, floor, options.seed)
+    effects = valued(causes.effects, ladder)
+    findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
+    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    if verdict == "none" and shaky(floor, noise, steps[-1]):
+        verdict = "not_repeatable"
+    beyond = NOT_ASKED
+    if not options.quick:
+        beyond = beyond_of(study, judges, options.exclude, progress)
+    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
+    settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=told,
+        reasons=reasons(verdict, steps, floor, findings, share, interval, structure_left, beyond),
         findings=tuple(findings),
-        ladder=gap.steps,
-        floor=gap.floor,
-        floor_from=gap.floor_from,
-        closed=gap.closed,
-        closed_ci=gap.closed_ci,
-        blocked=blocked(study, clean.data, gap.cells[-1]),
+        ladder=tuple(steps),
+        floor=floor,
+        closed=share,
+        closed_ci=interval,
+        beyond=beyond,
         noise=float(np.sqrt(noise.variance)),
         jitter=noise.jitter,
         structure=structure_left[1],
         structure_in=structure_left[0],
-        where=lies.to_dict(),
+        where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*given.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
-        provenance=Provenance.of(robot, given, settings),
+        notices=(*asked.data.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
+        provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=clean.data,
-        held=np.isin(clean.data.line, held.line),
-        cells=gap.cells,
+        held=~np.isin(clean.data.line, train.line),
+        cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
     )
+
+
+def steps_of(
+    asked: Asked, study: Study, judges: Judges, causes: Causes, ladder: Ladder
+) -> list[Step]:
+    """The rungs, each judged: faults of the data first, by what they do to a fit."""
+    steps = [judges.step("nominal", study.nominal)]
+    spoilt = dict.fromkeys(f.effect for f in causes.faults if f.effect in FAULTS)
+    first = ladder.fits[0].cell
+    if spoilt:
+        train = asked.train(asked.data)
+        fit = fit_cell(asked.robot, train, SUM, silent)
+        whole = replace(judges, train=train)
+        names = asked.data.target_names
+        steps = [
+            whole.step(name, Cell.of(asked.robot, state, names))
+            for name, state in (("nominal", fit.nominal), ("geometric", fit.state))
+        ]
+    steps.append(judges.step(f"without {' and '.join(spoilt)}" if spoilt else "geometric", first))
+    for number, wider in zip(ladder.taken, ladder.fits[1:], strict=True):
+        term = causes.effects[number].term
+        steps.append(judges.step(f"+ {term.effect} {term.place}", wider.cell))
+    return steps
+
+
+def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
+    """Who judges: every held-out point as measured, those that stand out marked."""
+    held = asked.data.take(asked.held)
+    right = dict(zip(clean.given.line, clean.given.y, strict=True))
+    held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
+    sound = dict(zip(clean.data.line, clean.data.seen, strict=True))
+    nothing = np.zeros(len(held.target_names), dtype=bool)
+    kept = np.array([sound.get(line, nothing) for line in held.line]).T
+    return Judges(train, held, held.seen.T & ~kept)
+
+
+def noise_mm(rows: Rows, noise: Noise) -> float:
+    """RMS distance that a fit takes for noise [mm]."""
+    spread = noise.variance * (1.0 + noise.ratio * rows.variance_ratio).sum() / max(rows.count, 1)
+    return 1e3 * float(np.sqrt(3.0 * spread))
 
 
 def located(study: Study) -> Where:
@@ -147,38 +235,40 @@ def located(study: Study) -> Where:
 class Clean:
     """Measurements with rows and points put right or left out.
 
-    faults: their rows as lines of the file.  remarks: on them, for people.  fit: the geometric fit
-    of the training poses, where it is that of the clean data.
+    given: as measured, but for points that stood in each other's rows.  faults: their rows as lines
+    of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
+    it is that of the clean data.
     """
 
     data: Measurements
+    given: Measurements
     faults: tuple[Fault, ...]
     remarks: tuple[str, ...]
     fit: Solved | None
 
 
-def cleaned(
-    robot: Robot, data: Measurements, seed: int, holdout: float, progress: Progress
-) -> Clean:
+def cleaned(asked: Asked, progress: Progress) -> Clean:
     """The data without the faults that can be mended."""
-    data, exchanged = in_order(robot, data)
+    robot = asked.robot
+    data, exchanged = in_order(robot, asked.data)
     found = find_faults(data)
     sound = mended(data, found)
     check_plausible(robot, sound)
-    train, _, _ = split(sound, holdout, seed)
     progress("geometry")
-    fit = fit_cell(robot, train, SUM, progress)
+    fit = fit_cell(robot, asked.train(sound), SUM, progress)
     error = Cell.of(robot, fit.state, sound.target_names).error(sound)
     more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
+    wrong = wrong_rows(data, Cell.of(robot, fit.state, data.target_names).error(data))
+    points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (
         *exchanged,
-        *in_lines(data, found, "swapped_rows", "outliers"),
-        *in_lines(sound, more, "outliers"),
+        *in_lines(data, found, "swapped_rows"),
+        *(one for one in points if are_wrong(one, wrong, data.line)),
     )
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
-    return Clean(sound, faults, remarks, None if more else fit)
+    return Clean(sound, data, faults, remarks, None if more else fit)
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:

@@ -7,202 +7,225 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import Causes
+from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
 from minimax_cal.diagnosing.result import Finding, Step
-from minimax_cal.diagnosing.study import SUM, Study
-from minimax_cal.evidence.noise import Noise, Rows
-from minimax_cal.fitting.options import silent
-from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.fitting.beyond import without
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.faults import Fault
-from minimax_cal.measuring.grouping import groups, split
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.floor import REPEATS, Floor
+from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.parameters import State
 
 SHAKY = 3.0  # times what the instrument alone would show between visits
-REPEATS = "repeated poses"
-REVISITS = 5  # repeated poses that tell a noise floor
 RESAMPLES = 1000
+FEWEST = 100  # of them that show a gap
+SPARED = 10  # groups of training poses that are left out in turn, for the interval
+HELPS = 1e-6  # relative fall of the error by groups that is one
+FAULTS = ("outliers", "swapped_rows")
+
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Gap:
-    """How far the errors shrink.
+class Ladder:
+    """Geometry, then with each effect that helps.
 
-    steps: accuracy with the nominal robot, with geometry, and with each effect.  cells: from
-    geometry on.  floor: RMS distance that noise alone leaves [mm], floor_from: how it is known.
-    closed: share of the gap that is closed on held-out poses, with its 95 % interval.
+    taken: numbers of the effects that the ladder took.  With the others groups of poses that were
+    left out, or the training poses themselves, are met no better.
     """
 
-    steps: tuple[Step, ...]
-    cells: tuple[Cell, ...]
-    floor: float
-    floor_from: str
-    closed: float
-    closed_ci: tuple[float, float]
+    fits: tuple[Joint, ...]
+    taken: tuple[int, ...]
 
-    def shaky(self, noise: Noise) -> bool:
-        """Whether what is left is mostly that the arm does not come back to the same place."""
-        if self.floor_from != REPEATS:
-            return False
-        instrument = 1e3 * float(np.sqrt(3.0 * noise.variance))
-        return self.floor > max(SHAKY * instrument, self.steps[-1].holdout.rms_mm / SHAKY)
+    @property
+    def last(self) -> Joint:
+        """With every effect taken."""
+        return self.fits[-1]
 
 
-def gap_of(
-    study: Study,
-    raw: Measurements,
-    sound: Measurements,
-    held: Measurements,
-    causes: Causes,
-    seed: int,
-    holdout: float,
-) -> Gap:
-    """The gap on poses that no fit has seen.  raw, sound: before and after faults were mended."""
-    steps, error = geometric_steps(study, raw, held, causes.faults, seed, holdout)
-    cells = [study.geometric]
-    terms: list[Term] = []
-    for effect in causes.effects:
-        terms += effect.terms
-        cells.append(study.cell(study.data, terms))
-        label = f"+ {effect.term.effect} {effect.term.place}"
-        steps.append(step_of(label, cells[-1], study.data, held))
-    noise = causes.choice.noise
-    floor, source = noise_floor(study.rows, noise, sound, cells[-1], steps[-1].train)
-    closed, interval = closed_share(error, cells[-1].error(held), floor, seed)
-    return Gap(tuple(steps), tuple(cells), floor, source, closed, interval)
+def folds(data: Measurements, count: int) -> Array:
+    """(m,) number of a fold, groups of poses together, at random."""
+    group = clusters(data)
+    order = np.random.default_rng(0).permutation(int(group.max()) + 1)
+    return np.asarray(order[group] % count)
 
 
-def step_of(name: str, cell: Cell, train: Measurements, held: Measurements) -> Step:
-    """A rung: the accuracy of a cell."""
-    return Step(name, accuracy(cell.error(train)), accuracy(cell.error(held)))
+def climbed(study: Study, effects: Sequence[Sequence[Term]], noise: Noise) -> Ladder:
+    """The ladder of a study's effects, in their order."""
+    part = folds(study.data, FOLDS)
+    fits, taken = [joint(study, (), noise)], []
+    spared = fits[0].spared([part == number for number in range(FOLDS)])
+    square = fits[0].cross_validated(spared)
+    for number, terms in enumerate(effects):
+        wide = joint(study, (*fits[-1].terms, *terms), noise)
+        new = wide.cross_validated(spared)
+        if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
+            fits.append(wide)
+            taken.append(number)
+            square = new
+    return Ladder(tuple(fits), tuple(taken))
 
 
-def geometric_steps(
-    study: Study,
-    raw: Measurements,
-    held: Measurements,
-    faults: Sequence[Fault],
-    seed: int,
-    holdout: float,
-) -> tuple[list[Step], Array]:
-    """The rungs up to geometry, and the geometric errors of the held-out poses (k, m, 3) [m].
+def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
+    """The findings that a ladder took, with values and sigmas of its last fit."""
+    out, at, last = [], 0, ladder.last
+    geometric = last.model.names.geometric
+    sigma = last.uncertainty.sigma[geometric:] if ladder.taken else np.zeros(0)
+    for finding in [findings[number] for number in ladder.taken]:
+        own = slice(at, at + len(finding.values))
+        at = own.stop
+        values, sure = last.state.effects[own].tolist(), sigma[own].tolist()
+        out.append(replace(finding, values=tuple(values), sigmas=tuple(sure)))
+    return out
 
-    Faults in the data come first: what they do to a fit and to its judgement.
+
+# ---- accuracy ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Judges:
+    """Poses that judge: those of the fit, those held out, and points held out that stand out.
+
+    far: (k, m) True for points of `held` that no sound arm shows.
     """
-    train, geometric = study.data, study.geometric
-    mended_faults = dict.fromkeys(f.effect for f in faults if f.effect != "readback")
-    if not mended_faults:
-        nominal = step_of("nominal", study.nominal, train, held)
-        return [nominal, step_of("geometric", geometric, train, held)], geometric.error(held)
-    first, rest, _ = split(raw, holdout, seed)
-    fit = fit_cell(study.robot, first, SUM, silent)
-    start, wrong = (
-        Cell.of(study.robot, state, raw.target_names) for state in (fit.nominal, fit.state)
-    )
-    steps = [
-        step_of("nominal", start, first, rest),
-        step_of("geometric", wrong, first, rest),
-        step_of(f"without {' and '.join(mended_faults)}", geometric, train, held),
-    ]
-    return steps, wrong.error(rest)
+
+    train: Measurements
+    held: Measurements
+    far: Array
+
+    @property
+    def everyone(self) -> Measurements:
+        """All poses in the order of the file, held-out points that stand out left out."""
+        y = np.where(self.far.T[..., None], np.nan, self.held.y)
+        whole = both(self.train, self.held.with_y(y))
+        whole = whole.take(np.argsort(whole.line, kind="stable"))
+        return whole.take(np.asarray(whole.seen.any(axis=1)))
+
+    def step(self, name: str, cell: Cell) -> Step:
+        """A rung: the accuracy of a cell."""
+        every, trusted = cell.error(self.held), self.errors(cell)
+        return Step(name, accuracy(cell.error(self.train)), accuracy(every), accuracy(trusted))
+
+    def errors(self, cell: Cell) -> Array:
+        """(k, m, 3) of a cell at the held-out poses, NaN for what stands out [m]."""
+        return np.where(self.far[..., None], np.nan, cell.error(self.held))
+
+
+def both(one: Measurements, other: Measurements) -> Measurements:
+    """The rows of two parts of one file."""
+    return replace(
+        one,
+        q=np.concatenate([one.q, other.q]),
+        y=np.concatenate([one.y, other.y]),
+        line=np.concatenate([one.line, other.line]),
+        columns={name: np.concatenate([column, other.columns[name]])
+                 for name, column in one.columns.items()},
+        unknown={},
+    )  # fmt: skip
 
 
 def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float) -> list[Finding]:
     """Findings with the held-out RMS before and after, and their shares of the gap, largest first.
 
-    Faults that are mended share the first step after geometry.
+    Faults that are mended share the first step after geometry.  Points that stand out judge none.
     """
-    gap = max(steps[1].holdout.rms_mm ** 2 - floor**2, 1e-12)
+    gap = max(steps[1].trusted.rms_mm ** 2 - floor**2, 1e-12)
     out, at = [], 1
-    mendable = [f for f in findings if f.term.effect in ("outliers", "swapped_rows")]
+    mendable = [f for f in findings if f.term.effect in FAULTS]
     for found in findings:
-        if found.term.effect == "readback":
+        fault = found in mendable
+        if not fault and found.term.effect == "readback":
             out.append(found)
             continue
-        fault = found in mendable
         low = 2 if fault else (at + 1 if at > 1 or not mendable else 3)
-        before, after = steps[low - 1].holdout.rms_mm, steps[low].holdout.rms_mm
+        before, after = steps[low - 1].trusted.rms_mm, steps[low].trusted.rms_mm
         at = low if not fault or found is mendable[-1] else at
         share = (before**2 - after**2) / gap / (len(mendable) if fault else 1)
         out.append(replace(found, before=before, after=after, share=share))
     return sorted(out, key=lambda f: -f.share if np.isfinite(f.share) else -np.inf)
 
 
-def noise_floor(
-    rows: Rows, noise: Noise, data: Measurements, cell: Cell, fitted: Accuracy
-) -> tuple[float, str]:
-    """RMS distance that noise alone leaves [mm], and how it is known.
+def shaky(floor: Floor, noise: Noise, last: Step) -> bool:
+    """Whether what is left is mostly that the arm does not come back to the same place."""
+    if floor.source != REPEATS:
+        return False
+    instrument = 1e3 * float(np.sqrt(3.0 * noise.variance))
+    return floor.value > max(SHAKY * instrument, last.trusted.rms_mm / SHAKY)
 
-    From poses visited again, with the effects of time and approach taken out, where there are
-    enough; from the noise of the final fit where that is less, because nobody repeats better.
-    Where the fit still has structure it is an upper bound.  fitted: of the final fit.
-    """
-    spread = noise.variance * (1.0 + noise.ratio * rows.variance_ratio).sum() / max(rows.count, 1)
-    model = min(1e3 * float(np.sqrt(3.0 * spread)), fitted.rms_mm)
-    group = groups(data)
-    error = np.moveaxis(cell.error(data), 1, 0).reshape(data.poses, -1)
-    total, dof, again = 0.0, 0, 0
-    names, counts = np.unique(group, return_counts=True)
-    for name in names[counts > 1]:
-        mine = error[group == name]
-        whole = np.isfinite(mine).all(axis=0)
-        off = mine[:, whole] - mine[:, whole].mean(axis=0)
-        total += float((off**2).sum())
-        dof += (len(mine) - 1) * int(whole.sum())
-        again += len(mine) - 1
-    if again >= REVISITS and dof:
-        revisits = 1e3 * float(np.sqrt(3.0 * total / dof))
-        if revisits < model:
-            return revisits, REPEATS
-    return model, "noise of the fit"
+
+# ---- how much is closed ------------------------------------------------------------------------
+
+
+def closed(ladder: Ladder, judges: Judges, floor: Floor, seed: int) -> tuple[float, Ends]:
+    """Share of the gap that a ladder closes on held-out poses, and its 95 % interval."""
+    before, after = (judges.errors(fit.cell) for fit in (ladder.fits[0], ladder.last))
+    variance, rng = spared(ladder, judges, floor), np.random.default_rng(seed)
+    return closed_share(before, after, clusters(judges.held), floor, variance, rng)
 
 
 def closed_share(
-    before: Array, after: Array, floor: float, seed: int
-) -> tuple[float, tuple[float, float]]:
-    """Share of the gap that is closed on held-out poses, and its 95 % interval over poses.
+    before: Array,
+    after: Array,
+    group: Array,
+    floor: Floor,
+    variance: float,
+    rng: np.random.Generator,
+) -> tuple[float, Ends]:
+    """Share of the gap that is closed, and its 95 % interval.
 
     1 - (after^2 - floor^2) / (before^2 - floor^2) of the RMS distances; NaN where there is no gap.
-    before, after: (k, m, 3) errors [m], of the same poses if no rows were left out.
+    Groups of poses and the floor are drawn anew; what other poses of the fit would change is the
+    variance.  before, after: (k, m, 3) errors of the same poses [m].  group: (m,).
     """
-    sums = []
-    for error in (before, after):
-        squares = np.nansum(1e6 * (error**2).sum(axis=-1), axis=0)
-        sums.append(np.stack([squares, np.isfinite(error[..., 0]).sum(axis=0)]))
-
-    def share(first: Array, last: Array) -> Array:
-        gap = first[0] / np.maximum(first[1], 1) - floor**2
-        rest = last[0] / np.maximum(last[1], 1) - floor**2
-        return np.where(gap > 0.0, 1.0 - rest / np.where(gap > 0.0, gap, 1.0), np.nan)
-
-    rng = np.random.default_rng(seed)
-    drawn = [rng.integers(0, part.shape[1], (RESAMPLES, part.shape[1])) for part in sums]
-    if sums[0].shape == sums[1].shape:
-        drawn[1] = drawn[0]
-    spread = share(*(part[:, rows].sum(axis=-1) for part, rows in zip(sums, drawn, strict=True)))
-    spread = spread[np.isfinite(spread)]
-    if not len(spread):
-        return float("nan"), (float("nan"), float("nan"))
-    low, high = np.quantile(spread, (0.025, 0.975))
-    return float(share(*(part.sum(axis=1) for part in sums))), (float(low), float(high))
+    pair = [sums(error) for error in (before, after)]
+    share = float(share_of([part.sum(axis=1) for part in pair], np.array([floor.least]))[0])
+    if not np.isfinite(share):
+        return share, (share, share)
+    group = np.unique(group, return_inverse=True)[1].reshape(-1)
+    count = int(group.max()) + 1
+    whole = [np.stack([np.bincount(group, row, count) for row in part]) for part in pair]
+    rows = rng.integers(0, count, (RESAMPLES, count))
+    drawn = share_of([part[:, rows].sum(axis=-1) for part in whole], floor.drawn(RESAMPLES, rng))
+    drawn = drawn[np.isfinite(drawn)]
+    if len(drawn) < FEWEST:
+        return share, (float("nan"), float("nan"))
+    middle = float(np.median(drawn))
+    grow = np.sqrt(1.0 + variance / max(float(np.var(drawn)), 1e-300))
+    low, high = middle + grow * (np.quantile(drawn, (0.025, 0.975)) - middle)
+    return share, (float(min(low, share)), float(max(high, share)))
 
 
-def blocked(study: Study, data: Measurements, cell: Cell) -> dict[str, float | None]:
-    """RMS on the last fifth of the session, fitted to what came before [mm].
+def sums(error: Array) -> Array:
+    """(2, m) sum of squares [mm^2] and number of points of each pose.  error: (k, m, 3) [m]."""
+    squares = np.nansum(1e6 * (error**2).sum(axis=-1), axis=0)
+    return np.stack([squares, np.isfinite(error[..., 0]).sum(axis=0)])
 
-    A random choice of held-out poses does not show what drifts; this does.
-    """
-    terms, values = cell.effects.terms, np.concatenate([np.zeros(0), *cell.effects.values])
-    clock = data.columns["clock"]
-    late = clock > np.quantile(clock, 0.8)
-    first, last = data.take(~late), data.take(late)
-    out: dict[str, float | None] = {"last_poses": last.poses}
-    if last.poses and first.poses > 3 * last.poses:
-        geometric = accuracy(study.cell(first).error(last)).rms_mm
-        usual = 3.0 * np.abs(values)
-        final = accuracy(study.cell(first, terms, usual).error(last)).rms_mm if terms else geometric
-        out |= {"geometric_rms_mm": geometric, "final_rms_mm": final}
-    return out
+
+def share_of(pair: Sequence[Array], floor: Array) -> Array:
+    """Share of the gap closed, NaN where there is none.  pair: sums and counts (2, ...) [mm^2]."""
+    gap, rest = (part[0] / np.maximum(part[1], 1) - floor**2 for part in pair)
+    return np.where(gap > 0.0, 1.0 - rest / np.where(gap > 0.0, gap, 1.0), np.nan)
+
+
+def spared(ladder: Ladder, judges: Judges, floor: Floor) -> float:
+    """Variance of the share closed that the choice of training poses brings: a jackknife."""
+    part = folds(judges.train, SPARED)
+    masks = [part == number for number in range(SPARED)]
+    shares = []
+    fits = [without(fit.estimator, fit.state, masks) for fit in (ladder.fits[0], ladder.last)]
+    for states in zip(*fits, strict=True):
+        if states[0] is None or states[1] is None:
+            continue
+        pair = [
+            sums(judges.errors(fit.with_state(state))).sum(axis=1)
+            for fit, state in zip((ladder.fits[0], ladder.last), states, strict=True)
+            if isinstance(state, State)
+        ]
+        shares.append(float(share_of(pair, np.array([floor.least]))[0]))
+    known = np.array([share for share in shares if np.isfinite(share)])
+    return float((len(known) - 1) * np.var(known)) if len(known) > 2 else 0.0

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite, json_text, number, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
@@ -150,11 +152,15 @@ class Finding:
 
 @dataclass(frozen=True)
 class Step:
-    """One rung of the gap ladder: accuracy on the training and on the held-out poses."""
+    """One rung of the gap ladder: accuracy on the training and on the held-out poses.
+
+    trusted: on the held-out points that do not stand out.
+    """
 
     name: str
     train: Accuracy
     holdout: Accuracy
+    trusted: Accuracy
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,8 +169,8 @@ class Diagnosis:
 
     status: of the geometric fit.  verdict: one of VERDICTS.  reasons: one sentence each, why.
     findings: by share of the gap.
-    ladder: nominal, geometric, then with each effect.  blocked: held-out RMS where the last part
-    of the session is held out instead [mm].  floor: RMS that noise alone would leave [mm].
+    ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
+    sought anew without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, with its interval.
     noise: of a coordinate [m].  jitter: of a joint [rad].
     structure: probability that what remains is unrelated to pose and time.
@@ -179,11 +185,10 @@ class Diagnosis:
     reasons: tuple[str, ...]
     findings: tuple[Finding, ...]
     ladder: tuple[Step, ...]
-    floor: float
-    floor_from: str
+    floor: Floor
     closed: float
     closed_ci: tuple[float, float]
-    blocked: Mapping[str, float | None]
+    beyond: Beyond
     noise: float
     jitter: float
     structure: float
@@ -232,10 +237,10 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
 
-        def held(kind: str) -> dict[str, float | None]:
+        def held(kind: str, of: str = "holdout") -> dict[str, float | None]:
             chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
                       "final": self.ladder[-1]}  # fmt: skip
-            return {k: finite(getattr(step.holdout, kind)) for k, step in chosen.items()}
+            return {k: finite(getattr(getattr(step, of), kind)) for k, step in chosen.items()}
 
         return {
             "schema": SCHEMA,
@@ -248,8 +253,11 @@ class Diagnosis:
             "gap": {
                 "holdout_rms_mm": held("rms_mm"),
                 "holdout_max_mm": held("max_mm"),
-                "noise_floor_mm": finite(self.floor),
-                "noise_floor_from": self.floor_from,
+                "trusted_rms_mm": held("rms_mm", "trusted"),
+                "beyond": self.beyond.to_dict(),
+                "noise_floor_mm": finite(self.floor.value),
+                "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
+                "noise_floor_from": self.floor.source,
                 "closed": finite(self.closed),
                 "closed_ci95": [finite(value) for value in self.closed_ci],
                 "ladder": [
@@ -257,10 +265,10 @@ class Diagnosis:
                         "step": step.name,
                         "train": step.train.to_dict(),
                         "holdout": step.holdout.to_dict(),
+                        "trusted": step.trusted.to_dict(),
                     }
                     for step in self.ladder
                 ],
-                "blocked": dict(self.blocked),
             },
             "noise": {
                 "instrument_mm": finite(1e3 * self.noise),
@@ -313,7 +321,8 @@ class Diagnosis:
              step.holdout.max_mm)
             for step in self.ladder
         ]  # fmt: skip
-        rows.append((f"noise floor ({self.floor_from})", self.floor, "", self.floor, ""))
+        floor = self.floor.value
+        rows.append((f"noise floor ({self.floor.source})", floor, "", floor, ""))
         return Table(
             f"{self.robot}: the gap, step by step",
             ("model", "train RMS mm", "train max mm", "held-out RMS mm", "held-out max mm"),
@@ -368,8 +377,8 @@ class Diagnosis:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""
-        every = (self.ladder_table(), self.effects_table(), self.parameter_table(),
-                 self.rival_table(), self.untestable_table())  # fmt: skip
+        every = (self.ladder_table(), self.beyond.table(), self.effects_table(),
+                 self.parameter_table(), self.rival_table(), self.untestable_table())  # fmt: skip
         return tuple(table for table in every if table.rows)
 
     def headline(self) -> str:

@@ -12,10 +12,18 @@ from pydantic import Field
 from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.fit_file import ScoresPart, TableParameter, in_si, measured_poses
+from minimax_cal.fitting.fit_file import (
+    EARLIER,
+    BeyondPart,
+    ScoresPart,
+    TableParameter,
+    in_si,
+    measured_poses,
+)
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import numbers
 from minimax_cal.ground.records import AGAIN, UNKNOWN, Ends, Number, Part, Recorded, checked
+from minimax_cal.measuring.floor import Floor
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
@@ -71,17 +79,25 @@ class RungPart(Part):
     step: str
     train: ScoresPart
     holdout: ScoresPart
+    trusted: ScoresPart | None = None
+
+    def rung(self) -> Step:
+        """As the code has it."""
+        held = self.holdout.accuracy()
+        trusted = self.trusted.accuracy() if self.trusted else held
+        return Step(self.step, self.train.accuracy(), held, trusted)
 
 
 class GapPart(Part):
     """The gap, how far it closes, and what noise would leave."""
 
     noise_floor_mm: Number = math.nan
+    noise_floor_range_mm: Ends = UNKNOWN
     noise_floor_from: str = ""
     closed: Number = math.nan
     closed_ci95: Ends = UNKNOWN
     ladder: Annotated[tuple[RungPart, ...], Field(min_length=2)]
-    blocked: dict[str, Number] = Field(default_factory=dict)
+    beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
 
 
 class NoisePart(Part):
@@ -180,15 +196,13 @@ def assembled(
         verdict=part.verdict,
         reasons=part.reasons,
         findings=tuple(finding.finding(fitted) for finding in part.effects),
-        ladder=tuple(
-            Step(rung.step, rung.train.accuracy(), rung.holdout.accuracy())
-            for rung in part.gap.ladder
+        ladder=tuple(rung.rung() for rung in part.gap.ladder),
+        floor=Floor(
+            part.gap.noise_floor_mm, *part.gap.noise_floor_range_mm, part.gap.noise_floor_from
         ),
-        floor=part.gap.noise_floor_mm,
-        floor_from=part.gap.noise_floor_from,
         closed=part.gap.closed,
         closed_ci=part.gap.closed_ci95,
-        blocked={key: None if math.isnan(x) else x for key, x in part.gap.blocked.items()},
+        beyond=part.gap.beyond.beyond(),
         noise=1e-3 * part.noise.instrument_mm,
         jitter=1e-3 * part.noise.joint_jitter_mrad,
         structure=part.structure.p,

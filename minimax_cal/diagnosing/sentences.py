@@ -7,15 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.result import Finding, Step
+from minimax_cal.fitting.beyond import Beyond
+from minimax_cal.measuring.floor import Floor
 
 
-def opening(ladder: Sequence[Step], floor: float) -> str:
+def opening(ladder: Sequence[Step], floor: Floor) -> str:
     """What geometry alone does."""
     nominal, geometric = ladder[0].holdout, ladder[1].holdout
+    most = "" if floor.certain else "at most "
     return (
         f"On poses that no fit has seen, the nominal robot misses by {nominal.rms_mm:.3f} mm RMS, "
         f"the geometrically calibrated one by {geometric.rms_mm:.3f} mm (largest "
-        f"{geometric.max_mm:.3f} mm); noise alone would leave {floor:.3f} mm."
+        f"{geometric.max_mm:.3f} mm); noise alone would leave {most}{floor.value:.3f} mm "
+        f"({floor.source})."
     )
 
 
@@ -49,11 +53,12 @@ def advice(finding: Finding) -> list[str]:
 def reasons(
     verdict: str,
     ladder: Sequence[Step],
-    floor: float,
+    floor: Floor,
     findings: Sequence[Finding],
     closed: float,
     interval: tuple[float, float],
     structure: tuple[str, float],
+    beyond: Beyond,
 ) -> tuple[str, ...]:
     """The verdict and why, in sentences.  structure: where most of it is, and its probability."""
     out = [opening(ladder, floor)]
@@ -84,6 +89,13 @@ def reasons(
             "The arm does not return to the same place when a pose is repeated, and no known "
             "effect of time, load or approach explains it."
         )
+    if beyond.worst:
+        out.append(beyond.sentence())
+        if beyond.typical_mm > beyond.geometric_typical_mm:
+            out.append(
+                f"There geometry alone does better ({beyond.geometric_typical_mm:.3f} mm): the "
+                "effects do not carry over to places that were not measured."
+            )
     for finding in findings:
         out += advice(finding)
     return tuple(out)

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import solve_triangular
+from scipy.special import fdtrc
 
-from minimax_cal.evidence.library import Candidate, Library, Stack
+from minimax_cal.evidence.library import Aside, Candidate, Library
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.evidence.products import within
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.table import EFFECTS
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
 SAME = 1e-12  # added to products of unit columns where some are the same
@@ -132,11 +132,31 @@ class Bench:
     @cached_property
     def everyone(self) -> list[Added]:
         """Every candidate of the library, the best first."""
-        return self.ranked(self.library.candidates)
+        found = self.ranked(self.library.candidates)
+        if self.library.lines is not None:
+            found += self.lines.ranked(self.library.lines.candidates)
+        return sorted(found, key=lambda one: -one.evidence)
+
+    @cached_property
+    def lines(self) -> Bench:
+        """The bench for the library's lines."""
+        return self.beside(self.library.lines or self.library.aside(()))
+
+    def knows(self, c: Candidate) -> bool:
+        """Whether the candidate was stored, or one of the lines, when this bench was made."""
+        return max(c.main) < self.settings.pull.shape[1] or self.line(c) is not None
+
+    def line(self, c: Candidate) -> Candidate | None:
+        """The line that was stored as a candidate later."""
+        lines = self.library.lines.candidates if self.library.lines else ()
+        return next((one for one in lines if one.term.text == c.term.text), None)
 
     def added(self, c: Candidate) -> Added:
         """A candidate beside what was chosen, at its best ratio."""
-        return self.compared([c])[0]
+        line = self.line(c)
+        if line is None:
+            return self.compared([c])[0]
+        return replace(self.lines.compared([line])[0], candidate=c)
 
     def ranked(self, among: Sequence[Candidate]) -> list[Added]:
         """Candidates by evidence."""
@@ -168,17 +188,14 @@ class Bench:
         d = len(one.candidate.main)
         free = max(self.dof - d, 1)
         ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d
-        return float(min(1.0, stats.f.sf(ratio, d, free) * self.tries * one.candidate.tries))
+        return float(min(1.0, fdtrc(d, free, ratio) * self.tries * one.candidate.tries))
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
-        main, rival = one.candidate.main, np.concatenate([other.main, other.doubt])
-        index = np.concatenate([main, rival])
         at = int(np.argmax(self.settings.ratios == one.ratio))
-        own = self.library.products.clear(index) * np.sqrt(self.fixed.weights[at])
-        part = self.settings.part[at, index]
-        both = own @ own.T - part @ part.T
-        d = len(main)
+        d = len(one.candidate.main)
+        fields = [self.library.fields(one.candidate)[:d], self.library.fields(other)]
+        both = self.fixed.gram(np.concatenate(fields), at)
         size = float(one.value @ both[:d, :d] @ one.value)
         across = one.value @ both[:d, d:]
         scale = np.sqrt(np.maximum(np.diag(both)[d:], 1e-300))
@@ -186,22 +203,18 @@ class Bench:
         shared = float((across / scale) @ inverse @ (across / scale))
         return size / one.variance, min(shared / max(size, 1e-300), 1.0)
 
-    def beside(self, terms: Sequence[Term]) -> Bench:
-        """A bench for other terms, which belong to no library yet."""
-        lib = self.library
-        stack = Stack(lib.scene, lib.rows)
-        found = tuple(c for c in map(stack.add, terms) if c is not None)
-        raw = stack.columns
-        columns, weights = lib.products.columns.cleared(raw), self.fixed.weights
-        part, pull = self.fixed.projected(columns)
+    def beside(self, aside: Aside) -> Bench:
+        """The bench for candidates that are not stored, instead of those that are."""
+        weights = self.fixed.weights
+        part, pull = self.fixed.projected(aside.clear)
         settings = replace(
             self.settings,
             part=part,
             pull=pull,
-            whole=weights @ raw**2,
-            own=lambda index: np.moveaxis(within(columns[index], weights), -1, 0),
+            whole=(weights @ aside.raw**2),
+            own=lambda index: np.moveaxis(within(aside.clear[index], weights), -1, 0),
         )
-        return replace(self, library=replace(lib, candidates=found), settings=settings)
+        return replace(self, settings=settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +230,12 @@ class Fixed:
     weights: Array
     before: Array
     error: Array
+
+    def gram(self, columns: Array, at: int) -> Array:
+        """(d, d) products of columns (d, N), projected, at one of the ratios."""
+        own = columns * self.weights[at]
+        part = solve_triangular(self.factors[at], self.rows @ own.T, lower=True)
+        return np.asarray(own @ columns.T - part.T @ part)
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
@@ -253,20 +272,20 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     noise, dof = products.noise(main), products.dof(main)
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
-    p = products.columns.fixed - 1
-    across, whole = products.across(ratios, index)
-    turn = block_diag(products.span, np.eye(len(index)))
-    fixed = turn.T @ np.delete(across, p, axis=1)
-    gram = fixed[:, :, np.concatenate([np.arange(p), p + 1 + index])] @ turn
-    r = products.span.shape[1] + len(main)
-    gram[:, range(r, len(turn.T)), range(r, len(turn.T))] += ridge * noise.variance  # a prior
+    p, fit = products.columns.fixed - 1, products.span.shape[1]
+    fixed, error, whole = products.across(ratios, index)
+    gram = np.concatenate(
+        [products.told_apart(fixed[:, :, :p], axis=2), fixed[:, :, p + 1 + index]], axis=2
+    )
+    r = fit + len(main)
+    gram[:, range(r, r + len(loose)), range(r, r + len(loose))] += ridge * noise.variance  # a prior
     factors = triangles(gram)
     part = np.stack([
         solve_triangular(factor, lines[:, p:], lower=True, check_finite=False).T
         for factor, lines in zip(factors, fixed, strict=True)
     ])  # fmt: skip
     before, part = part[:, 0], part[:, 1:]
-    square = across[:, p, p]
+    square = error[:, p]
     total = np.maximum(square - (before**2).sum(axis=1), ROUNDING * square + 1e-300)
     size = np.einsum("sff->sf", factors)[:, :r]
     spread = np.log1p(ratios[:, None] * lib.rows.variance_ratio[products.kept]).sum(axis=1)
@@ -274,16 +293,17 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         ratios=ratios,
         part=part,
         before=before,
-        pull=across[:, p, p + 1 :] - (part @ before[..., None])[..., 0],
+        pull=error[:, p + 1 :] - (part @ before[..., None])[..., 0],
         total=total,
         whole=whole,
         logs=spread + 2.0 * np.log(size).sum(axis=1),
         own=lambda index: products.among(ratios, index),
     )
-    rows = turn.T @ np.concatenate([products.columns.clear[:p], products.clear(index)])
+    geometry = products.told_apart(products.columns.clear[:p], axis=0)
+    rows = np.concatenate([geometry, products.clear(index)])
     weights = products.kept / (1.0 + np.outer(ratios, lib.rows.variance_ratio))
     held = Fixed(rows, factors, weights, before, lib.rows.error)
-    return Bench(lib, tuple(chosen), noise, settings, held, dof, float(len(lib.candidates)))
+    return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.count))
 
 
 def triangles(gram: Array) -> Array:

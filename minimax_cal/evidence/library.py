@@ -37,11 +37,28 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
+class Aside:
+    """Candidates whose columns are stored nowhere: each is compared a few times only.
+
+    raw: (N, d) their columns.  clear: (d, N) what geometry does not imitate of them.
+    """
+
+    candidates: tuple[Candidate, ...]
+    raw: Array
+    clear: Array
+
+    def holds(self, c: Candidate) -> bool:
+        """Whether a candidate's columns are these."""
+        return any(c is one for one in self.candidates)
+
+
+@dataclass(frozen=True, eq=False)
 class Library:
     """All candidates that these data can test.
 
     products: of their columns, which all libraries of the same data share.  untestable: effect and
-    what the data lack.  found: candidates added later, by the text of their terms.
+    what the data lack.  found: candidates stored later, by the text of their terms.  lines: of
+    gears, as the last search found them.
     """
 
     scene: Scene
@@ -50,6 +67,7 @@ class Library:
     candidates: tuple[Candidate, ...]
     untestable: tuple[tuple[str, str], ...] = ()
     found: dict[str, Candidate] = field(default_factory=dict)
+    lines: Aside | None = None
 
     @staticmethod
     def empty(scene: Scene, rows: Rows) -> Library:
@@ -73,6 +91,33 @@ class Library:
         self.products.columns.append(stack.columns)
         return out
 
+    def aside(self, terms: Sequence[tuple[Term, float]]) -> Aside:
+        """Candidates of further terms that are not stored.  terms: with their tries."""
+        stack = Stack(self.scene, self.rows)
+        found = (stack.add(term, tries) for term, tries in terms)
+        candidates = tuple(c for c in found if c is not None)
+        return Aside(candidates, stack.columns, self.products.columns.cleared(stack.columns))
+
+    def stored(self, c: Candidate) -> tuple[Library, Candidate]:
+        """The library with a candidate among those stored, and the candidate there."""
+        if self.lines is None or not self.lines.holds(c):
+            return self, c
+        found = self.with_terms([(c.term, c.tries)])[0]
+        rest = replace(self.lines, candidates=tuple(o for o in self.lines.candidates if o is not c))
+        return replace(self, candidates=(*self.candidates, found), lines=rest), found
+
+    def fields(self, c: Candidate) -> Array:
+        """(d + r, N) what geometry does not imitate of a candidate's columns and their doubts."""
+        index = np.concatenate([c.main, c.doubt])
+        if self.lines is not None and self.lines.holds(c):
+            return np.asarray(self.lines.clear[index])
+        return self.products.clear(index)
+
+    @property
+    def count(self) -> int:
+        """How many candidates there are."""
+        return len(self.candidates) + (len(self.lines.candidates) if self.lines else 0)
+
     def only(self, poses: Array) -> Library:
         """The library for some of the poses, of which the others' columns are taken away.
 
@@ -84,10 +129,9 @@ class Library:
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""
         products, count = self.products, self.products.columns.count
-        across, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
-        fixed = products.columns.fixed
+        across, _, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
         own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
-        left = own - ((products.span.T @ across[0, : fixed - 1, fixed:]) ** 2).sum(axis=0)
+        left = own - (across[0, :, products.columns.fixed :] ** 2).sum(axis=0)
         clear = left > FAINT * whole[0]
         shown = tuple(c for c in self.candidates if clear[c.main].all())
         gone = {c.term.effect for c in self.candidates} - {c.term.effect for c in shown}

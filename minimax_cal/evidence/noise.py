@@ -123,6 +123,18 @@ class Noise:
         return np.asarray(1.0 / (self.variance * (1.0 + self.ratio * rows.variance_ratio)))
 
 
+def remaining(rows: Rows, weight: Array, known: Array) -> Array:
+    """(N,) what the weighted least squares on geometry and known columns leaves of the error [m].
+
+    weight: (N,) inverse variances, 0 for rows that are not fitted.  known: (N, q).
+    """
+    columns = np.concatenate([rows.basis, known], axis=1)
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    gram = columns.T @ (columns * weight[:, None])
+    value = np.linalg.lstsq(gram, columns.T @ (weight * rows.error), rcond=1e-12)[0]
+    return np.asarray(rows.error - columns @ value)
+
+
 def restricted(rows: Rows, known: Array) -> Noise:
     """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)

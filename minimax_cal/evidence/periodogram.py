@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
 from minimax_cal.modelling.effects.scene import Scene
@@ -12,16 +12,6 @@ from minimax_cal.modelling.effects.table import Term
 
 SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has fewer teeth
 DENSITY = 4.0  # frequencies tried for each one that is independent
-
-
-def leftover(rows: Rows, weight: Array, known: Array) -> Array:
-    """(N,) weighted residual W r of the generalised least squares on geometry and known columns."""
-    columns = np.concatenate([rows.basis, known], axis=1)
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    columns = columns / scale
-    gram = columns.T @ (columns * weight[:, None])
-    value = np.linalg.lstsq(gram, columns.T @ (weight * rows.error), rcond=1e-12)[0]
-    return np.asarray(weight * (rows.error - columns @ value))
 
 
 def strongest_lines(
@@ -38,7 +28,7 @@ def strongest_lines(
     known: (N, q) columns that are fitted already.  kept: (N,) rows that count, None for all.
     """
     weight = noise.weights(rows) * (1.0 if kept is None else kept)
-    pull = leftover(rows, weight, known)
+    pull = weight * remaining(rows, weight, known)
     arms = rows.of(scene.jacobian)
     poses = scene.poses
     found = []

@@ -8,10 +8,8 @@ products of some poses are those of all poses less those of the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -20,6 +18,7 @@ from minimax_cal.evidence.noise import FREE, RATIOS, Noise, Rows, likeliest, tol
 from minimax_cal.ground.arrays import Array
 
 NODES = 20  # points in a decade of ratios; as many ratios asked for pay for them
+ALL = slice(None)
 ANGLES = np.pi * (2.0 * np.arange(NODES) + 1.0) / (2.0 * NODES)
 
 
@@ -73,32 +72,23 @@ def grown(store: Array, count: int) -> Array:
     return more
 
 
-class Summed(Protocol):
-    """Products at some ratios."""
-
-    def across(self, index: Array) -> Array:
-        """(f, g, D) products of some columns with all."""
-
-    def square(self, index: Array) -> Array:
-        """(g, f, f) products among some columns."""
-
-    def among(self, index: Array) -> Array:
-        """(c, d, d, g) products within each of c sets of columns (c, d)."""
-
-    def squares(self) -> Array:
-        """(D, g) squares of candidates' columns as they are."""
-
-
 class Sums:
     """Products at some ratios, summed over some rows, each formed when it is first asked for.
 
-    ratios: (g,).  rows: of the sums, all or an array of numbers.  once: asked for once only.
+    ratios: (g,).  rows: of the sums, all or some.  total: sums that are taken less these.
+    once: whether they are asked for only once.
     """
 
     def __init__(
-        self, columns: Columns, ratios: Array, rows: slice | Array, *, once: bool = False
+        self,
+        columns: Columns,
+        ratios: Array,
+        rows: slice | Array = ALL,
+        total: Sums | None = None,
+        *,
+        once: bool = False,
     ) -> None:
-        self.columns, self.rows, self.once = columns, rows, once
+        self.columns, self.rows, self.total, self.once = columns, rows, total, once
         spread = columns.rows.variance_ratio[rows]
         self.weights = 1.0 / (1.0 + np.outer(ratios, spread))  # (g, N)
         self.lines: dict[int, Array] = {}
@@ -122,21 +112,26 @@ class Sums:
     def form(self, index: Array) -> None:
         """Form the products of some columns with all that are there."""
         width = len(self.columns.clear)
-        short = sorted((self.width(i), int(i)) for i in index if self.width(i) < width)
+        once = {int(i) for i in index}  # two of the chosen may share a column
+        short = sorted((self.width(i), i) for i in once if self.width(i) < width)
         for start, group in groupby(short, key=lambda one: one[0]):
             members = [i for _, i in group]
-            new = self.between(members, self.columns.clear[start:, self.rows])
+            new = self.between(members, start)
             for i, line in zip(members, new, strict=True):
                 self.lines[i] = np.concatenate([self.lines[i], line], axis=1) if start else line
 
-    def between(self, members: list[int], there: Array) -> Array:
-        """(f, g, d) products of some columns with others (d, N): the fewer of them are weighed."""
+    def between(self, members: list[int], start: int) -> Array:
+        """(f, g, d) products of some columns with all from a first on; the fewer are weighed."""
         mine = self.columns.clear[members][:, self.rows]
+        there = self.columns.clear[start:, self.rows]
         out = np.empty((len(mine), len(self.weights), len(there)))
         for i, weight in enumerate(self.weights):
             few = len(mine) < len(there)
             out[:, i] = (mine * weight) @ there.T if few else mine @ (there * weight).T
-        return out
+        if self.total is None:
+            return out
+        self.total.form(np.array(members))
+        return np.stack([self.total.lines[i][:, start:] for i in members]) - out
 
     def width(self, i: int) -> int:
         """How many products of a column are there already."""
@@ -146,13 +141,17 @@ class Sums:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
         mark = (index.tobytes(), index.shape[1])
         if mark not in self.sets:
-            self.sets[mark] = within(self.columns.clear[:, self.rows][index], self.weights)
+            own = within(self.columns.clear[index][..., self.rows], self.weights)
+            self.sets[mark] = own if self.total is None else self.total.among(index) - own
         return self.sets[mark]
 
     def squares(self) -> Array:
         """(D, g) squares of candidates' columns as they are."""
         new = self.columns.plain[len(self.whole) : self.columns.count, self.rows]
-        self.whole = np.concatenate([self.whole, new**2 @ self.weights.T])
+        more = new**2 @ self.weights.T
+        if self.total is not None:
+            more = self.total.squares()[len(self.whole) :] - more
+        self.whole = np.concatenate([self.whole, more])
         return self.whole
 
 
@@ -166,30 +165,6 @@ def within(fields: Array, weights: Array) -> Array:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Less:
-    """The products of all rows less those of some."""
-
-    all: Summed
-    some: Summed
-
-    def across(self, index: Array) -> Array:
-        """As `Sums`."""
-        return self.all.across(index) - self.some.across(index)
-
-    def square(self, index: Array) -> Array:
-        """As `Sums`."""
-        return self.all.square(index) - self.some.square(index)
-
-    def among(self, index: Array) -> Array:
-        """As `Sums`."""
-        return self.all.among(index) - self.some.among(index)
-
-    def squares(self) -> Array:
-        """As `Sums`."""
-        return self.all.squares() - self.some.squares()
-
-
 class Products:
     """Products for any ratio, of all rows or of those that are kept.
 
@@ -199,7 +174,7 @@ class Products:
     def __init__(self, columns: Columns, kept: Array, all: Products | None = None) -> None:
         self.columns, self.kept, self.all = columns, kept, all
         self.grid = self.summed(RATIOS)
-        self.decades: dict[int, Summed] = {}
+        self.decades: dict[int, Sums] = {}
         self.asked: dict[int, int] = {}
         self.noises: dict[bytes, Noise] = {}
 
@@ -211,20 +186,20 @@ class Products:
         """The products of some rows only.  kept: (N,)."""
         return Products(self.columns, kept, self.all or self)
 
-    def summed(self, ratios: Array, decade: int | None = None) -> Summed:
+    def summed(self, ratios: Array, decade: int | None = None) -> Sums:
         """Products at some ratios, or at the nodes of a decade."""
         if self.all is None:
-            return Sums(self.columns, ratios, slice(None))
-        whole = self.all.grid if decade is None else self.all.decade(decade)
-        return Less(whole, Sums(self.columns, ratios, np.flatnonzero(~self.kept)))
+            return Sums(self.columns, ratios)
+        total = self.all.grid if decade is None else self.all.decade(decade)
+        return Sums(self.columns, ratios, np.flatnonzero(~self.kept), total)
 
-    def decade(self, number: int) -> Summed:
+    def decade(self, number: int) -> Sums:
         """Products at the nodes of a decade of ratios."""
         if number not in self.decades:
             self.decades[number] = self.summed(10.0 ** nodes(number), number)
         return self.decades[number]
 
-    def parts(self, ratios: Array, asked: int) -> list[tuple[int | None, Array, Summed, Array]]:
+    def parts(self, ratios: Array, asked: int) -> list[tuple[int | None, Array, Sums, Array]]:
         """Number of the decade, which ratios (s,), of which products and how (s, g) combined.
 
         asked: by how much this counts towards forming the products of a decade.
@@ -232,14 +207,14 @@ class Products:
         numbers = np.floor(np.log10(np.maximum(ratios, 1e-300))).astype(int)
         if ratios is RATIOS:
             return [(None, np.arange(len(RATIOS)), self.grid, np.eye(len(RATIOS)))]
-        out: list[tuple[int | None, Array, Summed, Array]] = []
+        out: list[tuple[int | None, Array, Sums, Array]] = []
         for number in map(int, np.unique(numbers)):
             here = np.flatnonzero(numbers == number)
             self.asked[number] = self.asked.get(number, 0) + asked * len(here)
             if ratios[here[0]] == 0.0:
                 out.append((number, here, self.grid, np.eye(1, len(RATIOS))))
             elif self.all is None and self.asked[number] <= NODES:
-                once = Sums(self.columns, ratios[here], slice(None), once=True)
+                once = Sums(self.columns, ratios[here], once=True)
                 out.append((None, here, once, np.eye(len(here))))
             else:
                 between = interpolation(np.log10(ratios[here]), nodes(number))
@@ -297,17 +272,28 @@ class Products:
 
         return likeliest(grams, rows, dof, self.kept)
 
-    def across(self, ratios: Array, index: Array) -> tuple[Array, Array]:
-        """(s, f, p + 1 + D) products of the geometry, the error, and some candidates' columns with
-        all, and (s, D) squares of the candidates' columns as they are.
+    def told_apart(self, lines: Array, axis: int) -> Array:
+        """The geometry's columns along an axis, as the combinations that the rows tell apart."""
+        if self.all is None:
+            return lines
+        return np.asarray(np.moveaxis(np.moveaxis(lines, axis, -1) @ self.span, -1, axis))
+
+    def across(self, ratios: Array, index: Array) -> tuple[Array, Array, Array]:
+        """Products of the geometry and of some candidates' columns with all (s, f, p + 1 + D), of
+        the error with all (s, p + 1 + D), and squares of the candidates' as they are (s, D).
         """
-        fixed = np.concatenate([np.arange(self.columns.fixed), self.columns.fixed + index])
+        p = self.columns.fixed - 1
+        fixed = np.concatenate([np.arange(p), p + 1 + index, [p]])
         out = np.empty((len(ratios), len(fixed), len(self.columns.clear)))
         whole = np.empty((len(ratios), self.columns.count))
         for _, here, summed, combined in self.parts(ratios, 1):
             out[here] = np.moveaxis(combined @ summed.across(fixed), 1, 0)
             whole[here] = combined @ summed.squares().T
-        return out, whole
+        lines, error = out[:, :-1], out[:, -1]
+        if self.all is not None:
+            geometry = self.told_apart(lines[:, :p], axis=1)
+            lines = np.concatenate([geometry, lines[:, p:]], axis=1)
+        return lines, error, whole
 
     def among(self, ratios: Array, index: Array) -> Array:
         """(s, c, d, d) products within sets of candidates' columns (c, d)."""

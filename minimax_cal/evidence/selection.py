@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
 from minimax_cal.evidence.library import Candidate, Library
-from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
@@ -50,11 +50,22 @@ class Choice:
         """(N, q) their columns."""
         return self.library.columns[:, columns_of(self.chosen)[0]]
 
+    @property
+    def left(self) -> Array:
+        """(N,) what geometry and effects, fitted to the poses that count, leave of all rows [m].
+
+        `Rows.back` gives it as errors of points: those of poses that do not count are predicted.
+        """
+        rows = self.library.rows
+        weight = self.noise.weights(rows) * self.library.products.kept
+        return remaining(rows, weight, self.known)
+
 
 def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
-    ripple: whether to look for lines of gears besides.
+    lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
+    at.  most: effects at most.  ripple: whether to look for lines of gears besides.
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
@@ -65,19 +76,19 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
             found = strongest_lines(lib.scene, lib.rows, noise, known, kept=lib.products.kept)
-            lib = replace(lib, candidates=(*plain(lib), *lib.with_terms(found)))
+            lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
         table = bench(lib, [one.candidate for one in fits], fits)
         tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table)
         if not best:
             break
-        fits = refined(lib, [*fits, *best])
+        lib, fits = refined(lib, [*fits, *best])
         noise = noise_beside(lib, fits)
     benches = []
     for i, one in enumerate(fits):
         chosen, others = without(fits, i)
         table = tables.get(tuple(map(id, chosen))) or bench(lib, chosen, others)
-        if max(one.candidate.main) >= table.settings.pull.shape[1]:  # tuned since
+        if not table.knows(one.candidate):  # tuned since
             table = bench(lib, chosen, others)
         benches.append(table)
     final = tuple(b.added(one.candidate) for b, one in zip(benches, fits, strict=True))
@@ -129,7 +140,8 @@ def addition(lib: Library, table: Bench) -> tuple[Library, list[Added]]:
             better = tuned(table, one)
             lib, better = adopted(lib, better, one.candidate)
             best = better if better.evidence > best.evidence or one is best else best
-    return lib, [best]
+    lib, stored = lib.stored(best.candidate)
+    return lib, [replace(best, candidate=stored)]
 
 
 def tuned(table: Bench, best: Added) -> Added:
@@ -140,7 +152,8 @@ def tuned(table: Bench, best: Added) -> Added:
     for _ in range(TUNINGS):
         term = best.candidate.term
         near = EFFECTS[term.effect].finer(table.library.scene, term.choice)
-        ranked = table.beside([replace(term, choice=choice) for choice in near]).everyone
+        aside = table.library.aside([(replace(term, choice=choice), 1.0) for choice in near])
+        ranked = table.beside(aside).ranked(aside.candidates)
         if not ranked or ranked[0].evidence <= best.evidence:
             break
         best = ranked[0]
@@ -156,10 +169,10 @@ def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Adde
     return replace(lib, candidates=kept), replace(one, candidate=found)
 
 
-def refined(lib: Library, fits: list[Added]) -> list[Added]:
+def refined(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
     """Replace each effect by any that does better, and drop what is no longer needed."""
     if len(fits) == 1:
-        return fits
+        return lib, fits
     for _ in range(3):
         changed = False
         for number in range(
@@ -170,15 +183,15 @@ def refined(lib: Library, fits: list[Added]) -> list[Added]:
             own = table.added(fits[number].candidate)
             top = next(o for o in table.everyone if not repeated(o.candidate, chosen))
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
-                fits[number], changed = top, True
+                lib, stored = lib.stored(top.candidate)
+                fits[number], changed = replace(top, candidate=stored), True
             elif table.p_value(own) > LEVEL:
-                fits = others
-                return refined(lib, fits)
+                return refined(lib, others)
             else:
                 fits[number] = own
         if not changed:
             break
-    return fits
+    return lib, fits
 
 
 def best_variant(scene: Scene, rows: Rows, chosen: Sequence[Term], several: Sequence[Term]) -> Term:

@@ -121,7 +121,7 @@ def beyond_of(
     if solved.effects.terms:
         train, k = data.take(~held), len(data.target_names)
         active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state, _ = refitted(robot, train, solved.state, active, (), np.zeros(0))
+        state = refitted(robot, train, solved.state, active)
         geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
     found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)

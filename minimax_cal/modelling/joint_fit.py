@@ -84,29 +84,14 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 
-def refitted(
-    robot: Robot,
-    data: Measurements,
-    start: State,
-    active: Array,
-    terms: Sequence[Term],
-    usual: Array,
-) -> tuple[State, Fitted]:
-    """Least squares from a fit that is near: geometry on some poses, jointly with effects.
+def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> State:
+    """Geometry alone by least squares, from a fit that is near.
 
-    start: of the geometry.  active: (p,) the geometric parameters that are free.  usual: (e,) size
-    of the effects' parameters, a prior where the poses do not tell them; empty for none.
+    active: (p,) the geometric parameters that are free.
     """
-    model, state = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    model, begin = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
     points, method = float(model.counts.sum()), least_squares.METHODS["snllm"]
-    for _ in range(2 if terms else 1):
-        wide, begin = extended(model, robot, data, state, terms) if terms else (model, state)
-        if len(usual):
-            spread = float(model.cost(replace(state, effects=np.zeros(0))).sum()) / (3.0 * points)
-            weight = np.concatenate([np.zeros(len(active)), spread / np.maximum(usual, 1e-30) ** 2])
-            wide = wide.with_prior(Prior(np.zeros(len(weight)), weight))
-        found = least_squares.solve(
-            SumOfSquares(wide), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
-        )
-        state = found.x.take(np.array(0))
-    return state, fitted(terms, scene_of(robot, data, model, state), state.effects)
+    found = least_squares.solve(
+        SumOfSquares(model), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
+    )
+    return found.x.take(np.array(0))

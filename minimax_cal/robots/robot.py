@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -84,6 +85,7 @@ class RobotSchema(BaseModel):
     units: UnitsSchema
     joints: Annotated[list[JointSchema], Field(min_length=1)]
     up: Vector = (0.0, 0.0, 1.0)
+    repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +100,7 @@ class Robot:
     mass: (n,) mass of the link that joint i moves, NaN where unknown [kg].
     com: (n, 3) its centre of gravity in frame i, NaN where unknown [m].
     up: (3,) vertical in the base frame.
+    repeatability: of its data sheet, by ISO 9283; NaN where unknown [m].
     """
 
     name: str
@@ -110,6 +113,7 @@ class Robot:
     mass: Array
     com: Array
     up: Array
+    repeatability: float = math.nan
 
     @property
     def joints(self) -> int:
@@ -148,11 +152,13 @@ class Robot:
                 out["com_mm"] = [float(c) * 1e3 for c in self.com[i]]
             return out
 
+        known = np.isfinite(self.repeatability)
         return {
             "name": self.name,
             "convention": CONVENTION,
             "units": {"length": "mm", "angle": "rad"},
             "up": [float(u) for u in self.up],
+            **({"repeatability_mm": 1e3 * self.repeatability} if known else {}),
             "joints": [joint(i) for i in range(self.joints)],
         }
 
@@ -210,6 +216,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         mass=optional([j.mass_kg for j in joints], np.nan),
         com=np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3,
         up=up / np.linalg.norm(up),
+        repeatability=1e-3 * (schema.repeatability_mm or math.nan),
     )
 
 

@@ -30,9 +30,9 @@ def here(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_words_come_first_then_tables(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("diagnose", "ur10", "gap.csv", "--seed", 3, "--holdout", 0.3) == 0
+    assert run("diagnose", "ur10", "gap.csv", "--seed", 3, "--holdout", 0.3, "--quick") == 0
     out, err = capsys.readouterr()
-    found = mc.diagnose("ur10", "gap.csv", seed=3, holdout=0.3)
+    found = mc.diagnose("ur10", "gap.csv", seed=3, holdout=0.3, quick=True)
     assert " ".join(out.split()).startswith(" ".join(found.headline().split()))
     assert max(map(len, out.splitlines())) <= 110
     titles = ("step by step", "effects found", "kind of error", "by target", "turns of each joint")
@@ -44,7 +44,7 @@ def test_words_come_first_then_tables(here: Path, capsys: pytest.CaptureFixture[
 
 
 def test_json_is_alone_and_as_agreed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("diagnose", "ur10", "gap.csv", "--json", "-o", "gap.json") == 0
+    assert run("diagnose", "ur10", "gap.csv", "--quick", "--json", "-o", "gap.json") == 0
     out = capsys.readouterr().out
     content = json.loads(out)
     kept = json.loads((here / "gap.json").read_text())
@@ -75,7 +75,7 @@ def test_json_is_alone_and_as_agreed(here: Path, capsys: pytest.CaptureFixture[s
 
 def test_a_suspect_can_be_left_out(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--without", "joint_compliance,link_bending", "--without", "base_flex")
-    assert run("diagnose", "ur10", "gap.csv", *options, "--json") == 0
+    assert run("diagnose", "ur10", "gap.csv", *options, "--quick", "--json") == 0
     content = json.loads(capsys.readouterr().out)
     named = {e["effect"] for e in content["effects"]}
     named |= {a["effect"] for e in content["effects"] for a in e["alternatives"]}
@@ -88,12 +88,12 @@ def test_notices_go_to_stderr_unless_quiet(here: Path, capsys: pytest.CaptureFix
     header, *rows = Path("gap.csv").read_text().splitlines()
     noted = [f"{header},colour", *(f"{row},red" for row in rows)]
     Path("noted.csv").write_text("\n".join(noted) + "\n")
-    assert run("diagnose", "ur10", "noted.csv", "--json") == 0
+    assert run("diagnose", "ur10", "noted.csv", "--quick", "--json") == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["notices"]
     assert "notice: " in err
     assert "colour" in err
-    assert run("diagnose", "ur10", "noted.csv", "--json", "--quiet") == 0
+    assert run("diagnose", "ur10", "noted.csv", "--quick", "--json", "--quiet") == 0
     assert capsys.readouterr().err == ""
 
 
@@ -141,7 +141,7 @@ def test_numbers_that_break_down_are_exit_1(
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr("minimax_cal.cli.diagnose.diagnose", broken)
-    assert run("diagnose", "ur10", "gap.csv", "-o", "gap.json") == 1
+    assert run("diagnose", "ur10", "gap.csv", "--quick", "-o", "gap.json") == 1
     out, err = capsys.readouterr()
     assert err.startswith("error: the numbers did not work out (Singular matrix)")
     assert out == ""
@@ -150,7 +150,10 @@ def test_numbers_that_break_down_are_exit_1(
 
 @pytest.mark.parametrize(("kind", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml")])
 def test_figure(kind: str, start: bytes, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("diagnose", "ur10", "gap.csv", "--figure", f"gap.{kind}", "--json", "-q") == 0
+    assert (
+        run("diagnose", "ur10", "gap.csv", "--quick", "--figure", f"gap.{kind}", "--json", "-q")
+        == 0
+    )
     out, err = capsys.readouterr()
     picture = (here / f"gap.{kind}").read_bytes()
     assert picture.startswith(start)
@@ -235,7 +238,7 @@ def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
 
     from minimax_cal.diagnosing.result import Alternative
 
-    found = mc.diagnose("ur10", folder / "gap.csv")
+    found = mc.diagnose("ur10", folder / "gap.csv", quick=True)
     other = Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "ten poses stretched out")
     first = replace(found.findings[0], alternatives=(other,))
     more = replace(found, findings=(first,), not_testable=(("settling", "the visit order"),))

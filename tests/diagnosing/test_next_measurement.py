@@ -20,8 +20,9 @@ from minimax_cal.diagnosing.next_measurement import (
     separate,
     separate_with,
 )
-from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import ENOUGH
+from minimax_cal.evidence.bench import bench
+from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.noise import Noise, linearised
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
@@ -136,11 +137,11 @@ def test_power_now_is_what_rivals_say(
     robot: mc.Robot, sim: Simulation, wide: Site, one: Term, value: list[float], other: Term
 ) -> None:
     rows = linearised(wide.model, wide.state, wide.scene.jacobian)
-    empty = selection.Library(wide.scene, rows, np.zeros((len(rows.error), 0)), ())
-    lib, both = empty.with_terms([(one, 1.0), (other, 1.0)])
-    table = selection.bench(lib, ())
+    lib = Library.empty(wide.scene, rows)
+    both = lib.with_terms([(one, 1.0), (other, 1.0)])
+    table = bench(lib, ())
     added = dataclasses.replace(table.added(both[0]), value=np.array(value))
-    size, rho2 = table.setting(added).likeness(added, both[1])
+    size, rho2 = table.likeness(added, both[1])
     jitter = np.sqrt(added.ratio * added.variance / rows.size)
     same = dataclasses.replace(wide, noise=Noise(added.ratio, added.variance, float(jitter)))
     now = powers(same, Pair(one, np.array(value), other))["old", 70]

@@ -20,9 +20,12 @@ OF_ORDER = ("frame_drift", "thermal_growth", "backlash", "settling", "target_shi
 def shifted() -> mc.Measurements:
     """A nest that moves half-way."""
     made = simulate(mc.load_robot("irb2600"), 80, 3, seed=4, truth=Truth(compliance=0.0))
-    shift = np.zeros((80, 3, 3))
-    shift[40:, 1] = 2e-3
-    return made.data.with_y(made.data.y + shift)
+    spots = made.cell.target_positions + np.array([[0.0] * 3, [1e-3, 5e-4, 0.0], [0.0] * 3])
+    moved = replace(made.cell, target_positions=spots)
+    step = (moved.predict(made.data.q) - made.cell.predict(made.data.q)) * (
+        np.arange(80) >= 40
+    ).reshape(-1, 1, 1)
+    return made.data.with_y(made.data.y + step)
 
 
 def untold(data: mc.Measurements) -> mc.Measurements:

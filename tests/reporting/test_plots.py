@@ -36,7 +36,7 @@ def diagnosed(case: str, targets: int = 3) -> Diagnosis:
         data = data.with_y(data.y + moved @ made.cell.base[:3, :3].T)
     else:
         data = replace(data, columns={})
-    return mc.diagnose(ROBOT, data)
+    return mc.diagnose(ROBOT, data, quick=True)
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])

@@ -766,7 +766,7 @@ def test_real_arm_in_three_commands(tmp_path: Path, capsys: pytest.CaptureFixtur
     data.write_text("\n".join(lines) + "\n")
     fit, gap, out = (tmp_path / name for name in ("fit.json", "gap.json", "report.html"))
     assert run("calibrate", robot, data, "-o", fit, "-q") == 0
-    assert run("diagnose", robot, data, "-o", gap, "-q") == 0
+    assert run("diagnose", robot, data, "-o", gap, "-q", "--quick") == 0
     assert run("report", fit, gap, "-o", out) == 0
     seen = Seen(out.read_text())
     told = json.loads(fit.read_text())["accuracy"]["holdout"]

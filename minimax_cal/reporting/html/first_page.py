@@ -115,9 +115,8 @@ def claims_at(gap: Diagnosis, rung: int | None) -> tuple[str, tuple[Claim, ...]]
     plain = {"nominal": "the nominal robot", "geometric": "geometry alone"}
     model = plain.get(step.name) or with_effects(rungs[at][1] if rungs else gap.cells[-1])
     claims = [within(where, gap.ladder[0].holdout, step.holdout, ends, poses)]
-    away = getattr(gap, "beyond", None)
-    if isinstance(away, Beyond) and at == last:
-        claims.append(beyond(away))
+    if at == last:
+        claims.append(beyond(gap.beyond))
     return model, tuple(claims)
 
 
@@ -213,12 +212,11 @@ def limits_now(sources: Sources, found: Signed) -> str:
         lacking = [f for f in established(sources.gap) if not holds(sources, f)]
         if lacking:
             return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
-        if left <= NEAR_NOISE * sources.gap.floor:
-            return f"the noise of the measurements, which alone leaves {number(sources.gap.floor)}."
-        return (
-            f"a remainder that no known effect explains; noise alone would leave "
-            f"{number(sources.gap.floor)}."
-        )
+        floor = sources.gap.floor
+        alone = f"{'' if floor.certain else 'at most '}{number(floor.value)}"
+        if left <= NEAR_NOISE * floor.value:
+            return f"the noise of the measurements, which alone leaves {alone}."
+        return f"a remainder that no known effect explains; noise alone would leave {alone}."
     if sources.fit:
         few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
         if few:

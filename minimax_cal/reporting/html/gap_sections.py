@@ -24,19 +24,14 @@ def gap_steps(gap: Diagnosis) -> Blocks:
 
 
 def closing(gap: Diagnosis) -> str:
-    """How much of the gap closed, and how it does on the end of the session."""
+    """How much of the gap closed, and how the model does on parts left out."""
     out = "Each step is judged on held-out poses; the noise floor is what noise alone would leave."
     if math.isfinite(gap.closed):
         low, high = (100.0 * end for end in gap.closed_ci)
         ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
         out += f" The steps after geometry close {100.0 * gap.closed:.0f} % of the gap{ends}."
-    last, first = gap.blocked.get("final_rms_mm"), gap.blocked.get("geometric_rms_mm")
-    poses = gap.blocked.get("last_poses") or 0
-    if last is not None and first is not None:
-        out += (
-            f" With the last {poses:.0f} poses of the session held out "
-            f"instead, geometry leaves {first:.3f} mm RMS and the last step {last:.3f} mm."
-        )
+    if gap.beyond.worst:
+        out += f" {gap.beyond.sentence()} Geometry alone: {gap.beyond.geometric_typical_mm:.3f} mm."
     return out
 
 

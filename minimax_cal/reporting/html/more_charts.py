@@ -91,7 +91,7 @@ def correlation_map(known: Uncertainty) -> Figure:
 
 def waterfall(gap: Diagnosis) -> Figure:
     """The gap from the nominal robot down to the noise."""
-    steps, floor = gap.ladder, gap.floor
+    steps, floor = gap.ladder, gap.floor.value
     held = np.array([s.holdout.rms_mm for s in steps])
     train = np.array([s.train.rms_mm for s in steps])
     worst = np.array([s.holdout.max_mm for s in steps])

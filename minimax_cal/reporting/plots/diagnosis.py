@@ -40,9 +40,9 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
     axes.plot(held, at, "o", color="black", label="held-out RMS")
     axes.plot(train, at, "o", color="black", mfc="none", ms=9, label="training RMS")
     axes.plot(worst, at, "|", color="black", ms=11, mew=2, label="largest, held out")
-    if diagnosis.floor > 0.0:
-        axes.axvline(diagnosis.floor, color="grey", ls="--", label="noise floor")
-    numbers = np.concatenate([held, train, worst, [diagnosis.floor]])
+    if diagnosis.floor.value > 0.0:
+        axes.axvline(diagnosis.floor.value, color="grey", ls="--", label="noise floor")
+    numbers = np.concatenate([held, train, worst, [diagnosis.floor.value]])
     numbers = numbers[np.isfinite(numbers)]
     if numbers.min() > 0.0 and numbers.max() > 10.0 * numbers.min():
         axes.set_xscale("log")

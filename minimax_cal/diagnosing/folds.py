@@ -1,0 +1,64 @@
+"""Diagnoses without a part of the poses: effects sought anew, and judged by the part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.diagnosing.causes import chosen, effects_of
+from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
+from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.fitting.beyond import Beyond, Errors, without
+from minimax_cal.fitting.options import Progress
+from minimax_cal.fitting.uncertainty import Estimator
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import parts
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.parameters import State
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """What was found without some of the poses."""
+
+    effects: tuple[tuple[Term, ...], ...]
+    ladder: Ladder
+
+    @property
+    def taken(self) -> tuple[tuple[Term, ...], ...]:
+        """The effects that its ladder took."""
+        return tuple(self.effects[number] for number in self.ladder.taken)
+
+
+def fold_of(study: Study, rows: Array, state: State, exclude: Sequence[str]) -> Fold:
+    """Effects sought and fitted on some rows only.
+
+    rows: (m,) True for them.  state: the geometry that was fitted to them.
+    """
+    fit = replace(study.fit, state=state)
+    small = studied(study.robot, study.data.take(rows), fit)
+    _, choice = chosen(small, exclude)
+    effects = tuple(effects_of(choice))
+    return Fold(effects, climbed(small, effects, choice.noise))
+
+
+def beyond_of(study: Study, judges: Judges, exclude: Sequence[str], progress: Progress) -> Beyond:
+    """Every part of the poses judges a model that was sought without it."""
+    data = judges.everyone
+    found = parts(data)
+    masks = [np.isin(study.data.line, data.line[part.rows]) for part in found]
+    estimator = Estimator(
+        study.model.only(study.fit.identification.active), np.ones(len(study.model.y))
+    )
+    errors = Errors()
+    states = without(estimator, study.fit.state, masks)
+    for number, (part, mask, state) in enumerate(zip(found, masks, states, strict=True)):
+        if state is None:
+            continue
+        progress(f"part {number + 1} of {len(found)} left out: {part.name}")
+        fold = fold_of(study, ~mask, state, exclude)
+        rows, fits = data.take(part.rows), fold.ladder.fits
+        errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
+    return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")

@@ -1,0 +1,167 @@
+"""Geometry and effects in one fit: what is told, saved, exported and corrected with.
+
+The poses are weighed as the noise is: each by the inverse of s^2 I + t^2 S S' (`evidence.noise`).
+Compliances are not negative, and nothing moves the arm by more than an arm can be off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.fitting.beyond import moved, needed
+from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Term, names_of
+from minimax_cal.modelling.joint_fit import extended, fitted
+from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.least_squares import solve_normal
+
+PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
+SETTLED = 1e-4  # relative change of the weighed square that ends them
+FARTHEST = 0.02  # of the reach: no effect of a body moves a point farther
+RIDGE = 1e-12  # of a parameter's own weight: what nothing tells stays where it is
+FOLDS = 5  # of groups of poses, by which a rung is judged
+WORSE = 1e-3  # relative rise of the training error that is none
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Geometry with some effects, fitted together.
+
+    state: with the effects' values.  weight: (m, 3k, 3k) of the poses, measurement axes.
+    model: linear where the fit ended.  rests: (e,) True where an effect's parameter is at a bound.
+    """
+
+    study: Study
+    terms: tuple[Term, ...]
+    state: State
+    model: Model
+    weight: Array
+    rests: Array
+
+    @cached_property
+    def estimator(self) -> Estimator:
+        """How the fit weighs its poses."""
+        active = self.model.active.copy()
+        active[len(active) - len(self.rests) :] &= ~self.rests
+        return Estimator(self.model.only(active), np.ones(len(self.model.y)), self.weight)
+
+    @cached_property
+    def poses(self) -> Poses:
+        """Pose by pose, linear where the fit ended."""
+        return Poses.of(self.estimator, self.state)
+
+    @cached_property
+    def cell(self) -> Cell:
+        """What predicts."""
+        return self.with_state(self.state)
+
+    def with_state(self, state: State) -> Cell:
+        """What would predict with other values."""
+        study, effects = self.study, NOTHING
+        if self.terms:
+            effects = fitted(self.terms, study.scene, state.effects)
+        return Cell.of(study.robot, state, study.data.target_names, effects)
+
+    @cached_property
+    def train(self) -> Accuracy:
+        """On the poses of the fit."""
+        return accuracy(self.cell.error(self.study.data))
+
+    def no_worse(self, other: Joint) -> bool:
+        """Whether the poses of the fit are met as well as by another."""
+        return self.train.rms_mm <= (1.0 + WORSE) * other.train.rms_mm
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Of all parameters, by leaving out groups of poses; NaN on a bound."""
+        units = names_of(self.terms, self.cell.scene(self.study.data))[1] if self.terms else ()
+        group = clusters(self.study.data)
+        return uncertainty_of(self.estimator, self.state, group, units)
+
+    def spared(self, folds: Sequence[Array]) -> list[Array]:
+        """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
+        poses = self.poses
+        return [f for f in folds if not needed(poses.bread, poses.gram[f].sum(axis=0))]
+
+    def cross_validated(self, folds: Sequence[Array]) -> float:
+        """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
+        poses, total = self.poses, 0.0
+        if len(self.spared(folds)) < len(folds):
+            return float("inf")
+        for mine in folds:
+            pull = poses.score[~mine].sum(axis=0)
+            step = solve_normal(poses.bread - poses.gram[mine].sum(axis=0), pull[:, None])[:, 0]
+            left = poses.error[mine] - np.einsum("mrp,p->mr", poses.jacobian[mine], step)
+            total += float((left**2).sum())
+        return total
+
+
+def joint(study: Study, terms: Sequence[Term], noise: Noise) -> Joint:
+    """The joint fit of geometry and effects, from the geometry of the study."""
+    robot, data = study.robot, study.data
+    base = study.model.only(study.fit.identification.active)
+    weight = weights(study, noise)
+    allowed = bounds(study.scene, terms)
+    state = replace(study.fit.state, effects=np.zeros(len(allowed)))
+    for _ in range(PASSES):
+        model, state = extended(base, robot, data, state, terms) if terms else (base, state)
+        poses = Poses.of(Estimator(model, np.ones(len(model.y)), weight), state)
+        pull, room = poses.score.sum(axis=0), np.full((poses.jacobian.shape[-1], 2), np.inf)
+        room[:, 0] = -np.inf
+        room[len(room) - len(allowed) :] = allowed - state.effects[:, None]
+        step = bounded(poses.bread, pull, *room.T)
+        gain = float(2.0 * step @ pull - step @ poses.bread @ step)
+        square = float((poses.error * np.einsum("mab,mb->ma", weight, poses.error)).sum())
+        state = moved(Estimator(model, np.ones(len(model.y))), state, step)
+        if gain <= SETTLED * square:
+            break
+    model, state = extended(base, robot, data, state, terms) if terms else (base, state)
+    rests = np.isclose(state.effects[:, None], allowed, rtol=1e-9, atol=0.0).any(axis=1)
+    return Joint(study, tuple(terms), state, model, weight, np.asarray(rests))
+
+
+def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
+    """(e, 2) between which the parameters of effects must lie: of compliances not below 0."""
+    out = [np.zeros((0, 2))]
+    for term in terms:
+        fields = term.columns(scene).displacement(scene)
+        size = np.sqrt((fields**2).sum(axis=2)).max(axis=(1, 2))
+        most = FARTHEST * scene.robot.reach() / np.maximum(size, 1e-300)
+        least = np.zeros_like(most) if EFFECTS[term.effect].positive else -most
+        out.append(np.stack([least, most], axis=1))
+    return np.concatenate(out)
+
+
+def weights(study: Study, noise: Noise) -> Array:
+    """(m, 3k, 3k) s^2 (s^2 I + t^2 S S')^-1 of each pose, in measurement axes."""
+    model, state = study.model, study.fit.state
+    arm = Poses.of(Estimator(model, np.ones(len(model.y))), state).arm
+    r = arm.shape[1]
+    whole = np.eye(r) + (noise.jitter**2 / noise.variance) * arm @ np.swapaxes(arm, 1, 2)
+    inverse = np.linalg.inv(whole)
+    turn = np.kron(np.eye(r // 3), state.rotation)
+    return np.asarray(turn @ inverse @ turn.T)
+
+
+def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
+    """The step x (p,) that minimises x'Hx - 2 g'x between bounds."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    root = np.linalg.cholesky(gram * np.outer(scale, scale) + RIDGE * np.eye(len(gram)))
+    target = np.linalg.solve(root, pull * scale)
+    if np.isinf(low).all() and np.isinf(high).all():
+        return np.asarray(scale * np.linalg.solve(root.T, target))
+    found = lsq_linear(root.T, target, (low / scale, high / scale), method="bvls", tol=1e-12)
+    return np.asarray(scale * found.x)

@@ -1,0 +1,41 @@
+"""Whether points that stand out are wrong, or the noise has heavy tails."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from minimax_cal.fitting.suspects import Scores, Spread, spread_of
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults import Fault
+from minimax_cal.measuring.faults.distances import between
+from minimax_cal.measuring.measurements import Measurements
+
+HEAVY = 10.0  # degrees of freedom of Student's t, and fewer: single points far off are usual
+
+
+def wrong_rows(data: Measurements, error: Array) -> Array:
+    """(m,) True where a point is farther off than the tails of all others allow.
+
+    Judged by the errors of a fit, and by the distances between targets, each against Student's t
+    with as heavy tails as the other points show.  Where the errors' tails are heavy no point is
+    wrong for being far off.  error: (k, m, 3) of all points [m].
+    """
+    out = np.zeros(data.poses, dtype=bool)
+    spread, far = judged(np.linalg.norm(error, axis=-1), 3)
+    if spread.dof <= HEAVY:
+        return out
+    off = np.abs(between(data).off)
+    return np.asarray(far | judged(off, 1)[1] if off.size else far)
+
+
+def judged(size: Array, directions: int) -> tuple[Spread, Array]:
+    """How sizes (s, m) scatter, and (m,) True where one stands out.  NaN is unknown."""
+    seen = np.isfinite(size)
+    scores = Scores(np.where(seen, size, 0.0) ** 2, directions * seen)
+    spread = spread_of(scores, float(directions * seen.sum()))
+    return spread, spread.far(scores).any(axis=0)
+
+
+def are_wrong(fault: Fault, rows: Array, line: Array) -> bool:
+    """Whether rows of a fault, as lines of the file, are among those that are wrong."""
+    return bool(np.isin(fault.rows, line[rows]).any())

@@ -1,0 +1,132 @@
+"""What no model can take away: how far apart visits to one pose are, or what is declared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
+
+REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most: the noise of the fit"
+FEWEST = 5  # repeated visits that tell
+RESAMPLES = 500
+SIGMAS = 1.959964  # of a coordinate that a u95 holds
+# ISO 9283: repeatability is the mean distance from the middle plus three of its standard
+# deviations; of a Gaussian, alike in all directions, the RMS distance is this share of it.
+RMS_OF_REPEATABILITY = float(
+    stats.chi(3).moment(2) ** 0.5 / (stats.chi(3).mean() + 3.0 * stats.chi(3).std())
+)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """RMS distance that noise alone would leave [mm], between two ends, and how it is known.
+
+    value: the best estimate; where nothing but the fit tells, what it leaves at most.
+    """
+
+    value: float
+    low: float
+    high: float
+    source: str
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is known by more than what the fit leaves."""
+        return self.source != AT_MOST
+
+    @property
+    def least(self) -> float:
+        """The floor to take off where the gap is not to be told too small [mm]."""
+        return self.value if self.certain else 0.0
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Array:
+        """(count,) values that it may have [mm]."""
+        if not self.certain:
+            return np.asarray(rng.uniform(self.low, self.high, count))
+        low, high = max(self.low, 1e-9), max(self.high, 1e-9)
+        middle = min(max(self.value, low), high)
+        side = rng.normal(size=count) / SIGMAS
+        up, down = np.log(high / middle), np.log(middle / low)
+        return np.asarray(middle * np.exp(np.where(side > 0.0, side * up, side * down)))
+
+
+def floor_of(data: Measurements, error: Array, repeatability: float, most: float) -> Floor:
+    """The floor, by revisits, else by what is declared, else by what a fit leaves at most.
+
+    error: (k, m, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
+    most: RMS distance that the fit takes for noise [mm].
+    """
+    again = [revisits(data, points) for points in (error, np.moveaxis(data.y, 1, 0))]
+    known = [one for one in again if one]
+    if known:  # moves between visits are in the points, noise of joints read back in the errors
+        return min(known, key=lambda one: one.value)
+    told = declared(data, repeatability)
+    if told is None:
+        return Floor(most, 0.0, most, AT_MOST)
+    instrument, arm = told
+    both = float(np.hypot(np.nan_to_num(instrument), np.nan_to_num(arm)))
+    if np.isnan(instrument) or np.isnan(arm):  # the other part is between nothing and the fit's
+        return Floor(max(both, most), both, max(both, most), AT_MOST)
+    low = float(np.hypot(instrument, 0.5 * arm))  # a data sheet promises no more than this
+    return Floor(both, low, both, DECLARED)
+
+
+def declared(data: Measurements, repeatability: float) -> tuple[float, float] | None:
+    """RMS distance by the instrument's u95 and by the arm's repeatability, NaN unknown [mm]."""
+    instrument = np.nan
+    if "u95" in data.columns and np.isfinite(data.columns["u95"]).any():
+        u95 = data.columns["u95"]
+        instrument = 1e3 * float(np.sqrt(3.0 * np.nanmean((u95 / SIGMAS) ** 2)))
+    arm = 1e3 * RMS_OF_REPEATABILITY * repeatability
+    return None if np.isnan(instrument) and np.isnan(arm) else (instrument, arm)
+
+
+def revisits(data: Measurements, error: Array) -> Floor | None:
+    """By the scatter of errors among visits to one pose; None where they are too few.
+
+    A median, so that a few wrong points do not set it: of squared distances from the middle of the
+    visits, over that of a Gaussian.  error: (k, m, 3), or points as measured [m].
+    """
+    square, group = deviations(error, groups(data))
+    names = np.unique(group)
+    if len(names) < FEWEST:
+        return None
+    rng = np.random.default_rng(0)
+    member = [np.flatnonzero(group == name) for name in names]
+    usual = stats.chi2.median(3) / 3.0
+
+    def rms_mm(of: Array) -> float:
+        return 1e3 * float(np.sqrt(np.median(of) / usual))
+
+    drawn = [
+        rms_mm(square[np.concatenate([member[i] for i in rng.integers(0, len(names), len(names))])])
+        for _ in range(RESAMPLES)
+    ]
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return Floor(rms_mm(square), float(low), float(high), REPEATS)
+
+
+def deviations(error: Array, group: Array) -> tuple[Array, Array]:
+    """Squared distances of visits from their pose's middle, each as large as a point's own scatter
+    is expected to be [m^2], and the group of each.
+
+    error: (k, m, 3), NaN unknown [m].  group: (m,).
+    """  # fmt: skip
+    square, member = [np.zeros(0)], [np.zeros(0, dtype=int)]
+    names, inverse, counts = np.unique(group, return_inverse=True, return_counts=True)
+    for points in error:
+        seen = np.isfinite(points[:, 0]) & (counts[inverse] > 1)
+        index = inverse[seen]
+        number = np.bincount(index, minlength=len(names))
+        middle = np.stack([np.bincount(index, x, len(names)) for x in points[seen].T], axis=1)
+        off = points[seen] - (middle / np.maximum(number, 1)[:, None])[index]
+        more = number[index] > 1
+        wide = number[index][more] / (number[index][more] - 1.0)
+        square.append((off[more] ** 2).sum(axis=1) * wide)
+        member.append(names[index][more])
+    return np.concatenate(square), np.concatenate(member)

@@ -1,0 +1,179 @@
+"""Products formed once: the same as sums over the rows that count, for any ratio of the noises."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import study
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.bench import bench
+from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.noise import Rows, orthonormal, restricted
+from minimax_cal.evidence.periodogram import sums
+from minimax_cal.evidence.products import NODES, interpolation, nodes
+from minimax_cal.evidence.selection import select
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.table import Term
+
+RATIOS = np.array([0.0, 0.013, 0.4, 3.7, 1.0e4])
+ROUNDING = 1e-12  # of products, relative to the largest of their columns
+
+
+@pytest.fixture(scope="module")
+def rough() -> Study:
+    """100 poses with play in a joint, a gear's line, and joints that do not come back."""
+    causes = (Cause("backlash", "J2", 400.0), Cause("gear_ripple", "J4", 400.0))
+    sealed = make(Case("irb2600", "pair", causes, seed=4))
+    data = with_history(sealed.data)
+    fit = fit_cell(sealed.robot, data, Options(objective="sum"), silent)
+    return studied(sealed.robot, data, fit)
+
+
+@pytest.fixture(scope="module")
+def lib(rough: Study) -> Library:
+    return library(rough.scene, rough.rows)
+
+
+@pytest.fixture(scope="module")
+def poses(rough: Study) -> Array:
+    """All but every sixth."""
+    return np.asarray(np.arange(rough.scene.poses) % 6 != 2)
+
+
+def kept_rows(rough: Study, poses: Array) -> Array:
+    return np.repeat(poses, rough.rows.weight.shape[1])
+
+
+@pytest.mark.parametrize("decade", [-3, 0, 4])
+def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
+    ratios = 10.0 ** np.linspace(decade, decade + 1, 101)
+    variance = np.concatenate([[0.0], np.logspace(-9, 6, 301)])
+
+    def weights(ratios: Array) -> Array:
+        return np.asarray(1.0 / (1.0 + np.outer(ratios, variance)))
+
+    between = interpolation(np.log10(ratios), nodes(decade))
+    found = between @ weights(10.0 ** nodes(decade))
+    assert_allclose(found, weights(ratios), rtol=1e-12)
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_products_are_the_sums_over_rows_that_count(
+    lib: Library, rough: Study, poses: Array, some: bool
+) -> None:
+    """Asked for once, and so often that those of decades are formed."""
+    kept = kept_rows(rough, poses) if some else np.ones(len(rough.rows.error), dtype=bool)
+    products = lib.products.of(kept) if some else library(rough.scene, rough.rows).products
+    index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
+    clear, raw = products.columns.clear, products.columns.raw
+    p = products.columns.fixed - 1
+    rows = np.concatenate([products.told_apart(clear[:p], axis=0), clear[p + 1 + index]])
+    for _ in range(NODES + 1):
+        lines, error, whole = products.across(RATIOS, index)
+    within = products.among(RATIOS, sets)
+    size = np.linalg.norm(clear, axis=1)
+    for i, ratio in enumerate(RATIOS):
+        weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
+        atol = ROUNDING * np.outer(np.linalg.norm(rows, axis=1), size)
+        assert np.all(np.abs(lines[i] - (rows * weight) @ clear.T) <= atol)
+        assert np.all(np.abs(error[i] - clear @ (weight * clear[p])) <= ROUNDING * size * size[p])
+        assert_allclose(whole[i], weight @ raw**2, rtol=1e-11)
+        for c, pair in enumerate(sets):
+            own = clear[p + 1 + pair]
+            atol = ROUNDING * np.outer(size[p + 1 + pair], size[p + 1 + pair])
+            assert np.all(np.abs(within[i, c] - (own * weight) @ own.T) <= atol)
+
+
+def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
+    lib: Library, rough: Study, poses: Array
+) -> None:
+    rows, kept = rough.rows, kept_rows(rough, poses)
+    alone = Rows(rows.error[kept], orthonormal(rows.basis[kept]), rows.variance_ratio[kept],
+                 rows.size, 3 * int(np.count_nonzero(rough.model.weight[:, poses])),
+                 rows.turn[poses], rows.weight[poses])  # fmt: skip
+    index = np.array([4, 9])
+    found = lib.only(poses).products.noise(index)
+    expected = restricted(alone, lib.columns[kept][:, index])
+    assert_allclose(found.ratio, expected.ratio, rtol=1e-6)
+    assert_allclose(found.variance, expected.variance, rtol=1e-7)
+
+
+def test_a_candidate_beside_others_is_least_squares_on_the_poses_that_count(
+    lib: Library, rough: Study, poses: Array
+) -> None:
+    some = lib.only(poses)
+    first, second = (next(c for c in some.candidates if c.key == key and not len(c.doubt))
+                     for key in (("backlash", "J2"), ("gear_error", "J3")))  # fmt: skip
+    one = bench(some, [first]).added(second)
+    rows = rough.rows
+    root = np.sqrt(kept_rows(rough, poses) / (1.0 + one.ratio * rows.variance_ratio))[:, None]
+    columns = lib.columns[:, np.concatenate([first.main, second.main])]
+    matrix = np.concatenate([rows.basis, columns], axis=1) * root
+    expected = np.linalg.lstsq(matrix, rows.error * root[:, 0], rcond=None)[0]
+    assert_allclose(one.value, expected[-2:], rtol=1e-8)
+
+
+def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
+    chosen = [next(c for c in lib.candidates if c.key == ("joint_compliance", "all"))]
+    term = Term("gear_ripple", "J4", {"turns": 33.3})
+    table = bench(lib, chosen)
+    aside = lib.aside([(term, 5.0)])
+    loose = table.beside(aside).added(aside.candidates[0])
+    (stored,) = lib.with_terms([(term, 5.0)])
+    held = bench(lib, chosen).added(stored)
+    assert_allclose(loose.value, held.value, rtol=1e-9)
+    assert_allclose([loose.gain, loose.evidence], [held.gain, held.evidence], rtol=1e-8)
+
+
+def test_a_selection_from_some_poses_looks_at_no_other(
+    lib: Library, rough: Study, poses: Array, rng: np.random.Generator
+) -> None:
+    """Errors of the others, whatever they are, change nothing; they are predicted besides."""
+    choice = select(lib.only(poses))
+    assert {c.key for c in choice.chosen} == {("backlash", "J2"), ("gear_ripple", "J4")}
+    kept = kept_rows(rough, poses)
+    other = rough.rows.error + np.where(kept, 0.0, 1e-3 * rng.normal(size=len(kept)))
+    spoilt = select(library(rough.scene, replace(rough.rows, error=other)).only(poses))
+    assert [c.term.text for c in spoilt.chosen] == [c.term.text for c in choice.chosen]
+    for one, again in zip(choice.fits, spoilt.fits, strict=True):
+        assert_allclose(again.value, one.value, rtol=1e-6)
+    assert_allclose((spoilt.left - other)[kept], (choice.left - rough.rows.error)[kept], atol=1e-9)
+    outside = np.sqrt(np.mean(choice.left[~kept] ** 2))
+    assert outside < 1.3 * np.sqrt(np.mean(choice.left[kept] ** 2))
+    assert outside < 0.9 * np.sqrt(np.mean(rough.rows.error[~kept] ** 2))
+
+
+def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
+    q, score, size = rng.uniform(-3, 3, 40), rng.normal(size=40), rng.uniform(size=40)
+    turns = np.arange(8.0, 260.0, 0.31)
+    pull, square, whole = sums(turns, q, score, size)
+    waves = np.exp(1j * np.outer(turns, q))
+    assert_allclose(pull, waves @ score, rtol=0, atol=1e-11)
+    assert_allclose(square, waves**2 @ size, rtol=0, atol=1e-11)
+    assert whole == pytest.approx(size.sum())
+
+
+def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
+    """Columns that come later have the same products as those that were there before."""
+    quiet = study(6e-6, 1.0, 0)
+    early = library(quiet.scene, quiet.rows)
+    late = Library.empty(quiet.scene, quiet.rows)
+    terms = [c.term for c in early.candidates][:6]
+    for term in terms:  # one by one, products asked for in between
+        (found,) = late.with_terms([(term, 1.0)])
+        first = late.found[terms[0].text].main  # as two effects that share a column
+        twice = np.concatenate([first, found.main, first])
+        for _ in range(NODES):
+            late.products.across(RATIOS[:2], twice)
+    index = np.concatenate([late.found[term.text].main for term in terms])
+    same = np.concatenate([c.main for c in early.candidates[:6]])
+    p = early.products.columns.fixed
+    ours = late.products.across(RATIOS[:2], index)[0][:, :, p + index]
+    theirs = early.products.across(RATIOS[:2], same)[0][:, :, p + same]
+    assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
