@@ -8,7 +8,15 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import DATA, ROBOT, ROWS, Output, options_from, result_options
+from minimax_cal.cli.options import (
+    DATA,
+    ROBOT,
+    ROWS,
+    InGroups,
+    Output,
+    options_from,
+    result_options,
+)
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
@@ -17,7 +25,7 @@ from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
 from minimax_cal.reporting.plots.figures import save_errors
 
 
-@click.command(name="calibrate")
+@click.command(name="calibrate", cls=InGroups)
 @ROBOT
 @DATA
 @options_from(Options)

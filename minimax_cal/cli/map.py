@@ -47,7 +47,10 @@ def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str
 @options_from(Grid, "samples", "bins", "seed")
 @RUNG
 @JSON
-@click.option("-o", "--output", "figure", type=PATH, help="Draw to this PNG, SVG or PDF.")
+@click.option(
+    "-o", "--output", "figure", type=PATH,
+    help="Draw to this PNG, SVG or PDF, or write the numbers to a .json.",
+)  # fmt: skip
 @QUIET
 @with_output
 def map_command(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
 from inspect import signature
@@ -15,6 +15,8 @@ import click
 from rich.console import Console
 
 from minimax_cal.cli import FAILED
+from minimax_cal.cli.progress import stages
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 WIDTH = 110  # of text that goes to no terminal
 MOST_NOTICES = 50
+RESULT = "Measurements and result"
+DRAWN = (".png", ".svg", ".pdf")
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -93,6 +97,8 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
     return click.option(
         flag,
         name,
+        cls=Grouped,
+        group=told.group,
         type=kind,
         is_flag=kind is bool,
         default=shown,
@@ -103,6 +109,30 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
         callback=in_si,
         help=told.help or None,
     )
+
+
+class Grouped(click.Option):
+    """An option that the help lists under a heading."""
+
+    def __init__(self, *given: Any, group: str = "", **more: Any) -> None:
+        super().__init__(*given, **more)
+        self.group = group
+
+
+class InGroups(click.Command):
+    """A command whose help lists its options part by part, those of the result last."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The options under their headings, in the order in which these come first."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for each in self.get_params(ctx):
+            if record := each.get_help_record(ctx):
+                groups.setdefault(getattr(each, "group", "") or RESULT, []).append(record)
+        last = groups.pop(RESULT, [])
+        for title, records in (*groups.items(), (RESULT, last)):
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 def kind_of(default: Any, told: Option, flag: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
@@ -131,11 +161,9 @@ class Output:
     figure: Path | None
     quiet: bool
 
-    @contextmanager
-    def stages(self) -> Iterator[Callable[[str], None]]:
-        """To be told of each stage of long work, which a terminal shows on stderr."""
-        with Console(stderr=True, quiet=self.quiet, highlight=False).status("reading") as status:
-            yield status.update
+    def stages(self) -> AbstractContextManager[Callable[[str], None]]:
+        """To be told of each stage of long work, which stderr shows."""
+        return stages(self.quiet)
 
     def notice(self, *texts: str) -> None:
         """Print notices on stderr, one a line."""
@@ -183,6 +211,7 @@ def with_output(command: Command) -> Command:
         figure: Path | None = None,
         **more: Any,
     ) -> Any:
+        output, figure = by_ending(command, output, figure)
         writable(output)
         drawable(figure)
         return command(*given, to=Output(output, as_json, figure, quiet), **more)
@@ -199,10 +228,37 @@ def measured(path: Path, in_rows: bool) -> Measurements:
     return data.in_visit_order() if in_rows and not ordered(data) else data
 
 
+def by_ending(
+    command: Command, output: Path | None, figure: Path | None
+) -> tuple[Path | None, Path | None]:
+    """Where the result and where its picture go: by the ending of a file, as .json or .svg.
+
+    Raises OptionError for a picture of a command that draws none, or for two of a kind.
+    """
+    if output and output.suffix.lower() in DRAWN:
+        if not getattr(command, "draws", False):
+            raise OptionError(f"{output}: this command draws no picture; write a .json")
+        if figure:
+            raise OptionError(f"{output}: the picture goes to {figure} already")
+        return None, output
+    if figure and figure.suffix.lower() == ".json" and not output:
+        return figure, None
+    return output, figure
+
+
+def drawing(command: Command) -> Command:
+    """A command that can draw its result."""
+    command.draws = True  # type: ignore[attr-defined]
+    return command
+
+
 def result_options(what: str, *, figure: str = "") -> Decorator:
     """The options of a result.  what: what -o writes.  figure: what --figure draws, if anything."""
     drawn = click.option("--figure", type=PATH, help=f"Draw {figure} to this PNG, SVG or PDF.")
-    return stacked(*([drawn] if figure else []), JSON, output(what), QUIET, with_output)
+    if not figure:
+        return stacked(JSON, output(what), QUIET, with_output)
+    what = f"{what}, or by its ending the picture,"
+    return stacked(drawn, JSON, output(what), QUIET, with_output, drawing)
 
 
 def output(what: str) -> Decorator:

@@ -75,58 +75,104 @@ class Options:
     """
 
     objective: str = option(
-        "minimax", "sum, minimax (worst target), point (worst point), pose, or one target: smr:K."
+        "minimax",
+        "What is made small: sum, minimax (the worst target), point (the worst point), pose, or "
+        "one target alone, as smr:2.",
+        group="What is fitted",
     )
-    qp: str = option("daqp", "QP backend of minimax.")
+    qp: str = option(
+        "daqp",
+        "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them.",
+        group="How it is solved",
+    )
     holdout: float = option(
-        0.2, "Share of the poses kept out of the fit; a split column overrides it."
+        0.2,
+        "The share of the poses that the fit does not see; a split column overrides it.",
+        group="What is held out",
     )
-    seed: int = option(0, "Seed of the choice of held-out poses.")
+    seed: int = option(
+        0,
+        "The seed of the choice of held-out poses.",
+        group="What is held out",
+    )
     holdout_by: str | None = option(
         None,
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "
         "left out in turn.",
         metavar="COLUMN",
+        group="What is held out",
     )
     cv: bool = option(
         False,
         "Cross-validate: judge every pose by a fit without it [default: when fewer than 20 are "
         "held out].",
+        group="What is held out",
     )
-    fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
-    free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)
+    fix: Sequence[str] = option(
+        (),
+        "Keep these parameters nominal, as d2,beta*.",
+        many=tuple,
+        group="What is fitted",
+    )
+    free: Sequence[str] = option(
+        (),
+        "Keep these ones where several cannot be told apart.",
+        many=tuple,
+        group="What is fitted",
+    )
     priors: Mapping[str, float] = option(
         dict,
-        "Known tolerance of a parameter about its nominal value, as a*=0.5mm.",
+        "What is known of a parameter: how far it may be from its nominal value, as a*=0.5mm.",
         flag="--prior",
         metavar="NAME=SIGMA",
         read=prior_of,
         many=dict,
+        group="What is fitted",
     )
     effects: Sequence[str | Term] = option(
         (),
         "Fit these too, as joint_compliance:all,backlash:J6; `minimax-cal effects` lists them.",
         metavar="NAME:PLACE",
         many=tuple,
+        group="What is fitted",
     )
-    method: str = option("snllm", f"Least squares: {', '.join(METHODS)}.")
+    method: str = option(
+        "snllm",
+        f"The method of least squares: {', '.join(METHODS)}.",
+        group="How it is solved",
+    )
     loss: str = option(
-        SQUARE, f"Of the distances, against outliers: {', '.join((SQUARE, *LOSSES))}."
+        SQUARE,
+        f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}.",
+        group="Points that stand out",
     )
     trim: float = option(
         0.0,
-        "Set at most this share of the points aside: those that stand out.",
+        "Set at most this share of the points aside, those that stand out.",
         metavar="SHARE",
+        group="Points that stand out",
     )
-    hessian: str = option("gauss-newton", "Of the minimax SQP: gauss-newton or bfgs.")
+    hessian: str = option(
+        "gauss-newton",
+        "The Hessian of the minimax: gauss-newton or bfgs.",
+        group="How it is solved",
+    )
     distance: str = option(
-        "two-sided", "Form of the distance constraints: two-sided, squared or off."
+        "two-sided",
+        "How distances between targets are kept: two-sided, squared or off.",
+        group="How it is solved",
     )
     lever: float | None = option(
-        None, "What a radian counts as in the pose objective [default: the targets' own].", "mm"
+        None,
+        "What a radian counts as in the pose objective [default: the targets' own].",
+        "mm",
+        group="What is fitted",
     )
     distance_tolerance: float | None = option(
-        None, "How far a distance between targets may be off [default: as measured].", "mm"
+        None,
+        "How far a distance between targets may be off [default: as measured].",
+        "mm",
+        group="How it is solved",
     )
     resolution: float = identify.RESOLUTION
 
