@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
@@ -27,9 +28,12 @@ from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
+    Solver,
     check_options,
     listed,
     objective_of,
+    qp_name,
+    sigmas_of,
     silent,
     usable,
 )
@@ -41,7 +45,7 @@ from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
@@ -67,9 +71,9 @@ class Parts:
 
 def calibrate(
     robot: Robot | str | Path,
-    data: Measurements | str | Path,
+    data: Measurements | str | Path | tuple[ArrayLike, ArrayLike],
     objective: str = "minimax",
-    qp: str = "daqp",
+    qp: str | Solver = "daqp",
     *,
     holdout: float = 0.2,
     seed: int = 0,
@@ -77,7 +81,7 @@ def calibrate(
     cv: bool = False,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
-    priors: Mapping[str, float] | None = None,
+    priors: Mapping[str, float | str] | None = None,
     method: str = "snllm",
     lever: float | None = None,
     hessian: str = "gauss-newton",
@@ -91,20 +95,21 @@ def calibrate(
 ) -> Fit:
     """Calibrate a robot from measurements.
 
-    robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
-    worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
-    out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together.  cv: judge every pose by a fit without it, which is done anyway
-    where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list or a text
-    with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method:
-    of the least squares.  lever: what a radian counts as in the pose objective [m], the targets'
-    own unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
-    two-sided, squared or off; distance_tolerance: theirs [m], as measured unless given. resolution:
-    relative singular value that counts as not measured.  effects: beyond geometry, as
-    joint_compliance:J2, or a diagnosis (or its file), whose established effects are taken.  loss:
-    square, huber, cauchy or tukey.  trim: share of the points that may be set aside.  progress:
-    called with a word on each stage. Raises CalibrationError for wrong input; how the numbers ended
-    is in the result's `status`.
+    robot, data: loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
+    3).  objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.  qp:
+    backend of the minimax QPs, or a function from Problem to a verified Solution.  holdout: share
+    of the poses kept out of the fit; seed: of that choice; holdout_by: a column (session, group
+    ...) or region, whose poses are held out together.  cv: judge every pose by a fit without it,
+    which is done anyway where fewer than 20 poses are held out.  fix, free: parameters as
+    ``beta*``, a list or a text with commas. priors: sigma of a parameter's deviation from nominal,
+    by name [m, rad], or a text as 0.5mm.  method: of the least squares.  lever: what a radian
+    counts as in the pose objective [m], the targets' own unless given.  hessian: gauss-newton or
+    bfgs.  distance: form of the distance constraints, two-sided, squared or off;
+    distance_tolerance: theirs [m], as measured unless given. resolution: relative singular value
+    that counts as not measured.  effects: beyond geometry, as joint_compliance:J2, or a diagnosis
+    (or its file), whose established effects are taken.  loss: square, huber, cauchy or tukey.
+    trim: share of the points that may be set aside.  progress: called with a word on each stage.
+    Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
@@ -118,7 +123,7 @@ def calibrate(
         cv=cv,
         fix=listed(fix),
         free=listed(free),
-        priors=priors or {},
+        priors=sigmas_of(priors or {}),
         method=method,
         lever=lever,
         hessian=hessian,
@@ -130,7 +135,7 @@ def calibrate(
         trim=trim,
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    data = data if isinstance(data, Measurements) else read_measurements(data)
+    data = measured(data)
     check(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
@@ -139,6 +144,18 @@ def calibrate(
     for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
         warnings.warn(doubt, CalibrationWarning, stacklevel=2)
     return fit
+
+
+def measured(data: Measurements | str | Path | tuple[ArrayLike, ArrayLike]) -> Measurements:
+    """Measurements as they are, of a file, or of joints (m, n) and points.  Raises DataError."""
+    if isinstance(data, tuple):
+        return measurements(*(np.asarray(part, dtype=float) for part in data))
+    return data if isinstance(data, Measurements) else read_measurements(data)
+
+
+def ran(qp: str | Solver) -> str:
+    """Name of the QP solver that ran."""
+    return usable(qp)[0] if isinstance(qp, str) else qp_name(qp)
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -158,7 +175,8 @@ def check(robot: Robot, data: Measurements, options: Options) -> None:
     """Raise an error, before any work, for what cannot be done."""
     objective_of(options.objective, data)
     check_options(options)
-    usable(options.qp)
+    if isinstance(options.qp, str):
+        usable(options.qp)
     checks.check_joints(robot, data)
     checks.check_spread(data)
 
@@ -202,7 +220,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         cell=calibrated,
         nominal=nominal,
         objective=options.objective,
-        qp=usable(options.qp)[0],  # the one that ran
+        qp=ran(options.qp),
         status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,

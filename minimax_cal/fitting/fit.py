@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, overload
@@ -293,7 +294,11 @@ class Fit:
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
 
     def __repr__(self) -> str:
-        return f"<Fit of {self.robot.name}: {self.objective}. {self.headline()}>"
+        after, known = self.within.after, sum(p.identifiable for p in self.parameters)
+        return (
+            f"<Fit of {self.robot.name}: {self.objective}, RMS {after.rms_mm:.3f} mm, largest "
+            f"{after.max_mm:.3f} mm, {known} of {len(self.parameters)} parameters, {self.status}>"
+        )
 
     def _repr_html_(self) -> str:
         """For a notebook."""
@@ -414,6 +419,11 @@ class Fit:
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
+
+    def plot(self) -> Any:
+        """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""
+        # reporting stands below; what it needs is imported when a picture is asked for
+        return import_module("minimax_cal.reporting.plots.figures").errors_figure(self)
 
     def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
         """What the table of accuracy tells, with titles."""

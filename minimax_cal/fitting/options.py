@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -19,21 +20,30 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import METHODS
-from qp_backends import BackendError, Problem
+from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 
 FALLBACK = "daqp"  # a required package
+FUNCTION = "function "  # before the name of a QP solver that is none of the backends
 TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
 UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
 LENGTHS = ("mm", "um", "m")
 
 
 Progress = Callable[[str], None]
+Solver = Callable[[Problem], Solution]
+QpSolver = str | Solver
 T = TypeVar("T")
 
 
 def silent(message: str) -> None:
     """Say nothing."""
+
+
+def sigmas_of(priors: Mapping[str, float | str]) -> dict[str, float]:
+    """Sigmas of priors in SI, from numbers or texts with a unit.  Raises OptionError."""
+    read = [prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in priors.items()]
+    return dict(read)
 
 
 def prior_of(text: str) -> tuple[str, float]:
@@ -43,15 +53,13 @@ def prior_of(text: str) -> tuple[str, float]:
     for unit in sorted(UNITS, key=len, reverse=True):
         if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTHS):
             what = "a length: give mm" if kind in "ad" else "an angle: give mrad or deg"
-            raise OptionError(f"--prior {text!r}: {name} is {what}")
+            raise OptionError(f"prior {text!r}: {name} is {what}")
         if equals and name and size.endswith(unit):
             try:
                 return name, float(size.removesuffix(unit)) * UNITS[unit]
             except ValueError:
                 break
-    raise OptionError(
-        f"--prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad"
-    )
+    raise OptionError(f"prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad")
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,7 @@ class Options:
         "one target alone, as smr:2.",
         group="What is fitted",
     )
-    qp: str = option(
+    qp: QpSolver = option(  # noqa: RUF009
         "daqp",
         "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them.",
         group="How it is solved",
@@ -179,7 +187,7 @@ class Options:
     def settings(self) -> dict[str, object]:
         """For the record, effects in their written form."""
         effects = [e.text if isinstance(e, Term) else e for e in self.effects]
-        return {**vars(self), "effects": effects}
+        return {**vars(self), "effects": effects, "qp": qp_name(self.qp)}
 
 
 def listed(names: str | Sequence[T]) -> Sequence[T | str]:
@@ -229,12 +237,27 @@ def check_options(options: Options) -> None:
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
 
 
+def qp_name(qp: str | Solver) -> str:
+    """What a QP solver is called in results."""
+    return qp if isinstance(qp, str) else f"{FUNCTION}{getattr(qp, '__name__', 'unnamed')}"
+
+
+def solver_of(qp: str | Solver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
+    """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
+    if not isinstance(qp, str):
+        return qp, ()
+    name, notices = usable(qp)
+    return partial(solve_qp, name=name, tolerance=tolerance), notices
+
+
 def usable(qp: str) -> tuple[str, tuple[str, ...]]:
     """The QP backend to use, and a notice where it is not the one that was named.
 
     A backend that exists but is not installed is replaced; a name that does not exist is a
     mistake.  Raises OptionError.
     """
+    if qp.startswith(FUNCTION):
+        return FALLBACK, (f"QP: the solver was a {qp}; {FALLBACK} is used",)
     try:
         solve_qp(TRIVIAL, qp)
     except BackendError as error:

@@ -14,7 +14,7 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
-from minimax_cal.fitting.options import Options, Progress, objective_of, silent, usable
+from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
@@ -41,7 +41,6 @@ from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
-from qp_backends import solve as solve_qp
 
 QP_TOLERANCE = 1e-9
 # With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
@@ -360,8 +359,7 @@ def worst_case(
         return None, None, ()
     progress("minimax")
     problem = minimax_problem(model, state, distances, options.distance, per)
-    name, notices = usable(options.qp)
-    qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
+    qp, notices = solver_of(options.qp, QP_TOLERANCE)
     optimum = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
     if optimum.status is Status.STALLED and optimum.value * problem.size < EXACT**2:
         optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left

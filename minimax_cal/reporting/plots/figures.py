@@ -83,6 +83,11 @@ def scale_bar(part: FigureBase, shown: Any, panels: Array, label: str, side: str
 
 
 def save_errors(fit: Fit, path: Path) -> None:
+    """`errors_figure` as a file."""
+    save(errors_figure(fit), path)
+
+
+def errors_figure(fit: Fit) -> Figure:
     """Errors before and after: pose by pose, and their distribution on held-out poses."""
     figure = new_figure(10, 3.8)
     from matplotlib.ticker import MaxNLocator
@@ -109,4 +114,4 @@ def save_errors(fit: Fit, path: Path) -> None:
     left.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2)
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.suptitle(f"{fit.robot.name}, objective {fit.objective}", fontweight="bold")
-    save(figure, path)
+    return figure
