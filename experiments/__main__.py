@@ -41,6 +41,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.solver_accuracy",
         "What each QP backend is worth: accuracy, reliability and time",
     ),
+    "external": (
+        "experiments.external",
+        "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
+    ),
     "blind_gap": (
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",

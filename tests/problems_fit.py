@@ -1,6 +1,6 @@
 """Fits that several tests start from."""
 
-from experiments.gap_cases import Case, make
+from experiments.gap_cases import Case, Sealed, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
@@ -19,6 +19,12 @@ def solve(model: Model, begin: State, method: str = "snllm", **kw: object):  # t
 
 def study(jitter: float, noise: float, seed: int, poses: int = 100) -> Study:
     """The training poses of an arm that errs in its geometry only."""
-    made = make(Case("irb2600", "none", jitter=jitter, noise=noise, seed=seed, poses=poses))
+    return study_of(
+        make(Case("irb2600", "none", jitter=jitter, noise=noise, seed=seed, poses=poses))
+    )
+
+
+def study_of(made: Sealed) -> Study:
+    """The training poses of a made arm."""
     train, _, _ = split(with_history(made.data), 0.2, 0)
     return studied(made.robot, train, fit_cell(made.robot, train, Options(objective="sum"), silent))

@@ -29,11 +29,15 @@ ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 class Causes:
     """What may be wrong.
 
-    faults: of the data.  choice: the effects selected, effects: as findings, the weightiest first.
+    faults: of the data.  library: what could be tested, and ripple:
+    whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
+    weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.
     """
 
     faults: tuple[Fault, ...]
+    library: Library
+    ripple: bool
     choice: Choice
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
@@ -54,7 +58,10 @@ def causes_of(
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
-    return Causes((*faults, *read_back), choice, tuple(effects), traces, lib.untestable)
+    ripple = "gear_ripple" not in exclude
+    return Causes(
+        (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
+    )
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:

@@ -144,7 +144,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         verdict = "not_repeatable"
     beyond = NOT_ASKED
     if not options.quick:
-        beyond = beyond_of(study, judges, options.exclude, progress)
+        beyond = beyond_of(study, causes, judges, progress)
     wrong = doubts(robot, study.fit, study.nominal.error(study.data))
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import chosen, effects_of
+from minimax_cal.diagnosing.causes import Causes, effects_of
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.beyond import Beyond, Errors, without
 from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.uncertainty import Estimator
@@ -32,19 +33,19 @@ class Fold:
         return tuple(self.effects[number] for number in self.ladder.taken)
 
 
-def fold_of(study: Study, rows: Array, state: State, exclude: Sequence[str]) -> Fold:
+def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: bool) -> Fold:
     """Effects sought and fitted on some rows only.
 
-    rows: (m,) True for them.  state: the geometry that was fitted to them.
+    library: of all rows, whose products serve every fold.  rows: (m,) True for those used.  state:
+    the geometry that was fitted to them.  ripple: whether lines of gears are looked for.
     """
-    fit = replace(study.fit, state=state)
-    small = studied(study.robot, study.data.take(rows), fit)
-    _, choice = chosen(small, exclude)
+    small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
+    choice = select(library.only(rows), ripple=ripple)
     effects = tuple(effects_of(choice))
     return Fold(effects, climbed(small, effects, choice.noise))
 
 
-def beyond_of(study: Study, judges: Judges, exclude: Sequence[str], progress: Progress) -> Beyond:
+def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:
     """Every part of the poses judges a model that was sought without it."""
     data = judges.everyone
     found = parts(data)
@@ -58,7 +59,7 @@ def beyond_of(study: Study, judges: Judges, exclude: Sequence[str], progress: Pr
         if state is None:
             continue
         progress(f"part {number + 1} of {len(found)} left out: {part.name}")
-        fold = fold_of(study, ~mask, state, exclude)
+        fold = fold_of(study, causes.library, ~mask, state, causes.ripple)
         rows, fits = data.take(part.rows), fold.ladder.fits
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
     return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")

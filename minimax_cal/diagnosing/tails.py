@@ -33,7 +33,7 @@ def judged(size: Array, directions: int) -> tuple[Spread, Array]:
     seen = np.isfinite(size)
     scores = Scores(np.where(seen, size, 0.0) ** 2, directions * seen)
     spread = spread_of(scores, float(directions * seen.sum()))
-    return spread, spread.far(scores).any(axis=0)
+    return spread, np.asarray(spread.far(scores).any(axis=0))
 
 
 def are_wrong(fault: Fault, rows: Array, line: Array) -> bool:

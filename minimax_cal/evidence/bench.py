@@ -73,7 +73,7 @@ class Settings:
         block = block + ridge[..., None] * np.eye(d)
         pull = self.pull[:, index]
         diagonal = np.einsum("scdd->scd", block)
-        alive = diagonal > 1e-7 * self.whole[:, index]
+        alive = diagonal > np.maximum(1e-7 * self.whole[:, index], 1e-200)
         if d == 1:
             inverse = np.where(alive, 1.0 / np.where(alive, diagonal, 1.0), 0.0)
             return inverse * pull, inverse, (inverse * pull * pull)[..., 0]

@@ -13,6 +13,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+GONE = 1e-8  # share of a field that poses must show
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 
 
@@ -132,7 +133,8 @@ class Library:
         across, _, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
         own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
         left = own - (across[0, :, products.columns.fixed :] ** 2).sum(axis=0)
-        clear = left > FAINT * whole[0]
+        every = (products.columns.raw**2).sum(axis=0)  # what a part shows less of is rounding
+        clear = (left > FAINT * whole[0]) & (whole[0] > GONE * every)
         shown = tuple(c for c in self.candidates if clear[c.main].all())
         gone = {c.term.effect for c in self.candidates} - {c.term.effect for c in shown}
         lacking = [(name, "poses at which geometry does not imitate it") for name in sorted(gone)]

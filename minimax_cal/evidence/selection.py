@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.noise import Noise, Rows, remaining
@@ -25,6 +27,8 @@ SMALL, PLENTY = 0.02, 2000.0  # of degrees of freedom beyond so many: less gain 
 REFINED = 6  # effects among which each is compared anew with all others
 NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
 TUNINGS = 3  # rounds of a finer search
+LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
+NOTHING: Array = np.zeros(0, dtype=int)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +73,7 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
-    if noise.variance < EXACT**2:
+    if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), (), noise)
     tables: dict[tuple[int, ...], Bench] = {}
     for _ in range(most):
@@ -78,6 +82,8 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
             found = strongest_lines(lib.scene, lib.rows, noise, known, kept=lib.products.kept)
             lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
         table = bench(lib, [one.candidate for one in fits], fits)
+        if table.dof < LEAST_DOF:
+            break
         tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table)
         if not best:

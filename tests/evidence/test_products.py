@@ -177,3 +177,14 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     ours = late.products.across(RATIOS[:2], index)[0][:, :, p + index]
     theirs = early.products.across(RATIOS[:2], same)[0][:, :, p + same]
     assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
+
+
+def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None:
+    """A nest that moved late, and poses from before: rounding is left of its columns."""
+    made = study(jitter=0.0, noise=1.0, seed=3)
+    whole = library(made.scene, made.rows)
+    shift = next(c for c in whole.candidates if c.term.effect == "target_shift")
+    since = made.scene.data.columns["clock"] < shift.term.choice["since"]
+    part = whole.only(since)
+    assert shift not in part.candidates
+    select(part)  # and no warning

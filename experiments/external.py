@@ -1,0 +1,206 @@
+"""Do the claims hold on poses that nobody has seen?
+
+    python -m experiments.external [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N] ...
+
+Poses are set aside before anything is done: random halves, the first and the last fifth, the ends
+of joints 1 to 3.  The rest is calibrated, and diagnosed; what is claimed (*within*: held out at
+random; *beyond*: whole parts left out, typical and worst) is set beside the RMS on the poses set
+aside.  Real arms where their measurements are on this machine, and simulated ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import gap_cases, sweep
+from experiments.real import here, real
+from experiments.sweep import Study, study_options
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.history import clock, numbered, with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.robot import Robot
+
+REAL = ("irb120", "ur10_b", "meca500_r", "fanuc_r2000", "qkm_hl6")
+SIMULATED = ("simulated play", "simulated compliance")
+HALVES = 10  # random halves an arm
+FIFTH, QUARTER = 0.2, 0.25
+WAYS = ("calibrate", "diagnose")
+RANDOM = "random half"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One arm, the poses set aside, and what is done with the others.
+
+    every: of so many rows of the file one is used.
+    """
+
+    arm: str
+    split: str
+    way: str
+    seed: int
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What was claimed, and what poses set aside show [mm]."""
+
+    within: float
+    typical: float
+    worst: float
+    external: float
+    geometric: float
+
+
+def arm_of(name: str) -> tuple[Robot, Measurements]:
+    """A robot as drawn and its measurements."""
+    if name in REAL:
+        return real(name)
+    effect, place, size = {
+        "simulated play": ("backlash", "J2", 2000.0),
+        "simulated compliance": ("joint_compliance", "all", 2000.0),
+    }[name]
+    made = gap_cases.make(
+        gap_cases.Case("irb2600", "single", (gap_cases.Cause(effect, place, size),), seed=11)
+    )
+    columns = {key: value for key, value in made.data.columns.items() if key != "split"}
+    return made.robot, replace(made.data, columns=columns)
+
+
+def splits(arm: str, halves: int) -> Iterator[tuple[str, int]]:
+    """Names of the splits of an arm, with their seeds."""
+    yield from ((RANDOM, seed) for seed in range(halves))
+    yield from (("first fifth", 0), ("last fifth", 0))
+    yield from ((f"{end} q{joint}", 0) for joint in (1, 2, 3) for end in ("low", "high"))
+
+
+def aside(data: Measurements, split: str, seed: int) -> Array:
+    """(m,) True for the poses that a split sets aside; repeats are on one side."""
+    group = groups(data)
+    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
+    if split == RANDOM:
+        order = np.random.default_rng(seed).permutation(len(first))
+        return np.asarray((order < len(first) // 2)[inverse])
+    if split.endswith("fifth"):
+        when = clock(data) if numbered(data) else np.arange(data.poses) / data.poses
+        rows = when < FIFTH if split.startswith("first") else when > 1.0 - FIFTH
+    else:
+        q = data.q[:, int(split[-1]) - 1]
+        low = split.startswith("low")
+        rows = q < np.quantile(q, QUARTER) if low else q > np.quantile(q, 1.0 - QUARTER)
+    return np.asarray(rows[first][inverse])
+
+
+def run(job: Job) -> Claim | None:
+    """The claim of one job; None where the other poses are too few."""
+    robot, data = arm_of(job.arm)
+    data = with_history(data.take(np.arange(0, data.poses, job.every)))
+    away = aside(data, job.split, job.seed)
+    rest, outside = data.take(~away), data.take(away)
+    try:
+        if job.way == "calibrate":
+            fit = mc.calibrate(robot, rest, "sum", seed=job.seed)
+            held, beyond = fit.accuracy["holdout"], fit.beyond
+            first = last = fit.cell
+        else:
+            found = mc.diagnose(robot, rest, seed=job.seed)
+            held, beyond = found.ladder[-1].holdout, found.beyond
+            first, last = found.cells[0], found.cells[-1]
+    except mc.CalibrationError:
+        return None
+    known = outside.keep(np.isin(outside.target_names, last.target_names))
+    return Claim(
+        held.rms_mm,
+        beyond.typical_mm,
+        beyond.worst_mm,
+        accuracy(last.error(known)).rms_mm,
+        accuracy(first.error(known)).rms_mm,
+    )
+
+
+def rows_of(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> list[tuple[Cell, ...]]:
+    """Every claim beside what came of it."""
+    return [
+        (job.arm, job.way, job.split, job.seed, c.within, c.typical, c.worst, c.external,
+         c.geometric, c.external / c.within, c.external / c.typical, c.external / c.worst,
+         c.external / c.geometric)
+        for job, c in zip(jobs, claims, strict=True) if c
+    ]  # fmt: skip
+
+
+HEADER = ("arm", "way", "set aside", "seed", "within mm", "beyond typical mm", "beyond worst mm",
+          "external mm", "geometry alone mm", "external / within", "external / typical",
+          "external / worst", "external / geometry")  # fmt: skip
+NAMES = ("arm", "way", "split", "seed", "within_mm", "typical_mm", "worst_mm", "external_mm",
+         "geometric_mm", "over_within", "over_typical", "over_worst", "over_geometric")  # fmt: skip
+
+
+def summary(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> Table:
+    """How far the claims hold: shares [%] and medians of the ratios."""
+    rows: list[tuple[Cell, ...]] = []
+    pairs = [(job, c) for job, c in zip(jobs, claims, strict=True) if c]
+    for arm, way in dict.fromkeys((job.arm, job.way) for job, _ in pairs):
+        own = [(job, c) for job, c in pairs if (job.arm, job.way) == (arm, way)]
+        inside = np.array([c.external / c.within for job, c in own if job.split == RANDOM])
+        new = [c for job, c in own if job.split != RANDOM]
+        typical, worst, plain = (
+            np.array([c.external / getattr(c, name) for c in new])
+            for name in ("typical", "worst", "geometric")
+        )
+        rows.append(
+            (arm, way, len(inside), 100.0 * middle((inside > 0.8) & (inside < 1.25)),
+             np.median([c.external for job, c in own if job.split == RANDOM]) if len(inside) else
+             np.nan, len(new), float(np.nanmedian(typical)) if len(new) else np.nan,
+             float(np.nanmedian(worst)) if len(new) else np.nan,
+             float(np.nanmax(worst)) if len(new) else np.nan, 100.0 * middle(worst <= 1.25),
+             100.0 * middle(plain <= 1.05))
+        )  # fmt: skip
+    return Table(
+        "external over claimed",
+        ("arm", "way", "random halves", "over within 0.8-1.25 %", "external mm", "regions, ends",
+         "over typical, median", "over worst, median", "over worst, most", "worst <= 1.25 %",
+         "geometry <= 1.05 %"),
+        tuple(rows),
+        ("", "", "d", ".0f", ".4f", "d", ".2f", ".2f", ".2f", ".0f", ".0f"),
+    )  # fmt: skip
+
+
+def middle(of: Array) -> float:
+    """Mean, NaN of nothing."""
+    return float(np.mean(of)) if len(of) else float("nan")
+
+
+@click.command()
+@study_options("external")
+@click.option("--arms", default=",".join((*REAL, *SIMULATED)), show_default=True)
+@click.option("--ways", default=",".join(WAYS), show_default=True)
+@click.option("--halves", type=int, default=HALVES, show_default=True)
+def main(study: Study, arms: str, ways: str, halves: int) -> None:
+    """Claimed accuracy beside that on poses set aside."""
+    named = [arm for arm in arms.split(",") if arm not in REAL or here(arm)]
+    if study.quick:
+        named, halves = [SIMULATED[0], *(arm for arm in named if arm == "qkm_hl6")], 2
+    jobs = [
+        Job(arm, split, way, study.seed + seed)
+        for arm in named
+        for way in ways.split(",")
+        for split, seed in splits(arm, halves)
+    ]
+    claims = study.sweep(run, jobs, "poses set aside")
+    every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
+                  ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 4))  # fmt: skip
+    content = [dict(zip(NAMES, row, strict=True)) for row in every.rows]
+    study.save([summary(jobs, claims), every], {"rows": content})
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)

@@ -1,0 +1,139 @@
+import json
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import study_of
+
+import minimax_cal as mc
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.gap import climbed, folds
+from minimax_cal.diagnosing.joint import bounded, bounds, joint, weights
+from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.modelling.effects.table import Term
+
+WHITE = Noise(0.0, 2e-5**2, 0.0)
+SHAKY = Noise(1.0, 2e-5**2, 3e-5)
+PLAY = Term("backlash", "J2")
+SOFT = Term("joint_compliance", "J2", {"parts": 128.0})
+
+
+def case(*causes: Cause, seed: int = 1) -> Study:
+    return study_of(make(Case("irb2600", "single", causes, seed=seed)))
+
+
+@pytest.fixture(scope="module")
+def play() -> Study:
+    return case(Cause("backlash", "J2", 1000.0))
+
+
+def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
+    root = rng.normal(size=(12, 9))
+    gram, pull = root.T @ root, 5.0 * rng.normal(size=9)
+    low, high = np.full(9, -np.inf), np.full(9, np.inf)
+    low[:4], high[2:6] = -0.05, 0.02
+    x = cp.Variable(9)
+    cost = cp.quad_form(x, cp.psd_wrap(gram)) - 2.0 * pull @ x
+    cp.Problem(cp.Minimize(cost), [x[:4] >= -0.05, x[2:6] <= 0.02]).solve(solver=cp.CLARABEL)
+    assert_allclose(bounded(gram, pull, low, high), x.value, atol=1e-6)
+    free = bounded(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
+    assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
+
+
+def test_poses_are_weighed_by_the_inverse_of_their_covariance(play: Study) -> None:
+    weight = weights(play, SHAKY)
+    model, state = play.model, play.fit.state
+    arm = Poses.of(Estimator(model, np.ones(len(model.y))), state).arm
+    turn = np.kron(np.eye(arm.shape[1] // 3), state.rotation)
+    cover = SHAKY.variance * np.eye(arm.shape[1]) + SHAKY.jitter**2 * arm[7] @ arm[7].T
+    assert_allclose(turn.T @ weight[7] @ turn @ cover, SHAKY.variance * np.eye(len(cover)),
+                    atol=1e-9 * SHAKY.variance)  # fmt: skip
+    assert_allclose(weights(play, WHITE)[3], np.eye(arm.shape[1]), atol=1e-12)
+
+
+def test_alike_weights_are_plain_least_squares(play: Study) -> None:
+    fit = joint(play, (), WHITE)
+    assert_allclose(fit.train.rms_mm, accuracy(play.geometric.error(play.data)).rms_mm, rtol=1e-6)
+
+
+def test_cross_validation_is_that_of_fits_made_anew(play: Study) -> None:
+    fit = joint(play, (PLAY,), WHITE)
+    part = folds(play.data, 5)
+    masks = [part == number for number in range(5)]
+    square = 0.0
+    for mask in masks:
+        rest = studied(play.robot, play.data.take(~mask), play.fit)
+        error = joint(rest, (PLAY,), WHITE).cell.error(play.data.take(mask))
+        square += float(np.nansum(error**2))
+    # linear against exact: second order in changes of some 10 um
+    assert_allclose(fit.cross_validated(masks), square, rtol=2e-3)
+
+
+def test_compliances_are_not_negative() -> None:
+    made = make(Case("irb2600", "single", (Cause("joint_compliance", "J2", 1000.0),), seed=3))
+    study = study_of(made)
+    pulled = joint(study, (SOFT,), WHITE)
+    assert pulled.state.effects[0] > 0.0
+    left = study.geometric.error(study.data)
+    mirrored = study.data.with_y(study.data.y - 2.0 * np.moveaxis(left, 0, 1))
+    pushed = joint(studied(study.robot, mirrored, study.fit), (SOFT,), WHITE)
+    assert pushed.state.effects[0] == 0.0
+    assert pushed.rests.tolist() == [True]
+    assert np.isnan(pushed.uncertainty.sigma[-1])
+    low, high = bounds(study.scene, (SOFT, PLAY)).T
+    assert low[0] == 0.0
+    assert low[1] == -high[1]
+    assert (high > 0.0).all()
+
+
+def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
+    """Backlash at joint 2 is there; ripple of a joint that has none is not."""
+    idle = [(Term("gear_ripple", "J6", {"turns": turns}),) for turns in (31.0, 47.0, 83.0, 117.0)]
+    ladder = climbed(play, [(PLAY,), *idle], WHITE)
+    assert ladder.taken[0] == 0
+    assert len(ladder.taken) <= 3  # each helps groups of poses by accident about as often as not
+    errors = [fit.cross_validated([folds(play.data, 5) == i for i in range(5)])
+              for fit in ladder.fits]  # fmt: skip
+    assert (np.diff(errors) < 0.0).all()
+
+
+def test_what_is_told_is_what_is_saved() -> None:
+    made = make(Case("irb2600", "pair", (Cause("joint_compliance", "all", 2000.0),
+                                         Cause("backlash", "J3", 2000.0)), seed=2))  # fmt: skip
+    found = mc.diagnose(made.robot, made.data, quick=True)
+    assert len(found.findings) >= 2
+    kept = {(t.effect, t.place): values for t, values in zip(
+        found.cells[-1].effects.terms, found.cells[-1].effects.values, strict=True)}  # fmt: skip
+    content = json.loads(found.json())
+    for told in content["effects"]:
+        values = [p["value"] * (1e-3 if p["unit"] == "mm" else 1.0) for p in told["parameters"]]
+        assert_allclose(values, kept[told["effect"], told["place"]], rtol=1e-12)
+    saved = {(e["effect"], e["place"]): e["values"] for e in content["cells"][-1]["effects"]}
+    for key, values in kept.items():
+        assert_allclose(saved[key], values, rtol=1e-12)
+
+
+def test_heavy_tails_are_not_named() -> None:
+    made = make(Case("irb2600", "none", (), seed=4))
+    rng = np.random.default_rng(0)
+    verdicts = []
+    for _ in range(4):
+        noise = 3e-5 * rng.standard_t(3, size=made.data.y.shape)
+        found = mc.diagnose(made.robot, made.data.with_y(made.data.y + noise), quick=True)
+        verdicts.append((found.verdict, [f.term.effect for f in found.findings]))
+    assert all(verdict != "named" for verdict, _ in verdicts), verdicts
+    assert not any("outliers" in names for _, names in verdicts), verdicts
+
+
+def test_held_out_poses_stay_where_they_were_put() -> None:
+    made = make(Case("irb2600", "single", (Cause("outliers", "all", 1.0),), seed=7))
+    sound = make(Case("irb2600", "none", (), seed=7))
+    spoilt, clean = (mc.diagnose(m.robot, m.data, quick=True) for m in (made, sound))
+    lines = [set(d.data.line[d.held].tolist()) for d in (spoilt, clean)]
+    assert lines[0] <= lines[1]  # a row without a sound point is not in the data
+    assert spoilt.ladder[-1].holdout.poses == clean.ladder[-1].holdout.poses
+    assert spoilt.ladder[-1].trusted.rms_mm < 0.5 * spoilt.ladder[-1].holdout.rms_mm
