@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
+from rich.text import Text
 
 from minimax_cal.cli import FAILED
 from minimax_cal.cli.progress import stages
@@ -273,12 +274,13 @@ def terminal() -> Console:
 
 
 def show(*tables: Table, headline: str = "") -> None:
-    """Print tables on stdout, and what they come to."""
+    """Print what tables come to on stdout, and the tables."""
     console = terminal()
+    if headline:
+        console.print(Text(visible(headline)), soft_wrap=not console.is_terminal)
+        click.echo()
     for table in tables:
         console.print(table.rich())
-    if headline:
-        click.echo(f"\n{visible(headline)}")
 
 
 def writable(*paths: Path | None) -> None:

@@ -270,6 +270,10 @@ def remarks(options: Options, poses: Parts) -> Iterator[str]:
         )
     if not poses.held.poses:
         yield "no pose is held out: nothing here says how the fit does on new poses"
+    if options.objective.startswith("smr:") and len(poses.data.target_names) > 1:
+        name = options.objective.replace(":", "")
+        others = ", ".join(other for other in poses.data.target_names if other != name)
+        yield f"objective {options.objective}: {name} alone is fitted; {others} took no part"
     if options.objective == "minimax" and len(poses.data.target_names) == 1:
         yield "there is one target: minimax and sum are the same"
     if checks.collinear(poses.train):

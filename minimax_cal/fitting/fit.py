@@ -183,7 +183,7 @@ def parameter_table(parameters: Iterable[Parameter]) -> Table:
         for p in parameters
     )  # fmt: skip
     header = ("name", "unit", "nominal", "calibrated", "change", "sigma", NOT_IDENTIFIED)
-    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".4f", ""))
+    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".2g", ""))
 
 
 @dataclass(frozen=True)
@@ -505,7 +505,7 @@ class Fit:
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
-        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back to the last digit."""

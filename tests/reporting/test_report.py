@@ -196,7 +196,7 @@ def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> No
         assert unit == {"rad": "mrad", "mm": "mm"}[p["unit"]]
         assert (nominal, value) == (f"{scale * p['nominal']:.4f}", f"{scale * p['value']:.4f}")
         assert change == f"{scale * (p['value'] - p['nominal']):+.4f}"
-        assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.4f}")
+        assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.2g}")
         assert reason == ("" if p["identifiable"] else p["reason"])
 
 
