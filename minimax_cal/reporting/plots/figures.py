@@ -1,4 +1,4 @@
-"""Pictures of a calibration (needs matplotlib: pip install minimax-cal[plot])."""
+"""Pictures of a calibration (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib import figure
     except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+        raise OptionError("a picture needs matplotlib: pip install '.[plot]' in a clone") from error
     return figure.Figure(figsize=(width, height), layout="constrained")
 
 

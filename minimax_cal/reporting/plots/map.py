@@ -1,4 +1,4 @@
-"""The picture of a map of the workspace (needs matplotlib: pip install minimax-cal[plot])."""
+"""The picture of a map of the workspace (needs matplotlib)."""
 
 from __future__ import annotations
 
