@@ -15,8 +15,9 @@ def from_clone(install: str) -> str:
 
 
 def optional(module: str, what: str, install: str) -> Any:
-    """A package that may be missing.  what: needs it.  install: what brings it, for pip, as pandas or
-    "minimax-cal[report]"; extras of our own are installed from a clone, as no index has them yet.
+    """A package that may be missing.  what: needs it.  install: what brings it, for pip.
+
+    Extras of our own, as "minimax-cal[report]", are installed from a clone: no index has them yet.
 
     Raises OptionError.
     """
