@@ -21,6 +21,7 @@ from experiments import gap_cases, sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups
@@ -198,7 +199,7 @@ def main(study: Study, arms: str, ways: str, halves: int) -> None:
     claims = study.sweep(run, jobs, "poses set aside")
     every = Table("every split", HEADER, tuple(rows_of(jobs, claims)),
                   ("", "", "", "d", *[".4f"] * 5, *[".2f"] * 4))  # fmt: skip
-    content = [dict(zip(NAMES, row, strict=True)) for row in every.rows]
+    content = [dict(plain(dict(zip(NAMES, row, strict=True)))) for row in every.rows]
     study.save([summary(jobs, claims), every], {"rows": content})
 
 

@@ -33,7 +33,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, where_tabl
 @click.command(name="diagnose")
 @ROBOT
 @DATA
-@options_from(Options, "holdout", "seed", "holdout_by")
+@options_from(Options, "holdout", "seed", "holdout_by", "instrument")
 @options_of(
     diagnose,
     exclude=Option(

@@ -43,6 +43,7 @@ from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended
 from minimax_cal.measuring.floor import floor_of
 from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
@@ -58,6 +59,7 @@ def diagnose(
     seed: int = 0,
     holdout: float = 0.2,
     holdout_by: str | None = None,
+    instrument: str | None = None,
     exclude: Sequence[str] = (),
     quick: bool = False,
     progress: Progress = silent,
@@ -66,7 +68,8 @@ def diagnose(
 
     robot, data: loaded, or a name or path.  seed, holdout: of the poses kept out of the fit, and
     their share; holdout_by: a column (session, group ...) or region, whose poses are held out
-    together.  exclude: effects that are not to be considered.  quick: leave no parts of the poses
+    together.  instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
+    exclude: effects that are not to be considered.  quick: leave no parts of the poses
     out in turn, so that there is no claim beyond the measured poses.  progress: called with a
     word on each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
     CalibrationError for wrong input.
@@ -81,8 +84,8 @@ def diagnose(
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
     checks.check_joints(robot, given)
     checks.check_spread(given)
-    options = DiagnosisOptions(seed, holdout, holdout_by, tuple(exclude), quick)
-    raw = with_groups(with_history(given))
+    options = DiagnosisOptions(seed, holdout, holdout_by, instrument, tuple(exclude), quick)
+    raw = with_groups(with_history(with_instrument(given, instrument)))
     held, notices = held_out(raw, holdout, seed, holdout_by)
     if not held.any():
         raise DataError(
@@ -99,6 +102,7 @@ class DiagnosisOptions:
     seed: int
     holdout: float
     holdout_by: str | None
+    instrument: str | None
     exclude: tuple[str, ...]
     quick: bool
 
@@ -128,7 +132,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     progress("gap ladder")
-    ladder = climbed(study, [finding.terms for finding in causes.effects], noise)
+    ladder = climbed(study, [finding.terms for finding in causes.effects])
     steps = steps_of(asked, study, judges, causes, ladder)
     floor = floor_of(
         clean.data,

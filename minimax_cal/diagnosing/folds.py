@@ -42,7 +42,7 @@ def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: b
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = select(library.only(rows), ripple=ripple)
     effects = tuple(effects_of(choice))
-    return Fold(effects, climbed(small, effects, choice.noise))
+    return Fold(effects, climbed(small, effects))
 
 
 def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:

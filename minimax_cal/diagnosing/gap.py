@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
-from minimax_cal.diagnosing.result import Finding, Step
+from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
@@ -18,6 +18,7 @@ from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State
 
@@ -55,14 +56,14 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]], noise: Noise) -> Ladder:
+def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
     """The ladder of a study's effects, in their order."""
     part = folds(study.data, FOLDS)
-    fits, taken = [joint(study, (), noise)], []
+    fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
     square = fits[0].cross_validated(spared)
     for number, terms in enumerate(effects):
-        wide = joint(study, (*fits[-1].terms, *terms), noise)
+        wide = joint(study, (*fits[-1].terms, *terms))
         new = wide.cross_validated(spared)
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
@@ -80,8 +81,27 @@ def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
         own = slice(at, at + len(finding.values))
         at = own.stop
         values, sure = last.state.effects[own].tolist(), sigma[own].tolist()
-        out.append(replace(finding, values=tuple(values), sigmas=tuple(sure)))
+        motion = motions(ladder.last.study.scene, finding)
+        out.append(replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion))
     return out
+
+
+def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:
+    """The largest motion per unit of each parameter, where its unit rests on assumed masses.
+
+    Turns of a joint [rad], or motion of a target [m].
+    """
+    told = scene.known_masses or scene.measured_torques
+    if told or not set(finding.units) <= set(TOLD_AS):
+        return ()
+    out: list[float] = []
+    for term in finding.terms:
+        columns = term.columns(scene)
+        turns = finding.units[0] == "rad/(N m)"
+        fields = columns.turn if turns else columns.displacement(scene)
+        size = np.abs(fields) if turns else np.linalg.norm(fields, axis=2)
+        out += [float(part.max()) for part in size]
+    return tuple(out)
 
 
 # ---- accuracy ----------------------------------------------------------------------------------

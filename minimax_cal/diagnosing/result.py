@@ -34,6 +34,7 @@ FAULTS = {
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
 }
+TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -66,7 +67,9 @@ class Finding:
     of its parameters, SI.  size: lambda, the weighed square of its projected motion.  p_value:
     probability of so much by accident, the whole library tried.  share: of the gap that it closes
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
-    known [mm].  rows: of a data fault.
+    known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
+    the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
+    told; empty otherwise.
     """
 
     terms: tuple[Term, ...]
@@ -82,6 +85,7 @@ class Finding:
     after: float = float("nan")
     fixed: Mapping[str, float] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
+    motion: tuple[float, ...] = ()
 
     @property
     def term(self) -> Term:
@@ -120,17 +124,24 @@ class Finding:
         return "-" if math.isnan(p) else f"< {SURE:g}" if p < SURE else f"{p:.1g}"
 
     def parameters(self) -> list[dict[str, Any]]:
-        """Each with value, sigma and unit, for JSON: lengths in millimetres."""
-        scale = [1e3 if unit == "m" else 1.0 for unit in self.units]
+        """Each with value, sigma and unit, for JSON: lengths in millimetres.
+
+        Where masses are not told, by the largest motion that it makes: mrad, or mm.
+        """
+        scale, units = [1e3 if unit == "m" else 1.0 for unit in self.units], self.units
+        units = tuple("mm" if unit == "m" else unit for unit in units)
+        if self.motion:
+            scale = [1e3 * size for size in self.motion]
+            units = tuple(TOLD_AS.get(unit, unit) for unit in self.units)
         return [
             {
                 "name": name,
                 "value": value * factor,
                 "sigma": finite(sigma * factor),
-                "unit": "mm" if unit == "m" else unit,
+                "unit": unit,
             }
             for name, unit, value, sigma, factor in zip(
-                self.names, self.units, self.values, self.sigmas, scale, strict=True
+                self.names, units, self.values, self.sigmas, scale, strict=True
             )
         ]
 

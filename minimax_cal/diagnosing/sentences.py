@@ -14,12 +14,15 @@ from minimax_cal.measuring.floor import Floor
 def opening(ladder: Sequence[Step], floor: Floor) -> str:
     """What geometry alone does."""
     nominal, geometric = ladder[0].holdout, ladder[1].holdout
-    most = "" if floor.certain else "at most "
+    known = (
+        f"{floor.value:.3f} mm ({floor.source})"
+        if floor.certain
+        else (f"at most {floor.value:.3f} mm, the noise of the fit")
+    )
     return (
         f"On poses that no fit has seen, the nominal robot misses by {nominal.rms_mm:.3f} mm RMS, "
         f"the geometrically calibrated one by {geometric.rms_mm:.3f} mm (largest "
-        f"{geometric.max_mm:.3f} mm); noise alone would leave {most}{floor.value:.3f} mm "
-        f"({floor.source})."
+        f"{geometric.max_mm:.3f} mm); noise alone would leave {known}."
     )
 
 

@@ -45,6 +45,7 @@ from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
@@ -79,6 +80,7 @@ def calibrate(
     seed: int = 0,
     holdout_by: str | None = None,
     cv: bool = False,
+    instrument: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
     priors: Mapping[str, float | str] | None = None,
@@ -99,17 +101,18 @@ def calibrate(
     3).  objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.  qp:
     backend of the minimax QPs, or a function from Problem to a verified Solution.  holdout: share
     of the poses kept out of the fit; seed: of that choice; holdout_by: a column (session, group
-    ...) or region, whose poses are held out together.  cv: judge every pose by a fit without it,
-    which is done anyway where fewer than 20 poses are held out.  fix, free: parameters as
-    ``beta*``, a list or a text with commas. priors: sigma of a parameter's deviation from nominal,
-    by name [m, rad], or a text as 0.5mm.  method: of the least squares.  lever: what a radian
-    counts as in the pose objective [m], the targets' own unless given.  hessian: gauss-newton or
-    bfgs.  distance: form of the distance constraints, two-sided, squared or off;
-    distance_tolerance: theirs [m], as measured unless given. resolution: relative singular value
-    that counts as not measured.  effects: beyond geometry, as joint_compliance:J2, or a diagnosis
-    (or its file), whose established effects are taken.  loss: square, huber, cauchy or tukey.
-    trim: share of the points that may be set aside.  progress: called with a word on each stage.
-    Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
+    ...) or region, whose poses are held out together.  instrument: u95 of a coordinate, as
+    10um+2.5um/m, where the data do not say.  cv: judge every pose by a fit without it, which is
+    done anyway where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list
+    or a text with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad],
+    or a text as 0.5mm.  method: of the least squares.  lever: what a radian counts as in the pose
+    objective [m], the targets' own unless given.  hessian: gauss-newton or bfgs.  distance: form of
+    the distance constraints, two-sided, squared or off; distance_tolerance: theirs [m], as measured
+    unless given. resolution: relative singular value that counts as not measured.  effects: beyond
+    geometry, as joint_compliance:J2, or a diagnosis (or its file), whose established effects are
+    taken.  loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
+    progress: called with a word on each stage. Raises CalibrationError for wrong input; how the
+    numbers ended is in the result's `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
@@ -121,6 +124,7 @@ def calibrate(
         seed=seed,
         holdout_by=holdout_by,
         cv=cv,
+        instrument=instrument,
         fix=listed(fix),
         free=listed(free),
         priors=sigmas_of(priors or {}),
@@ -185,7 +189,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     """Training and held-out poses; targets that hardly any pose shows are left out."""
     if options.effects:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
-    data = with_groups(data)
+    data = with_groups(with_instrument(data, options.instrument))
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES

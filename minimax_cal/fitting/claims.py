@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -14,6 +15,7 @@ from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.floor import floor_of
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -23,6 +25,8 @@ from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
+FLOORS = 50.0  # times the floor, likewise
+LEAST_FLOOR = 5e-3  # no arm does better [mm]
 GROSS = 0.01  # of the reach: a fit that misses by more contradicts its own data
 LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 
@@ -60,17 +64,21 @@ def contradiction(
 
     error: (k, m, 3) of all poses [m].  held: (m,).
     """
-    limit = 1e3 * GROSS * robot.reach()
     rest = aside(error, data, suspects)
+    floor = floor_of(data, rest, robot.repeatability, math.inf)
+    limit, what = 1e3 * GROSS * robot.reach(), f"{100 * GROSS:g} % of the arm's reach"
+    most = FLOORS * max(floor.value, LEAST_FLOOR)
+    if floor.certain and most < limit:
+        limit, what = most, f"{FLOORS:g} times the noise floor ({floor.source})"
     for name, rows in (("training", ~held), ("held-out", held)):
         whole, left = accuracy(error[:, rows]), accuracy(rest[:, rows])
         few = sum(left.counts) < LEFT * sum(whole.counts)
         miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
         if miss > limit:
             return (
-                f"the fit misses the {name} poses by {miss:.3g} mm, more than {100 * GROSS:g} % of "
-                "the arm's reach, suspects aside: it is no calibration of this arm; check the "
-                "robot file, joint signs, units and the sign of each coordinate"
+                f"the fit misses the {name} poses by {miss:.3g} mm, more than {what}, suspects "
+                "aside: it is no calibration of this arm; check the robot file, joint signs, units "
+                "and the sign of each coordinate"
             )
     return ""
 

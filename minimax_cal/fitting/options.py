@@ -72,6 +72,7 @@ class Options:
     seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
     region; None for poses that repeat each other or stand in a cluster.
     cv: judge every pose by a fit without it, however many are held out.
+    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
     fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
@@ -127,6 +128,12 @@ class Options:
         "Keep these ones where several cannot be told apart.",
         many=tuple,
         group="What is fitted",
+    )
+    instrument: str | None = option(
+        None,
+        "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
+        "the noise floor.",
+        metavar="10um+2.5um/m",
     )
     priors: Mapping[str, float] = option(
         dict,

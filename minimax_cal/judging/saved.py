@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from minimax_cal.fitting.opened import Opened, Result, open_result, place
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.robot import load_robot
@@ -104,8 +106,7 @@ def unseen(data: Measurements, known: Opened) -> tuple[Array, tuple[str, ...]]:
         return np.zeros(data.poses, dtype=bool), (said,)
     if data.digest and data.digest == known.digest:
         return np.isin(data.line, known.data.line[known.held]), ()
-    joints = {row.tobytes() for row in np.round(known.train.q, 9) + 0.0}
-    held = np.array([row.tobytes() not in joints for row in np.round(data.q, 9) + 0.0])
+    held = np.asarray(KDTree(known.train.q).query(data.q)[0]) > REPEAT
     said = (
         f"{data.source}: is not the file of the fit; {int((~held).sum())} of its {data.poses} rows "
         "have the joints of a training pose, the others count as held out"

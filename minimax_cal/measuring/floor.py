@@ -11,7 +11,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 
-REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most: the noise of the fit"
+REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
 FEWEST = 5  # repeated visits that tell
 RESAMPLES = 500
 SIGMAS = 1.959964  # of a coordinate that a u95 holds
@@ -69,9 +69,9 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     if told is None:
         return Floor(most, 0.0, most, AT_MOST)
     instrument, arm = told
-    both = float(np.hypot(np.nan_to_num(instrument), np.nan_to_num(arm)))
-    if np.isnan(instrument) or np.isnan(arm):  # the other part is between nothing and the fit's
-        return Floor(max(both, most), both, max(both, most), AT_MOST)
+    both = float(np.hypot(instrument, arm))
+    if not both < most:  # one part is not known, or data sheets promise less than the arm does
+        return Floor(most, min(float(np.nan_to_num(instrument)), most), most, AT_MOST)
     low = float(np.hypot(instrument, 0.5 * arm))  # a data sheet promises no more than this
     return Floor(both, low, both, DECLARED)
 

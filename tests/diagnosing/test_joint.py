@@ -9,15 +9,11 @@ from problems_fit import study_of
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.gap import climbed, folds
-from minimax_cal.diagnosing.joint import bounded, bounds, joint, weights
+from minimax_cal.diagnosing.joint import bounded, bounds, joint
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.evidence.noise import Noise
-from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.table import Term
 
-WHITE = Noise(0.0, 2e-5**2, 0.0)
-SHAKY = Noise(1.0, 2e-5**2, 3e-5)
 PLAY = Term("backlash", "J2")
 SOFT = Term("joint_compliance", "J2", {"parts": 128.0})
 
@@ -44,30 +40,19 @@ def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
     assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
 
 
-def test_poses_are_weighed_by_the_inverse_of_their_covariance(play: Study) -> None:
-    weight = weights(play, SHAKY)
-    model, state = play.model, play.fit.state
-    arm = Poses.of(Estimator(model, np.ones(len(model.y))), state).arm
-    turn = np.kron(np.eye(arm.shape[1] // 3), state.rotation)
-    cover = SHAKY.variance * np.eye(arm.shape[1]) + SHAKY.jitter**2 * arm[7] @ arm[7].T
-    assert_allclose(turn.T @ weight[7] @ turn @ cover, SHAKY.variance * np.eye(len(cover)),
-                    atol=1e-9 * SHAKY.variance)  # fmt: skip
-    assert_allclose(weights(play, WHITE)[3], np.eye(arm.shape[1]), atol=1e-12)
-
-
-def test_alike_weights_are_plain_least_squares(play: Study) -> None:
-    fit = joint(play, (), WHITE)
+def test_without_effects_it_is_the_geometric_fit(play: Study) -> None:
+    fit = joint(play, ())
     assert_allclose(fit.train.rms_mm, accuracy(play.geometric.error(play.data)).rms_mm, rtol=1e-6)
 
 
 def test_cross_validation_is_that_of_fits_made_anew(play: Study) -> None:
-    fit = joint(play, (PLAY,), WHITE)
+    fit = joint(play, (PLAY,))
     part = folds(play.data, 5)
     masks = [part == number for number in range(5)]
     square = 0.0
     for mask in masks:
         rest = studied(play.robot, play.data.take(~mask), play.fit)
-        error = joint(rest, (PLAY,), WHITE).cell.error(play.data.take(mask))
+        error = joint(rest, (PLAY,)).cell.error(play.data.take(mask))
         square += float(np.nansum(error**2))
     # linear against exact: second order in changes of some 10 um
     assert_allclose(fit.cross_validated(masks), square, rtol=2e-3)
@@ -76,11 +61,11 @@ def test_cross_validation_is_that_of_fits_made_anew(play: Study) -> None:
 def test_compliances_are_not_negative() -> None:
     made = make(Case("irb2600", "single", (Cause("joint_compliance", "J2", 1000.0),), seed=3))
     study = study_of(made)
-    pulled = joint(study, (SOFT,), WHITE)
+    pulled = joint(study, (SOFT,))
     assert pulled.state.effects[0] > 0.0
     left = study.geometric.error(study.data)
     mirrored = study.data.with_y(study.data.y - 2.0 * np.moveaxis(left, 0, 1))
-    pushed = joint(studied(study.robot, mirrored, study.fit), (SOFT,), WHITE)
+    pushed = joint(studied(study.robot, mirrored, study.fit), (SOFT,))
     assert pushed.state.effects[0] == 0.0
     assert pushed.rests.tolist() == [True]
     assert np.isnan(pushed.uncertainty.sigma[-1])
@@ -93,7 +78,7 @@ def test_compliances_are_not_negative() -> None:
 def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:
     """Backlash at joint 2 is there; ripple of a joint that has none is not."""
     idle = [(Term("gear_ripple", "J6", {"turns": turns}),) for turns in (31.0, 47.0, 83.0, 117.0)]
-    ladder = climbed(play, [(PLAY,), *idle], WHITE)
+    ladder = climbed(play, [(PLAY,), *idle])
     assert ladder.taken[0] == 0
     assert len(ladder.taken) <= 3  # each helps groups of poses by accident about as often as not
     errors = [fit.cross_validated([folds(play.data, 5) == i for i in range(5)])
