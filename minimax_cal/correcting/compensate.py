@@ -171,7 +171,7 @@ def compensate(
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None
     if robot is None:
-        raise CalibrationError("the fit does not tell its nominal robot; give it (--robot)")
+        raise CalibrationError("the fit does not tell its nominal robot; name it (nominal)")
     check_like(robot, cell.robot)
     arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
     base, tool, said = placed(cell, arm, robot, drawn, frame)
@@ -242,13 +242,13 @@ def check_like(nominal: Robot, robot: Robot) -> None:
     if nominal.joints != robot.joints:
         raise OptionError(
             f"{nominal.name} has {nominal.joints} joints, the calibrated {robot.name} "
-            f"{robot.joints}; give the nominal robot of this fit (--robot)"
+            f"{robot.joints}; give the nominal robot of this fit (nominal)"
         )
     odd = (nominal.prismatic != robot.prismatic) | (nominal.sign != robot.sign)
     if odd.any():
         raise OptionError(
             f"joint {int(np.argmax(odd)) + 1} of {nominal.name} has another type or sign than the "
-            "calibrated one's; give the nominal robot of this fit (--robot)"
+            "calibrated one's; give the nominal robot of this fit (nominal)"
         )
 
 
@@ -309,7 +309,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
     if timed:
         out.append(
             f"{', '.join(timed)} depends on the time in the calibration's session: taken at "
-            f"{data.columns['clock'][0]:g} of it (--clock 0 is its start, 1 its end)"
+            f"{data.columns['clock'][0]:g} of it (clock 0 is its start, 1 its end)"
         )
     scene = arm.scene(data.take(np.arange(1)))
     whole = any(

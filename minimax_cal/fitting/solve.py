@@ -249,20 +249,18 @@ def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
 def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, Array]:
     """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
     names = model.names
-    allowed = ~names.match(options.fix, "--fix")
+    allowed = ~names.match(options.fix, "fix")
     order = identify.drop_order(robot, names)
-    kept = names.match(options.free, "--free")
+    kept = names.match(options.free, "free")
     if (kept & ~allowed).any():
         name = names.all[int(np.argmax(kept & ~allowed))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     order = np.concatenate([order[~kept[order]], order[kept[order]]])
     sigma = np.full(names.count, np.inf)
     for pattern, value in options.priors.items():
-        chosen = names.match([pattern], "--prior")
+        chosen = names.match([pattern], "prior")
         if (chosen & ~names.links).any():
-            raise OptionError(
-                f"--prior {pattern}: base and targets have no nominal value to keep to"
-            )
+            raise OptionError(f"prior {pattern}: base and targets have no nominal value to keep to")
         sigma[chosen] = value
     return allowed, order, sigma
 

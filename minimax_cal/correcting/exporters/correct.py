@@ -89,14 +89,14 @@ def match(nominal: Robot, model: UrdfRobot) -> tuple[Array, float]:
     n = len(moving)
     if n != nominal.joints:
         raise OptionError(
-            f"--urdf {source}: its chain to {chain[-1].child!r} has {n} moving joints, "
-            f"the robot {nominal.joints}; name another last link with --tip"
+            f"urdf {source}: its chain to {chain[-1].child!r} has {n} moving joints, "
+            f"the robot {nominal.joints}; name another last link with tip"
         )
     slides = np.array([joint.kind == "prismatic" for joint in moving])
     if (slides != nominal.prismatic).any():
         number = int(np.argmax(slides != nominal.prismatic))
         raise OptionError(
-            f"--urdf {source}: joint {number + 1} ({moving[number].name}) slides in one of URDF "
+            f"urdf {source}: joint {number + 1} ({moving[number].name}) slides in one of URDF "
             "and robot and turns in the other"
         )
     rest = np.zeros((1, n))
@@ -111,7 +111,7 @@ def match(nominal: Robot, model: UrdfRobot) -> tuple[Array, float]:
     if gap.max() > MISFIT:
         worst = int(np.argmax(gap[:n]))
         raise OptionError(
-            f"--urdf {source}: moves otherwise than the nominal robot of the fit, up to "
+            f"urdf {source}: moves otherwise than the nominal robot of the fit, up to "
             f"{1e3 * gap.max():.3g} mm or mrad, most at joint {worst + 1} ({moving[worst].name}): "
             "another robot, another zero position or another sense of a joint?"
         )

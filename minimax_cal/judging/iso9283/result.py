@@ -384,7 +384,7 @@ def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list
         if not np.isfinite(part.values[next(iter(part.values))].position).any():
             out.append(
                 f"the TCP was measured at none of the {PARTS[key]} poses: choose one target for it "
-                f"(--tcp {data.target_names[0]})"
+                f"(tcp {data.target_names[0]})"
             )
     return out
 
