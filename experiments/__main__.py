@@ -23,6 +23,10 @@ from experiments.sweep import Study, look_for, needed, study_options
 from minimax_cal.ground.errors import OptionError
 
 STUDIES = {  # name: (module with the command `main`, what it tells)
+    "papers": (
+        "experiments.papers",
+        "Both papers item by item: all tables and figures, and a table of verdicts",
+    ),
     "convergence": (
         "experiments.convergence",
         "From which starts the least-squares methods reach the minimum, and how fast",
@@ -32,7 +36,15 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.conditions",
         "Errors, training and held out, under each way to fit, simulated and real",
     ),
+    "splits": (
+        "experiments.splits",
+        "Minimax against the sum over many splits, at random and by groups",
+    ),
     "methods": ("experiments.methods", "MDH, product of exponentials and minimax side by side"),
+    "courses": (
+        "experiments.courses",
+        "Error against iteration from paper S's start, simulated and real",
+    ),
     "calibration_process": (
         "experiments.calibration_process",
         "Error against iteration for all methods and backends, on real data",
@@ -61,6 +73,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.planning",
         "What 40 planned poses are worth against random ones, predicted and true",
     ),
+    "measuring_loop": (
+        "experiments.measuring_loop",
+        "Measure a few, fit, plan the next: poses until the promise is met",
+    ),
     "outliers": (
         "experiments.outliers",
         "Wrong points: losses, trimming and suspects, simulated and real",
@@ -69,6 +85,7 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
     ),
+    "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

@@ -18,7 +18,7 @@ import click
 import numpy as np
 
 from experiments import sweep
-from experiments.convergence import SAME, STEP, Setting, problem_of, starts_of
+from experiments.off_starts import SAME, STEP, Setting, problem_of, starts_of
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting.start import fit_base, search
 from minimax_cal.ground.tables import Cell, Table
@@ -123,16 +123,20 @@ def row_of(span: float, results: Sequence[Result]) -> tuple[Cell, ...]:
     )
 
 
-@click.command()
-@study_options("any_base")
-@click.option("--trials", "count", type=int, default=500, show_default=True)
-def main(study: Study, count: int) -> None:
-    """Global convergence from any base pose."""
+SPANS = (1.0, float(np.pi))  # poses within so far of zero [rad]
+
+
+def study_of(study: Study, count: int = 200) -> dict[float, list[Result]]:
+    """The trials of each span."""
     count = 12 if study.quick else count
-    found = {
+    return {
         span: study.sweep(run, trials(study.seed, count, span), f"poses within {span:.2f} rad")
-        for span in (1.0, float(np.pi))
+        for span in SPANS
     }
+
+
+def save(study: Study, found: dict[float, list[Result]]) -> None:
+    """The table."""
     table = Table(
         "random base poses x random deviations of theta_2, alpha_3 within 3.1 rad: share of trials "
         "that reach the global minimum",
@@ -144,6 +148,14 @@ def main(study: Study, count: int) -> None:
     names = ("span_rad", "trials", "snlgn_percent", "snllm_percent", "ours_percent", "paper_ms",
              "ours_ms", "worst_ratio")  # fmt: skip
     study.save([table], {"rows": [dict(zip(names, row, strict=True)) for row in table.rows]})
+
+
+@click.command()
+@study_options("any_base")
+@click.option("--trials", "count", type=int, default=200, show_default=True)
+def main(study: Study, count: int) -> None:
+    """Global convergence from any base pose."""
+    save(study, study_of(study, count))
 
 
 if __name__ == "__main__":

@@ -228,28 +228,30 @@ def claims(robots: Sequence[str], found: dict[str, dict[str, Outcome]]) -> Table
     )
 
 
-@click.command()
-@study_options("conditions")
-def main(study: Study) -> None:
-    """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""
+Found = dict[str, dict[str, Outcome]]  # by robot and condition
+
+
+def study_of(study: Study) -> Found:
+    """Every robot whose measurements are here under every condition."""
     robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
     for name in ROBOTS:
         if name not in robots:
             click.echo(f"{ROBOTS[name][0]}: its measurements are not on this machine", err=True)
     jobs = [Job(name, c, ROBOTS[name][2], study.seed) for name in robots for c in CONDITIONS]
     outcomes = study.sweep(run, jobs, "conditions")
-    found = {
-        name: {
-            job.condition: outcome
-            for job, outcome in zip(jobs, outcomes, strict=True)
-            if job.robot == name
-        }
+    done = list(zip(jobs, outcomes, strict=True))
+    return {
+        name: {job.condition: outcome for job, outcome in done if job.robot == name}
         for name in robots
     }
-    tables = [table_of(ROBOTS[name][0], found[name]) for name in robots]
-    summary = claims(robots, found)
+
+
+def save(study: Study, found: Found) -> None:
+    """Tables and pictures."""
+    tables = [table_of(ROBOTS[name][0], found[name]) for name in found]
+    summary = claims(list(found), found)
     figures = {}
-    for name in robots:
+    for name in found:
         figures[f"accuracy_{name}"] = boxes(ROBOTS[name][0], found[name])
         figures[f"sums_{name}"] = sums_figure(ROBOTS[name][0], found[name])
     rows = [
@@ -257,6 +259,13 @@ def main(study: Study) -> None:
         for row in summary.rows
     ]
     study.save([*tables, papers_table(), summary], {"rows": rows}, figures)
+
+
+@click.command()
+@study_options("conditions")
+def main(study: Study) -> None:
+    """Single SMR, sum, minimax, pose and worst point: paper M, Table 3, Fig. 2-6."""
+    save(study, study_of(study))
 
 
 if __name__ == "__main__":

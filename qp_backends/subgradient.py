@@ -1,4 +1,4 @@
-"""The primal-dual subgradient method, as paper M prints it and made usable.
+"""Primal-dual first-order methods: restarted averaged PDHG, and paper M's subgradient as printed.
 
 All variants move along T = (∂L/∂x, -∂L/∂y) of the Lagrangian L = ½xᵀPx + qᵀx + yᵀ(Ax - bound).
 
@@ -8,7 +8,8 @@ Only rows that are violated enter T, each with its multiplier, and a multiplier 
 violation and never shrinks; the paper leaves Boyd's augmentation out (rho = 0).
 "eliminated" is the same on the eliminated form of an epigraph problem (`elimination`), eq. 20-27.
 
-"restarted" is what the same direction needs to become accurate; what it changes, and why:
+"restarted", the default, is another method that starts from the same T: the primal-dual hybrid
+gradient (PDHG) of Chambolle and Pock, restarted and averaged as in PDLP.  From "raw" to it:
 1. x is measured in the metric of P (whitening) and rows are scaled to length 1, so that one step
    length suits all directions.
 2. Multipliers keep the sign of their side by projection, so that they can shrink again.
@@ -17,7 +18,7 @@ violation and never shrinks; the paper leaves Boyd's augmentation out (rho = 0).
 4. Iterates are averaged; the better of average and last iterate starts the method afresh whenever
    it has become much better than the start was, which makes the convergence linear on quadratic
    programs, and the ratio of dual to primal step length, the radius that the user of the raw
-   method must guess, follows the distances travelled [Applegate et al. 2021, 2023].
+   method must guess, follows the distances travelled [PDLP: Applegate et al. 2021, 2023].
 """
 
 from __future__ import annotations
@@ -208,7 +209,7 @@ def _steps(
     B: Array, c: Array, d: Array, low: Array, high: Array,
     w: Array, y: Array, primal: float, dual: float, steps: int,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Some steps of the usable method and the sums of their iterates; NumPy or compiled."""
+    """Some steps of PDHG and the sums of their iterates; NumPy or compiled."""
     shrink = 1.0 / (1.0 + primal * d)
     sum_w, sum_y = np.zeros(w.shape), np.zeros(y.shape)
     low, high = dual * low, dual * high

@@ -14,6 +14,7 @@ from minimax_cal.ground.files import json_text
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import read_measurements
+from minimax_cal.modelling.cell import strangers
 
 
 @click.command(name="evaluate")
@@ -35,7 +36,7 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
-    to.notice(*measured.notices, *said, *doubts)
+    to.notice(*measured.notices, *said, *strangers(cell, measured), *doubts)
     content = {
         "schema": 1,
         "kind": "evaluation",

@@ -31,7 +31,7 @@ from minimax_cal.robots.robot import Robot
 
 FRAMES = ("best-fit", "flange", "own")
 # What moves the reflectors or the instrument, and not the flange of the arm.
-SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "target_shift", "target_offset"})
+SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "session_jump", "target_shift", "target_offset"})
 TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 CORNERS = tuple(f"corner{i + 1}" for i in range(4))
 LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
@@ -299,7 +299,8 @@ def arm_of(cell: Cell) -> Cell:
 def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
     """What the reader should know about effects and limits."""
     out = limit_notices(cell.robot, data)
-    left = [term.label for term in cell.effects.terms if term not in arm.effects.terms]
+    own = arm.effects.terms
+    left = [t.label for t in cell.effects.terms if t not in own and not t.frees_frames]
     if left:
         out.append(
             f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"

@@ -67,7 +67,16 @@ def causes_of(
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
     """The library and what it explains."""
     lib = library(study.scene, study.rows, exclude)
+    if "session_jump" not in exclude:
+        lib = with_jumps(lib, study)
     return lib, selection.select(lib, ripple="gear_ripple" not in exclude)
+
+
+def with_jumps(lib: Library, study: Study) -> Library:
+    """The library with jumps at the moments that the errors show."""
+    jumps = [Term("session_jump", "frame", {"since": t}) for t in study.moments.tolist()]
+    terms = [(term, 1.0) for term in jumps]  # tried against chance when they were found
+    return replace(lib, candidates=(*lib.candidates, *lib.with_terms(terms))) if terms else lib
 
 
 def read_back_fault(study: Study, choice: Choice) -> list[Fault]:

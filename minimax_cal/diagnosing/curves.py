@@ -20,7 +20,7 @@ from minimax_cal.modelling.effects.table import Fitted, Term
 BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
 LINEAR = ("encoder_gain", "joint_coupling")
 BY_MOVE = {"backlash": "approach", "settling": "move"}
-BY_TIME = ("thermal_growth", "frame_drift", "target_shift")
+BY_TIME = ("thermal_growth", "frame_drift", "session_jump", "target_shift")
 VIEWS = ("geometry alone", "with effects", "the first effect taken out")
 FLAT = 1e-6  # of its size: what varies less does not vary
 

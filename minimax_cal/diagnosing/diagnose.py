@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
 from minimax_cal.diagnosing.folds import beyond_of
+from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
     FAULTS,
     Judges,
@@ -32,20 +33,20 @@ from minimax_cal.evidence.library import library
 from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
-from minimax_cal.fitting.checks import check_plausible, misplaced, put_right
+from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
+from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended
+from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
 from minimax_cal.measuring.floor import floor_of
 from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -91,6 +92,8 @@ def diagnose(
         raise DataError(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
         )
+    notices = (*notices, *unplaced(raw, ~held))
+    raw = stationed(robot, raw, ~held)
     with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
         return examined(Asked(robot, raw, held, options), notices, progress, began)
 
@@ -129,6 +132,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     train = asked.train(clean.data)
     judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
+    study = replace(study, moments=clean.moments)
     causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     progress("gap ladder")
@@ -168,10 +172,17 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure_in=structure_left[0],
         where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*asked.data.notices, *notices, *clean.remarks, *study.fit.notices, *wrong),
+        notices=(
+            *asked.data.notices,
+            *notices,
+            *clean.remarks,
+            *study.fit.notices,
+            *foot_notices(ladder.last, clean.data),
+            *wrong,
+        ),
         provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
-        data=clean.data,
+        data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
@@ -189,10 +200,9 @@ def steps_of(
         train = asked.train(asked.data)
         fit = fit_cell(asked.robot, train, SUM, silent)
         whole = replace(judges, train=train)
-        names = asked.data.target_names
         steps = [
-            whole.step(name, Cell.of(asked.robot, state, names))
-            for name, state in (("nominal", fit.nominal), ("geometric", fit.state))
+            whole.step("nominal", fit.nominal_cell(asked.robot, train)),
+            whole.step("geometric", fit.cell(asked.robot, train)),
         ]
     steps.append(judges.step(f"without {' and '.join(spoilt)}" if spoilt else "geometric", first))
     for number, wider in zip(ladder.taken, ladder.fits[1:], strict=True):
@@ -241,7 +251,7 @@ class Clean:
 
     given: as measured, but for points that stood in each other's rows.  faults: their rows as lines
     of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
-    it is that of the clean data.
+    it is that of the clean data.  moments: as `Study` has them.
     """
 
     data: Measurements
@@ -249,6 +259,7 @@ class Clean:
     faults: tuple[Fault, ...]
     remarks: tuple[str, ...]
     fit: Solved | None
+    moments: Array
 
 
 def cleaned(asked: Asked, progress: Progress) -> Clean:
@@ -260,9 +271,11 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     check_plausible(robot, sound)
     progress("geometry")
     fit = fit_cell(robot, asked.train(sound), SUM, progress)
-    error = Cell.of(robot, fit.state, sound.target_names).error(sound)
-    more = tuple(fault for fault in find_faults(sound, error) if fault.effect == "outliers")
-    wrong = wrong_rows(data, Cell.of(robot, fit.state, data.target_names).error(data))
+    cell = fit.cell(robot, sound)
+    error = cell.error(sound)
+    seen = find_faults(cell.placed(sound), error)
+    more = tuple(fault for fault in seen if fault.effect == "outliers")
+    wrong = wrong_rows(data, cell.error(data))
     points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (
         *exchanged,
@@ -271,8 +284,12 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     )
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
-    remarks = tuple(fault.text for fault in (*found, *more) if fault.effect != "target_shift")
-    return Clean(sound, data, faults, remarks, None if more else fit)
+    jumped = session_jumps(cell.placed(sound), cell.error(sound))
+    told = (*found, *more, *jumped)
+    remarks = tuple(fault.text for fault in told if fault.effect != "target_shift")
+    rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
+    moments = sound.columns["clock"][rows]
+    return Clean(sound, data, faults, remarks, None if more else fit, moments)
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:

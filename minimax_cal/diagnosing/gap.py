@@ -74,7 +74,8 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
     """The findings that a ladder took, with values and sigmas of its last fit."""
-    out, at, last = [], 0, ladder.last
+    out, last = [], ladder.last
+    at = len(ladder.fits[0].state.effects)  # after the frames of sessions
     geometric = last.model.names.geometric
     sigma = last.uncertainty.sigma[geometric:] if ladder.taken else np.zeros(0)
     for finding in [findings[number] for number in ladder.taken]:

@@ -21,6 +21,7 @@ from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncer
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import clusters
+from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Term, names_of
@@ -73,7 +74,8 @@ class Joint:
         study, effects = self.study, NOTHING
         if self.terms:
             effects = fitted(self.terms, study.scene, state.effects)
-        return Cell.of(study.robot, state, study.data.target_names, effects)
+        sessions = Sessions.of(study.data)
+        return Cell.of(study.robot, state, study.data.target_names, effects, sessions)
 
     @cached_property
     def train(self) -> Accuracy:
@@ -110,8 +112,12 @@ class Joint:
 
 
 def joint(study: Study, terms: Sequence[Term]) -> Joint:
-    """The joint fit of geometry and effects, from the geometry of the study."""
-    robot, data = study.robot, study.data
+    """The joint fit of geometry and effects, from the geometry of the study.
+
+    The frames of further sessions are the first of its effects.
+    """
+    robot, data, free = study.robot, study.data, study.fit.effects.terms
+    terms = (*free, *(term for term in terms if not term.frees_frames))
     base = study.model.only(study.fit.identification.active)
     allowed = bounds(study.scene, terms)
     state = replace(study.fit.state, effects=np.zeros(len(allowed)))
@@ -129,7 +135,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
             break
     model, state = extended(base, robot, data, state, terms) if terms else (base, state)
     rests = np.isclose(state.effects[:, None], allowed, rtol=1e-9, atol=0.0).any(axis=1)
-    return Joint(study, tuple(terms), state, model, np.asarray(rests))
+    return Joint(study, terms, state, model, np.asarray(rests))
 
 
 def bounds(scene: Scene, terms: Sequence[Term]) -> Array:

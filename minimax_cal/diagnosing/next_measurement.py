@@ -19,14 +19,14 @@ from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import Term, fields_of, of_sessions
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
 PREPARE = {"more": 0.0, "late": 5.0, "side": 5.0, "load": 15.0, "foot": 20.0}  # once [min]
-OF_BASE = frozenset({"base_flex", "frame_drift"})  # what moves the robot's foot
+OF_BASE = frozenset({"base_flex", "frame_drift", "session_jump"})  # what moves the robot's foot
 GOLDEN = 0.6180339887498949
 COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
@@ -128,6 +128,8 @@ class Site:
             y=np.zeros((k, 3, m)),
             weight=self.plan.weight,
         )
+        if free := of_sessions(self.plan.data.frames):
+            model = replace(model, fields=fields_of(free, self.whole))
         return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1), (0, 3)))
 
     def lines(self, poses: slice) -> slice:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from minimax_cal.evidence.noise import Rows, linearised
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import NOTHING
-from minimax_cal.modelling.joint_fit import scene_of
+from minimax_cal.modelling.joint_fit import extended, scene_of
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.robots.robot import Robot
 
@@ -22,7 +25,8 @@ SUM = Options(objective="sum")
 class Study:
     """The geometric fit of the training poses, linearised.
 
-    model, fit: geometry alone.  scene: what effects look at.  rows: rotated, for the two noises.
+    model, fit: geometry alone, with the frames of the sessions.  scene: what effects look at.
+    rows: rotated, for the two noises.  moments: (j,) of the clock at which all targets jumped.
     """
 
     robot: Robot
@@ -31,20 +35,24 @@ class Study:
     fit: Solved
     scene: Scene
     rows: Rows
+    moments: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def geometric(self) -> Cell:
         """The calibrated robot without effects."""
-        return Cell.of(self.robot, self.fit.state, self.data.target_names, NOTHING)
+        return self.fit.cell(self.robot, self.data)
 
     @property
     def nominal(self) -> Cell:
         """The nominal robot with its best base and targets."""
-        return Cell.of(self.robot, self.fit.nominal, self.data.target_names, NOTHING)
+        return self.fit.nominal_cell(self.robot, self.data)
 
 
 def studied(robot: Robot, data: Measurements, fit: Solved) -> Study:
     """A geometric fit linearised."""
+    data = seen_from(data, fit.frames)
     model, state = model_of(robot, data), fit.state
+    if fit.effects.terms:
+        model, _ = extended(model, robot, data, state, fit.effects.terms)
     scene = scene_of(robot, data, model, state)
     return Study(robot, data, model, fit, scene, linearised(model, state, scene.jacobian))

@@ -218,7 +218,9 @@ def left_out(
     plain = without(*geometric, masks) if geometric else fits
     errors = Errors()
     for part, fit, other in zip(parts, fits, plain, strict=True):
-        if fit and other:
-            final = error_of(fit, part.rows)
+        if not (fit and other):
+            continue
+        final = error_of(fit, part.rows)
+        if np.isfinite(final).any():  # else every point of the part stands out
             errors.add(part.name, final, error_of(other, part.rows) if geometric else final)
     return errors.beyond() if parts else Beyond(reason="the poses are too few or too much alike")

@@ -39,15 +39,16 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
+from minimax_cal.fitting.stations import jumps, pose_of, stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
-from minimax_cal.measuring import checks
+from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
@@ -55,6 +56,7 @@ from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
+JUMP = ("session_jump", "session_jump:frame")  # without its moment
 NAMED = 5  # implausible changes that are told one by one
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
@@ -143,6 +145,7 @@ def calibrate(
     check(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
+    options = with_jump(robot, poses, options, progress)
     solved = fit_cell(robot, poses.train, options, progress)
     fit = judged(robot, options, poses, solved, began)
     for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
@@ -191,6 +194,10 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
     data = with_groups(with_instrument(data, options.instrument))
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
+    kept = np.isin(data.line, train.line)
+    said = (*said, *unplaced(data, kept))
+    data = stationed(robot, data, kept)
+    train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     notices = (*data.notices, *checks.limit_notices(robot, data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
@@ -203,12 +210,30 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     return Parts(data, train, held, notices)
 
 
+def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) -> Options:
+    """The options with the moment of a jump that was asked for without one.
+
+    That of the largest in the errors of the geometry, on all poses: held-out ones between the last
+    training pose before it and the first one after could not be placed otherwise.
+    """
+    if not any(text in JUMP for text in options.effects):
+        return options
+    plain = replace(options, effects=(), objective="sum")
+    cell = fit_cell(robot, poses.train, plain, progress).cell(robot, poses.data)
+    rows, sizes = faults.jumps(cell.placed(poses.data), cell.error(poses.data))
+    if not len(rows):
+        return options
+    since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
+    found = Term("session_jump", "frame", {"since": since})
+    return replace(options, effects=[found if e in JUMP else e for e in options.effects])
+
+
 def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: float) -> Fit:
     """The fit with its accuracy on training and on held-out poses."""
-    data, held = poses.data, np.isin(poses.data.line, poses.held.line)
-    calibrated = Cell.of(robot, solved.state, data.target_names, solved.effects)
-    nominal = Cell.of(robot, solved.nominal, data.target_names)
-    before, after = nominal.error(data), calibrated.error(data)
+    held = np.isin(poses.data.line, poses.held.line)
+    cell, nominal = solved.cell(robot, poses.data), solved.nominal_cell(robot, poses.data)
+    data = cell.placed(poses.data)
+    before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
     wrong = contradiction(robot, data, after, held, suspects)
     notices = (
@@ -216,12 +241,13 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
+        *(fault.text for fault in faults.session_jumps(data, after)),
         *alarms(robot, poses, solved, before[:, ~held]),
         *bad_rows(suspects, data.source),
         *([wrong] if wrong else []),
     )
     return Fit(
-        cell=calibrated,
+        cell=cell,
         nominal=nominal,
         objective=options.objective,
         qp=ran(options.qp),
@@ -313,20 +339,22 @@ def parameter_table(robot: Robot, solved: Solved) -> Parameters:
 
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
+    Those of `session_jump` tell where it stands in a further session (`stations.jumps`).
     """
     names, n = solved.names, robot.joints
     known = solved.identification.active
     sigma = solved.uncertainty.sigma
-    axes = solved.nominal.rotation
+    axes, more = solved.nominal.rotation, len(solved.units)
 
-    def values(x: State) -> Array:
+    def values(x: State, frames: Frames) -> Array:
         turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
         parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
-        effects = x.effects if len(x.effects) else np.zeros(len(solved.units))
-        return np.concatenate([*parts, effects])
+        stood = jumps(frames, pose_of(x))
+        effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))
+        return np.concatenate([*parts, stood, effects])
 
-    before = values(solved.nominal)
-    value = np.where(known, values(solved.state), before)
+    before = values(solved.nominal, solved.start)
+    value = np.where(known, values(solved.state, solved.frames), before)
     order = [kind * n + joint for joint in range(n) for kind in range(5)]
     every = tuple(
         Parameter(

@@ -89,7 +89,9 @@ class Certificate:
     kkt: residuals of the optimality conditions, of the problem scaled to about one.
     value: the largest distance, weighted where the data tell the points' accuracy (`u95`) [m].
     bound: what the largest distance of the linearised problem cannot fall below, computed from the
-    multipliers alone [m].  The problem itself is not convex: this is no statement about far ones.
+    multipliers alone [m].  The problem itself is not convex: this is no statement about far ones,
+    and near ones may be better by second-order terms, the size of the curvature times the step
+    squared.
     """
 
     target: tuple[str, ...]

@@ -11,6 +11,7 @@ from minimax_cal.fitting.beyond import Beyond, left_out
 from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
+from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
@@ -18,8 +19,9 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.floor import floor_of
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import NOTHING
+from minimax_cal.modelling.effects.table import NOTHING, of_sessions
 from minimax_cal.modelling.joint_fit import extended, fitted, refitted
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
@@ -85,12 +87,14 @@ def contradiction(
 
 def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
     """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
-    terms = solved.effects.terms
-    scene = Cell.of(robot, solved.state, data.target_names).scene(data)
+    every, free = solved.effects.terms, of_sessions(data.frames)
+    names, sessions = data.target_names, Sessions.of(data)
+    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
 
     def error_of(state: State, rows: Array) -> Array:
-        effects = fitted(terms, scene, state.effects) if len(state.effects) else NOTHING
-        return Cell.of(robot, state, data.target_names, effects).error(data.take(rows))
+        terms = free if len(state.effects) == steps_of(data.frames) else every
+        effects = fitted(terms, scene, state.effects)
+        return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
 
     return error_of
 
@@ -125,11 +129,12 @@ def beyond_of(
     """
     wrong = [one for one in suspects if one.held]
     data = data.with_y(np.moveaxis(aside(np.moveaxis(data.y, 1, 0), data, wrong), 0, 1))
+    every, free = solved.effects.terms, of_sessions(data.frames)
     geometric = None
-    if solved.effects.terms:
-        train, k = data.take(~held), len(data.target_names)
-        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * k]
-        state = refitted(robot, train, solved.state, active)
-        geometric = Estimator(model_of(robot, train).only(active), np.ones(k)), state
+    if len(every) > len(free):
+        train, names = data.take(~held), data.target_names
+        active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
+        model, state = refitted(robot, train, solved.state, active)
+        geometric = Estimator(model, np.ones(len(names))), state
     found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)

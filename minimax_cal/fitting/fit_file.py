@@ -309,6 +309,7 @@ def cell_arrays(cell: Cell, name: str) -> dict[str, Array]:
         f"{name}.up": cell.robot.up,
         f"{name}.base": cell.base,
         f"{name}.targets": cell.target_positions,
+        **{f"{name}.session {label}": frame for label, frame in cell.sessions.frames.items()},
     }
 
 
@@ -395,9 +396,11 @@ def assembled(
 def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:
     """A cell with the digits that millimetres and a rotation vector took."""
     robot, exact = cell.robot, {key: arrays.get(f"{name}.{key}") for key in CELL}
-    base = restored(cell.base, exact["base"])
-    if exact["base"] is not None and not np.array_equal(base[:3, :3], exact["base"][:3, :3]):
-        base[:3, :3] = cell.base[:3, :3]  # a rotation is taken whole or not at all
+    base = refined_pose(cell.base, exact["base"])
+    frames = {
+        label: refined_pose(frame, arrays.get(f"{name}.session {label}"))
+        for label, frame in cell.sessions.frames.items()
+    }
     robot = replace(
         robot,
         mdh=restored(robot.mdh, exact["mdh"]),
@@ -405,7 +408,16 @@ def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:
         up=restored(robot.up, exact["up"]),
     )
     positions = restored(cell.target_positions, exact["targets"])
-    return replace(cell, robot=robot, base=base, target_positions=positions)
+    sessions = replace(cell.sessions, frames=frames)
+    return replace(cell, robot=robot, base=base, target_positions=positions, sessions=sessions)
+
+
+def refined_pose(pose: Array, exact: Array | None) -> Array:
+    """A pose with its last digits; a rotation is taken whole or not at all."""
+    out = restored(pose, exact)
+    if exact is not None and not np.array_equal(out[:3, :3], exact[:3, :3]):
+        out[:3, :3] = pose[:3, :3]
+    return out
 
 
 CELL = ("mdh", "com", "up", "base", "targets")
@@ -462,7 +474,8 @@ def measured_poses(
         if data.q.shape[1] != cell.robot.joints or set(data.target_names) - set(cell.target_names):
             raise ValueError("joints or targets are not those of the robot")
         errors = (told_errors(given, first, data), told_errors(given, "final", data))
-        return replace(data, source=str(given["source"])), held, errors
+        frames = cell.sessions.frames  # points were written as the first session saw them
+        return replace(data, source=str(given["source"]), frames=frames), held, errors
     except FAULTS as error:
         raise CalibrationError(
             f"{source}: its list of poses cannot be read ({error}); {AGAIN}"

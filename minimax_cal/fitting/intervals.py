@@ -78,10 +78,11 @@ def log_mean(total: Array, count: Array) -> tuple[Array, Array]:
 
 
 def members(error: Array, group: Array | None) -> Array:
-    """(m,) number of each pose's group, counted from 0."""
+    """(m,) number of each pose's group, counted from 0 in the order of their first poses."""
     if group is None:
         return np.arange(error.shape[1])
-    return np.unique(group, return_inverse=True)[1].reshape(-1)
+    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[inverse.reshape(-1)])
 
 
 def max_interval(

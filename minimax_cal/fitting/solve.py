@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -17,13 +17,16 @@ from minimax_cal.fitting.minimax_problem import Distances, measured_distances, m
 from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
+from minimax_cal.fitting.stations import steps_of, turned_in
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, point_share, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.grouping import clusters, groups
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.effects.table import Fitted, Term, names_of
+from minimax_cal.measuring.stations import Frames, Sessions, seen_from
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Fitted, Term, names_of, of_sessions
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import (
@@ -66,6 +69,7 @@ class Solved:
     trace: cost at each iterate of the least squares [m^2].
     effects: those asked for, with their values; units: of each value.
     robust: the weights of the points, and which stand out.
+    start, frames: of the sessions, where there are several, for the nominal and for this robot.
     """
 
     nominal: State
@@ -83,6 +87,18 @@ class Solved:
     effects: Fitted
     units: tuple[str, ...]
     robust: Robust
+    start: Frames = field(default_factory=dict)
+    frames: Frames = field(default_factory=dict)
+
+    def cell(self, robot: Robot, data: Measurements) -> Cell:
+        """The calibrated robot in its place.  data: all poses of the fit, held out or not."""
+        sessions = Sessions.of(seen_from(data, self.frames))
+        return Cell.of(robot, self.state, data.target_names, self.effects, sessions)
+
+    def nominal_cell(self, robot: Robot, data: Measurements) -> Cell:
+        """The same of the nominal robot."""
+        sessions = Sessions.of(seen_from(data, self.start))
+        return Cell.of(robot, self.nominal, data.target_names, sessions=sessions)
 
     @property
     def names(self) -> Names:
@@ -189,18 +205,22 @@ class Stage:
 def fit_cell(
     robot: Robot, data: Measurements, options: Options, progress: Progress = silent
 ) -> Solved:
-    """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError."""
-    task = prepared(robot, data, options)
+    """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError.
+
+    data: with the points of all sessions in one frame (`stations.stationed`).
+    """
+    task, begun = prepared(robot, data, options), data.frames
     mix = NO_MIX
     if options.objective == "pose":
         check_poses(data)
-        mix = pose_weights(data, options.lever)
     stage = geometry(task, progress)
-    if options.effects:
+    if options.effects or data.frames:
         progress("effects")
-        stage = with_effects(task, stage)
+        task, stage = with_effects(task, stage)
+        data = task.data
     model = stage.robust.model
-    if len(mix):
+    if options.objective == "pose":
+        mix = pose_weights(data, options.lever)
         model = stage.robust.by_pose
         stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
     believed = np.where(stage.robust.weights.T[..., None] > DOUBTED, data.y, np.nan)
@@ -227,6 +247,8 @@ def fit_cell(
         effects=fitted(stage.terms, scene, state.effects),
         units=names_of(stage.terms, scene)[1],
         robust=stage.robust,
+        start=begun,
+        frames=data.frames,
     )
 
 
@@ -240,7 +262,8 @@ def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
     telling = data if only < 0 else data.only(only)
     following = 0 if only < 0 else 3 * (k - 1)  # coordinates of targets that follow
     poses, known = len(np.unique(groups(telling))), int(np.isfinite(sigma[allowed]).sum())
-    checks.check_count(telling, poses, unknowns - following, known)
+    free = steps_of(data.frames)
+    checks.check_count(telling, poses, unknowns - following + free, known)
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
     frame = start.fit_base(base, robot.mdh)
     return Task(robot, data, options, base, frame, reference, share, allowed, order, sigma)
@@ -317,24 +340,37 @@ def wider(
     return found, notices
 
 
-def with_effects(task: Task, stage: Stage) -> Stage:
-    """The fit with the effects beside the geometry."""
-    robot, data, robust = task.robot, task.data, stage.robust
-    scene = scene_of(robot, data, robust.plain, stage.state)
+def with_effects(task: Task, stage: Stage) -> tuple[Task, Stage]:
+    """The fit with the frames of further sessions, and then the effects, beside the geometry."""
+    if free := of_sessions(task.data.frames):
+        task, stage = jointly(task, stage, free)
+    asked = [e for e in task.options.effects if not (isinstance(e, Term) and e.frees_frames)]
+    if not asked:
+        return task, stage
+    robust = stage.robust
+    scene = scene_of(task.robot, task.data, robust.plain, stage.state)
     rows = linearised(robust.model, stage.state, scene.jacobian)
-    terms = terms_of(scene, task.options.effects, partial(best_variant, scene, rows))
-    identification = stage.identification
+    found = terms_of(scene, asked, partial(best_variant, scene, rows))
+    return jointly(task, stage, (*free, *found))
+
+
+def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, Stage]:
+    """Geometry and effects together; the task with the data where its sessions then stand."""
+    robot, robust, identification = task.robot, stage.robust, stage.identification
     for _ in range(PASSES):
-        here = robust.fit.x.take(np.array(0))
+        frames, here = turned_in(task.data.frames, robust.fit.x.take(np.array(0)))
+        task = replace(task, data=seen_from(task.data, frames))
+        y = model_of(robot, task.data).y if frames else task.base.y
+        task, plain = replace(task, base=replace(task.base, y=y)), replace(robust.plain, y=y)
         active = identification.active
-        model, begin = extended(robust.plain.only(active), robot, data, here, terms)
+        model, begin = extended(plain.only(active), robot, task.data, here, terms)
         identification = task.identified(model, begin)
         known = identification.active[task.base.names.count :]
         begin = replace(begin, effects=np.where(known, begin.effects, 0.0))
         model, squares = task.squares(model.only(identification.active), begin)
         robust = task.robust(model, squares)
     base = replace(task.base, names=model.names, fields=model.fields, moved=model.moved)
-    return Stage(base, identification, robust, robust.fit, terms, stage.notices)
+    return task, Stage(base, identification, robust, robust.fit, terms, stage.notices)
 
 
 def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from minimax_cal.fitting.opened import Opened, Result, open_result, place
+from minimax_cal.fitting.opened import Opened, Result, open_result
+from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, strangers
+from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import load_robot
 
 BEFORE, AFTER = "before", "after"
@@ -69,7 +72,8 @@ def open_saved(
         notices += measured.notices
         if known.placed:
             measured, said = known_targets(measured, known.cell)
-            notices += said
+            notices += [*said, *strangers(known.cell, measured)]
+            measured = known.cell.placed(measured)
         held, said = unseen(measured, known)
         notices += said
     elif known.data.poses:
@@ -144,5 +148,7 @@ def nominal_cell(
     missing = [name for name in cell.target_names if name not in train.target_names]
     if missing:
         raise DataError(f"{train.source}: {missing[0]} was not measured")
+    check_joints(robot, train)
+    state = fit_base(model_of(robot, cell.placed(train)), robot.mdh).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
-    return place(robot, train), (said,)
+    return Cell.of(robot, state, train.target_names, sessions=cell.sessions), (said,)

@@ -33,6 +33,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
@@ -300,12 +301,19 @@ def tradeoff(
 
 def problem_of(fit: Fit) -> MinimaxProblem:
     """The worst-point problem on the training poses of a fit, with its identified parameters."""
-    model = model_of(fit.before.robot, fit.train).only(fit.identification.active)
+    robot, train, effects = fit.before.robot, fit.train, fit.cell.effects
+    model = model_of(robot, train)
+    if effects.terms:
+        model, _ = extended(model, robot, train, fit.cell.state, effects.terms)
+    model = model.only(fit.identification.active)
     return minimax_problem(model, fit.cell.state, fit.distances, "two-sided", "point")
 
 
 def choice_of(fit: Fit, name: str, compromise: Compromise) -> Choice:
     """A compromise as a cell, judged on the training and held-out poses of a fit."""
-    cell = Cell.of(fit.before.robot, compromise.state, fit.cell.target_names)
+    robot, names, sessions = fit.before.robot, fit.cell.target_names, fit.cell.sessions
+    scene = fit.cell.scene(fit.data)
+    effects = fitted(fit.cell.effects.terms, scene, compromise.state.effects)
+    cell = Cell.of(robot, compromise.state, names, effects, sessions)
     train, held = (accuracy(cell.error(fit.data.take(rows))) for rows in (~fit.held, fit.held))
     return Choice(name, compromise.share, cell, train, held, compromise.status)

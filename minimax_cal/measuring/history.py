@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -134,26 +134,86 @@ def last_signs(move: Array, linked: Array) -> Array:
 
 
 def clock(data: Measurements) -> Array:
-    """(m,) place in the session, 0 to 1: by time, else by visit number, else by row."""
-    order = visits(data)
+    """(m,) place in the session, 0 to 1: by time, else by visit number, else by row.
+
+    That of `with_history` where the data have it: a part of the data knows no better.
+    """
+    if "clock" in data.columns:
+        return np.asarray(data.columns["clock"])
     when = np.empty(data.poses)
-    when[order] = np.arange(data.poses)
+    when[visits(data)] = np.arange(data.poses)
+    name = timed_by(data)
+    if name:
+        when = filled(when, data.columns[name].astype(float))
+    length = np.ptp(when)
+    return np.asarray((when - when.min()) / (length if length > 0.0 else 1.0))
+
+
+def timed_by(data: Measurements) -> str:
+    """The column that tells when poses were visited: `time`, `order`, or none."""
     for name in ("time", "order"):
         if name not in data.columns:
             continue
         given = data.columns[name].astype(float)
-        known = np.isfinite(given)
         if name == "order" and restarts(given, sessions(data)):
-            break
-        if known.sum() > 1:
-            by_visit = np.argsort(when[known])
-            when = np.interp(when, when[known][by_visit], given[known][by_visit])
-            break
-    length = np.ptp(when)
-    return np.asarray((when - when.min()) / (length if length > 0.0 else 1.0))
+            return ""
+        if np.isfinite(given).sum() > 1:
+            return name
+    return ""
+
+
+def filled(visit: Array, given: Array) -> Array:
+    """(m,) given times, those between interpolated.  visit: (m,) place in the visiting order."""
+    known = np.isfinite(given)
+    by_visit = np.argsort(visit[known])
+    return np.interp(visit, visit[known][by_visit], given[known][by_visit])
 
 
 def restarts(number: Array, session: Array) -> bool:
     """Whether the visit numbers of a later session begin again among those of an earlier one."""
     spans = [(number[session == s].min(), number[session == s].max()) for s in np.unique(session)]
     return any(nxt[0] <= last[1] for last, nxt in pairwise(spans))
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time of a fit's data, for data that come later.
+
+    column: `time` or `order`.  origin, length: where in it the clock is 0, and from there to 1.
+    """
+
+    column: str
+    origin: float
+    length: float
+
+    @staticmethod
+    def of(data: Measurements) -> Clock | None:
+        """The clock of data, or of a part that knows its place (`with_history`); None by row."""
+        name, place = timed_by(data), clock(data)
+        if not name:
+            return None
+        given = data.columns[name].astype(float)
+        known = np.flatnonzero(np.isfinite(given))
+        first, last = known[np.argmin(given[known])], known[np.argmax(given[known])]
+        told = place[last] - place[first]
+        if not (given[last] > given[first] and told > 0.0):
+            return None
+        length = float((given[last] - given[first]) / told)
+        found = Clock(name, float(given[first] - length * place[first]), length)
+        same = np.abs(found.at(given[known]) - place[known]).max() < 1e-6
+        return found if same else None  # a clock of the user's own is no line over the column
+
+    def at(self, given: Array) -> Array:
+        """Place in the session of the fit.  given: of the column."""
+        return (given - self.origin) / self.length
+
+    def on(self, data: Measurements) -> Measurements:
+        """The data with this clock; as they are where they have one, or lack the column."""
+        if "clock" in data.columns or self.column not in data.columns:
+            return data
+        given = data.columns[self.column].astype(float)
+        if not np.isfinite(given).any():
+            return data
+        visit = np.empty(data.poses)
+        visit[visits(data)] = np.arange(data.poses)
+        return replace(data, columns={**data.columns, "clock": self.at(filled(visit, given))})

@@ -46,6 +46,8 @@ class Measurements:
     unknown: columns that nothing uses, as text, by their name in the file.
     notices: what the reader should know about the file.
     source, digest: path and SHA-256 of the file.
+    frames: (4, 4) where the measurement frame of each session stands in the one that y is given in,
+    by its label, the first one's first [m]; empty where y is as measured.
     """
 
     q: Array
@@ -58,6 +60,7 @@ class Measurements:
     notices: tuple[str, ...] = ()
     source: str = "measurements"
     digest: str = ""
+    frames: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def poses(self) -> int:

@@ -14,11 +14,15 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
 from minimax_cal.ground.files import json_of, read_text
 from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.history import Clock
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
+from minimax_cal.measuring.stations import ALONE, Sessions, labels, moved, seen_from, shifts
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted_from_list
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot, robot_from_dict
+
+LATE = 0.1  # of a session: so far beyond its ends, effects of time are not extrapolated silently
 
 
 class NotSaved(CalibrationError):
@@ -31,7 +35,8 @@ class Cell:
 
     base: (4, 4) pose of the base [m].  target_names: k of them.  target_positions: (k, 3) in
     the last frame [m].
-    effects: what moves the targets beyond geometry.
+    effects: what moves the targets beyond geometry.  sessions: where the instrument stood in each,
+    and their time; predictions are for the first where data name none.
     """
 
     robot: Robot
@@ -39,13 +44,21 @@ class Cell:
     target_names: tuple[str, ...]
     target_positions: Array
     effects: Fitted = field(default=NOTHING)
+    sessions: Sessions = field(default=ALONE)
 
     @staticmethod
-    def of(robot: Robot, state: State, targets: tuple[str, ...], effects: Fitted = NOTHING) -> Cell:
+    def of(
+        robot: Robot,
+        state: State,
+        targets: tuple[str, ...],
+        effects: Fitted = NOTHING,
+        sessions: Sessions = ALONE,
+    ) -> Cell:
         """The cell that a state of the parameters describes."""
         base = np.eye(4)
         base[:3, :3], base[:3, 3] = state.rotation, state.origin
-        return Cell(robot.with_mdh(state.mdh), base, targets, state.target_positions, effects)
+        robot = robot.with_mdh(state.mdh)
+        return Cell(robot, base, targets, state.target_positions, effects, sessions)
 
     @property
     def state(self) -> State:
@@ -67,24 +80,40 @@ class Cell:
         turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.target_positions)
         return np.asarray(turned + pose[:, None, :3, 3])
 
+    def placed(self, data: Measurements) -> Measurements:
+        """The data in the first frame of the fit's sessions, with the fit's clock."""
+        frames, clock = self.sessions.frames, self.sessions.clock
+        return seen_from(clock.on(data) if clock else data, frames)
+
     def scene(self, data: Measurements) -> Scene:
         """What the laws of effects look at, for all targets of the cell."""
         base = (self.base[:3, :3], self.base[:3, 3])
         hidden = np.full((data.poses, len(self.target_names), 3), np.nan)
-        data = replace(data, target_names=self.target_names, y=hidden)
+        data = self.placed(replace(data, target_names=self.target_names, y=hidden))
         return Scene.of(self.robot, data, base, self.target_positions, data.q * self.robot.sign)
 
     def follow(self, data: Measurements) -> Array:
-        """As `predict`, with the columns of the data (order, temperature, payload ...)."""
+        """As `predict`, with the columns of the data (session, order, temperature, payload ...).
+
+        Each row in the frame of its session; in the first where the data's points are all given so.
+        """
+        points, frames = self.seen(data), self.sessions.frames
+        if not (frames and data.poses):
+            return points
+        return moved(points, np.linalg.inv(shifts(data, frames)))
+
+    def seen(self, data: Measurements) -> Array:
+        """As `follow`, all rows in the frame of the first session."""
         if not (self.effects.terms and data.poses):
-            return Cell(self.robot, self.base, self.target_names, self.target_positions).predict(
-                data.q
-            )
+            return replace(self, effects=NOTHING).predict(data.q)
         points = np.moveaxis(self.effects.points(self.scene(data)), -1, 0)
         return np.asarray(points @ self.base[:3, :3].T + self.base[:3, 3])
 
     def error(self, data: Measurements) -> Array:
-        """Measured minus predicted: (k, m, 3), for the targets of the data [m]."""
+        """Measured minus predicted: (k, m, 3), for the targets of the data [m].
+
+        In the axes of the first session.
+        """
         check_joints(self.robot, data)
         strange = [name for name in data.target_names if name not in self.target_names]
         if strange:
@@ -93,26 +122,59 @@ class Cell:
                 f"({', '.join(self.target_names)})"
             )
         chosen = [self.target_names.index(name) for name in data.target_names]
-        return np.asarray(np.moveaxis(data.y - self.follow(data)[:, chosen], 1, 0))
+        return np.asarray(np.moveaxis(self.placed(data).y - self.seen(data)[:, chosen], 1, 0))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: millimetres and a rotation vector in radians."""
-        turn = Rotation.from_matrix(self.base[:3, :3]).as_rotvec()
+        frames, clock = self.sessions.frames, self.sessions.clock
+        told: dict[str, Any] = {"clock": vars(clock)} if clock else {}
+        if frames:
+            told["sessions"] = {label: pose_to_dict(frame) for label, frame in frames.items()}
         return {
-            "base": {
-                "translation_mm": [float(v) * 1e3 for v in self.base[:3, 3]],
-                "rotation_vector_rad": [float(v) for v in turn],
-            },
+            "base": pose_to_dict(self.base),
             "targets_mm": {
                 name: [float(v) * 1e3 for v in spot]
                 for name, spot in zip(self.target_names, self.target_positions, strict=True)
             },
             "effects": self.effects.to_list(),
+            **told,
         }
 
     def whole(self) -> dict[str, Any]:
         """`to_dict` with the robot, as `cell_from_dict` reads it."""
         return {"robot": self.robot.to_dict(), **self.to_dict()}
+
+
+def pose_to_dict(pose: Array) -> dict[str, list[float]]:
+    """A pose (4, 4) for JSON: millimetres and a rotation vector in radians."""
+    turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+    return {
+        "translation_mm": [float(v) * 1e3 for v in pose[:3, 3]],
+        "rotation_vector_rad": [float(v) for v in turn],
+    }
+
+
+def pose_from_dict(content: Mapping[str, Any]) -> Array:
+    """From `pose_to_dict`.  Raises KeyError, TypeError, ValueError."""
+    pose = np.eye(4)
+    turn = np.array(content["rotation_vector_rad"], dtype=float)
+    pose[:3, :3] = Rotation.from_rotvec(turn.reshape(3)).as_matrix()
+    pose[:3, 3] = np.array(content["translation_mm"], dtype=float).reshape(3) * 1e-3
+    if not np.isfinite(pose).all() or np.abs(pose).max() > FARTHEST:
+        raise ValueError("a pose is not of plausible numbers")
+    return pose
+
+
+def sessions_from(content: Mapping[str, Any]) -> Sessions:
+    """The sessions of a saved calibration.  Raises KeyError, TypeError, ValueError."""
+    frames = {str(k): pose_from_dict(pose) for k, pose in content.get("sessions", {}).items()}
+    told = content.get("clock")
+    if told is None:
+        return Sessions(frames)
+    clock = Clock(str(told["column"]), float(told["origin"]), float(told["length"]))
+    if not (np.isfinite(clock.origin) and 0.0 < clock.length < np.inf):
+        raise ValueError("its clock does not run")
+    return Sessions(frames, clock)
 
 
 def still(q: Array, targets: tuple[str, ...], robot: Robot) -> Measurements:
@@ -132,23 +194,20 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
             "expected a calibration of schema 1"
         )
     try:
-        base = np.eye(4)
-        turn = np.array(content["base"]["rotation_vector_rad"], dtype=float)
-        base[:3, :3] = Rotation.from_rotvec(turn.reshape(3)).as_matrix()
-        base[:3, 3] = np.array(content["base"]["translation_mm"], dtype=float).reshape(3) * 1e-3
+        base, sessions = pose_from_dict(content["base"]), sessions_from(content)
         targets = content["targets_mm"]
         spots = np.array([targets[name] for name in targets], dtype=float).reshape(-1, 3) * 1e-3
         robot = content["robot"]
         effects = effects_from(content, source)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: is not a saved calibration (robot, base, targets_mm: {error}); "
             "write one with minimax-cal calibrate -o"
         ) from error
-    large = np.abs(np.concatenate([base[:3, 3], spots.reshape(-1)])).max()
-    if not (np.all(np.isfinite(base)) and large <= FARTHEST):
-        raise CalibrationError(f"{source}: base or targets are not plausible numbers")
-    cell = Cell(robot_from_dict(robot, source), base, tuple(map(str, targets)), spots, effects)
+    if not np.abs(spots).max(initial=0.0) <= FARTHEST:
+        raise CalibrationError(f"{source}: targets are not plausible numbers")
+    names = tuple(map(str, targets))
+    cell = Cell(robot_from_dict(robot, source), base, names, spots, effects, sessions)
     try:
         scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
         for term, value in zip(effects.terms, effects.values, strict=True):
@@ -190,3 +249,31 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise NotSaved(f"{path}: is not a saved calibration")
     return content
+
+
+def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
+    """Notices on measurements whose session or time the fit cannot place.  data: as measured."""
+    said = []
+    frames, clock = cell.sessions.frames, cell.sessions.clock
+    new = sorted(set(labels(data)) - set(frames)) if frames else []
+    if new:
+        named = "no session is named" if new == [""] else f"session {new[-1]} is new to the fit"
+        said.append(
+            f"{data.source}: {named}: taken to be measured from where session "
+            f"{next(iter(frames))} was (the fit knows {', '.join(frames)})"
+        )
+    timed = [t.label for t in cell.effects.terms if {"constant", "since"} & t.choice.keys()]
+    if timed and "clock" not in data.columns:
+        column = clock.column if clock else "visit order"
+        place = clock.on(data).columns.get("clock") if clock else None
+        if place is None:
+            said.append(
+                f"{data.source}: {', '.join(timed)} depends on time, and the fit's clock "
+                f"({column}) does not run here: taken to last as long as the fit's session"
+            )
+        elif place.min() < -LATE or place.max() > 1.0 + LATE:
+            said.append(
+                f"{data.source}: {', '.join(timed)} is extrapolated: by {column} these poses lie "
+                f"from {place.min():.3g} to {place.max():.3g} of the fit's session"
+            )
+    return tuple(said)

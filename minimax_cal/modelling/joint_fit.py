@@ -11,7 +11,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of
+from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of, of_sessions
 from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
@@ -35,13 +35,14 @@ def extended(
 ) -> tuple[Model, State]:
     """The geometric model with the effects' columns at a state, and the state with their values.
 
-    Columns are constant; what finite turns add to them is taken from the state's values, so that
-    a second pass at the fit of the first is exact to second order.
+    Parameters that the state does not hold yet, the last ones, are zero.  Columns are constant;
+    what finite turns add to them is taken from the state's values, so that a second pass at the fit
+    of the first is exact to second order.
     """
     scene = scene_of(robot, data, model, state)
     fields = fields_of(terms, scene)
     names, _ = names_of(terms, scene)
-    values = state.effects if len(state.effects) else np.zeros(len(names))
+    values = np.pad(state.effects, (0, len(names) - len(state.effects)))
     moved = np.zeros((0, 0, 0))
     if values.any():
         exact = fitted(terms, scene, values).points(scene)
@@ -80,18 +81,20 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     )
     if not cell.effects.terms:
         return model, cell.state
-    hidden = replace(poses, target_names=cell.target_names)
+    hidden = cell.placed(replace(poses, target_names=cell.target_names))
     return extended(model, cell.robot, hidden, cell.state, cell.effects.terms)
 
 
-def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> State:
-    """Geometry alone by least squares, from a fit that is near.
+def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> tuple[Model, State]:
+    """Geometry alone by least squares, from a fit that is near, and where it ends.
 
-    active: (p,) the geometric parameters that are free.
+    active: (p,) the geometric parameters that are free; so are the frames of further sessions.
     """
     model, begin = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
+    if free := of_sessions(data.frames):
+        model, begin = extended(model, robot, data, begin, free)
     points, method = float(model.counts.sum()), least_squares.METHODS["snllm"]
     found = least_squares.solve(
         SumOfSquares(model), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
     )
-    return found.x.take(np.array(0))
+    return model, found.x.take(np.array(0))

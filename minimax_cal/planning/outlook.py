@@ -104,7 +104,8 @@ def remarks(task: Task, found: Poses, best: Found) -> list[str]:
     """What the reader should know about how the poses were found."""
     out = ["the arm's body is a crude one and the cell is not known: check every move yourself"]
     told = {name.rpartition(".")[0] for name in task.ahead.names}
-    silent_ones = [t.label for t in task.ahead.cell.effects.terms if t.label not in told]
+    terms = [term for term in task.ahead.cell.effects.terms if not term.frees_frames]
+    silent_ones = [term.label for term in terms if term.label not in told]
     if silent_ones:
         out.append(
             f"{', '.join(silent_ones)}: taken as known, not planned for, since the way to a pose "

@@ -77,6 +77,7 @@ def question(
                 )
     data = with_history(data)
     fit = calibrate(robot, data, "sum", holdout=0.0, effects=(*beside, pair[0]))
+    data = fit.cell.placed(data)
     state = replace(fit.cell.state, effects=np.zeros(0))
     model = model_of(robot, data)
     scene = scene_of(robot, data, model, state)

@@ -127,6 +127,7 @@ def noise_of(cell: Cell, data: Measurements) -> Noise:
     state = State(
         cell.robot.mdh, cell.base[:3, :3], cell.base[:3, 3], cell.target_positions[chosen]
     )
+    data = cell.placed(data)
     model = model_of(cell.robot, data)
     scene = scene_of(cell.robot, data, model, state)
     rows = linearised(model, state, scene.jacobian)

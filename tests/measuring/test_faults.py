@@ -265,14 +265,20 @@ def test_sessions_in_other_units(robot: mc.Robot) -> None:
         assert_array_equal(fault.rows, np.flatnonzero(later))
 
 
-def test_a_base_that_jumps_between_sessions(robot: mc.Robot) -> None:
-    data = halves(simulate(robot, 100, 3, seed=1, truth=TRUTH).data)
-    later = (data.columns["session"] == "b")[:, None, None]
-    for jump, count in ((0.0, 0), (0.5e-3, 1)):
-        moved = data.with_y(data.y + np.where(later, [0.0, jump, jump], 0.0))
-        error = mc.calibrate(robot, moved, "sum", holdout=0.0).cell.error(moved)
-        found = faults.session_jumps(moved, error)
-        assert len(found) == count
+def test_a_base_that_jumps_is_found_at_its_rows(robot: mc.Robot) -> None:
+    """In the visiting order, not that of the rows; two jumps are two."""
+    data = simulate(robot, 100, 3, seed=1, truth=TRUTH).data
+    rng = np.random.default_rng(0)
+    visit = rng.permutation(100)
+    data = replace(data, columns={**data.columns, "order": visit.astype(float)})
+    for first, second, starts in ((0.0, 0.0, []), (0.7e-3, 0.0, [40]), (0.7e-3, -1.4e-3, [40, 75])):
+        step = np.where(visit >= 40, first, 0.0) + np.where(visit >= 75, second, 0.0)
+        moved = data.with_y(data.y + step[:, None, None] * np.array([0.0, 0.6, 0.8]))
+        fit = mc.calibrate(robot, moved, "sum", holdout=0.0)
+        rows, sizes = faults.jumps(fit.data, fit.error)
+        assert visit[rows].tolist() == starts
+        assert_allclose(sizes, np.abs([first, second][: len(starts)]), rtol=0.15)
+        assert len(faults.session_jumps(fit.data, fit.error)) == bool(starts)
 
 
 @pytest.mark.parametrize("targets", [1, 3])

@@ -60,7 +60,7 @@ def all_terms(scene: Scene) -> list[Term]:
         for place in effect.places(scene):
             for choice in effect.choices(scene, place):
                 out += [Term(name, place, c) for c in (choice, *effect.finer(scene, choice)[:2])]
-    return out
+    return [*out, Term("session_jump", "frame", {"since": 0.4})]  # a moment that errors show
 
 
 ROBOT = weighty()
@@ -445,6 +445,21 @@ def test_the_base_drifts_as_one_body() -> None:
     assert not found.shift[1, :, [0, 2]].any()
     expected = clock * np.stack([-p[:, 1], p[:, 0], 0.0 * p[:, 2]], axis=1)  # turn about z
     assert_allclose(found.shift[5], expected, rtol=0, atol=EXACT)
+
+
+def test_a_jump_is_the_base_elsewhere_in_each_further_session() -> None:
+    session = np.array(["a", "b", "c", "b"])[np.arange(40) % 4]
+    frames = {name: np.eye(4) for name in "abc"}
+    scene = scene_of(ROBOT, replace(DATA, frames=frames, columns={**DATA.columns,
+                                                                  "session": session}))  # fmt: skip
+    found = columns("session_jump", "frame", scene, sessions=3.0)
+    assert found.names == tuple(f"{n}{i}" for i in "23" for n in ("x", "y", "z", "rx", "ry", "rz"))
+    p = scene.points
+    turned = np.stack([0.0 * p[:, 0], -p[:, 2], p[:, 1]], axis=1)  # about x
+    for at, name in ((3, "b"), (9, "c")):
+        assert_allclose(found.shift[at], turned * (session == name), rtol=0, atol=EXACT)
+    after = columns("session_jump", "frame", since=0.4)
+    assert_allclose(after.shift[0, :, 0], np.broadcast_to(SCENE.column("clock") >= 0.4, (3, 40)))
 
 
 def test_a_nest_moves_in_the_flange_after_its_moment() -> None:

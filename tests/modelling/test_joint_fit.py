@@ -113,6 +113,7 @@ CASES: dict[str, list[float]] = {
     "thermal_growth:all:constant=0.5:apart=0": [4e-4],
     "thermal_growth:all:temperature=1:apart=0": [1.2e-5],
     "frame_drift:frame:constant=0.5": [3e-4, -2e-4, 1e-4, 1e-4, -2e-4, 3e-4],
+    "session_jump:frame:since=0.4": [3e-4, -2e-4, 1e-4, 1e-4, -2e-4, 3e-4],
     "target_shift:smr2:since=0.4": [1e-4, 2e-4, -3e-4],
     "target_offset:smr1": [5e-4],
 }
@@ -291,6 +292,7 @@ def axes_of(links: kinematics.Chain) -> Array:
 
 def test_new_data_bring_their_own_columns(many: Many) -> None:
     cell, _, fit = many
+    cell = replace(cell, sessions=fit.cell.sessions)  # the clock runs on
     new = visited(40, seed=11)
     new = replace(new, columns={**new.columns, "payload": np.full(40, 10.0)})
     new = measured(cell, new, seed=12)

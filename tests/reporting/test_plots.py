@@ -13,6 +13,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots import diagnosis
+from minimax_cal.reporting.plots.figures import new_figure, save
 
 ROBOT = mc.load_robot("ur10")
 CASES: dict[str, tuple[str, str, dict[str, float], list[float]]] = {
@@ -140,3 +141,14 @@ def test_a_name_may_hold_a_dollar(tmp_path: Path) -> None:
     odd = replace(diagnosed("backlash"), robot="arm $x_{$")
     diagnosis.save_diagnosis(odd, tmp_path / "gap.svg")
     assert (tmp_path / "gap.svg").exists()
+
+
+def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path: Path) -> None:
+    figure = new_figure(4, 3)
+    axes = figure.subplots()
+    axes.plot([1.0, 1e4], [1.0, 1e4])
+    axes.set(xscale="log", yscale="log", title="$5")
+    save(figure, tmp_path / "picture.svg")
+    labels = [*axes.get_xticklabels(), *axes.get_yticklabels()]
+    assert len(labels) >= 4
+    assert all(label.get_parse_math() for label in labels)

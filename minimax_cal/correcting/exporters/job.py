@@ -78,7 +78,7 @@ def job_of(known: Opened) -> Job:
     if known.status is Status.FAILED:
         raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
     cell, nominal = known.cell, known.nominal
-    labels = tuple(term.label for term in cell.effects.terms)
+    labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
     before = nominal.robot if nominal else cell.robot
     return Job(cell.robot, before, known.source, labels, compliance_of(cell),
                fitted=nominal is not None)  # fmt: skip

@@ -22,6 +22,7 @@ from minimax_cal.diagnosing.where.smooth import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import stood
 
 UP: Array = np.array([0.0, 0.0, 1.0])
 
@@ -41,14 +42,16 @@ def where(
 
     error: (k, m, 3) measured minus predicted in base axes, NaN where not measured [m].
     jacobian: (n, k, 3, m) motion of each target with each joint, base axes [m/rad, or 1].
-    base: (4, 4) pose of the base in the measurement frame, at whose origin the instrument stands.
+    base: (4, 4) pose of the base in the measurement frame, at whose
+    origin the instrument stands, or stood first.
     noise: of the instrument per coordinate [m]; NaN to estimate it, see `noise_of`.
     fitted: (k, m, 3, p) derivative of the points by all that was fitted to these rows (as
     `Model.jacobian`); what the fit has taken is then not looked for.  Empty for held-out rows.
     up: (3,) vertical in base axes.  dof: degrees of freedom that `noise` was estimated from.
     """
     point = (data.y - base[:3, 3]) @ base[:3, :3]
-    sight = data.y / np.linalg.norm(data.y, axis=-1, keepdims=True) @ base[:3, :3]
+    seen = data.y - stood(data)[:, None]
+    sight = seen / np.linalg.norm(seen, axis=-1, keepdims=True) @ base[:3, :3]
     point, sight = np.moveaxis(point, 1, 0), np.moveaxis(sight, 1, 0)
     known = noise if math.isfinite(noise) else noise_of(data)
     rest = residual_of(error, fitted, groups(data), jacobian, known)

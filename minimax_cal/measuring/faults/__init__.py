@@ -11,7 +11,7 @@ from minimax_cal.measuring.faults.find import find_faults, in_lines, mended
 from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
 from minimax_cal.measuring.faults.nests import target_shifts
 from minimax_cal.measuring.faults.outliers import outlying
-from minimax_cal.measuring.faults.sessions import mixed_units, session_jumps
+from minimax_cal.measuring.faults.sessions import jumps, mixed_units, session_jumps
 from minimax_cal.measuring.faults.swaps import swapped_rows
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Fault",
     "find_faults",
     "in_lines",
+    "jumps",
     "looks_read_back",
     "mended",
     "mixed_units",

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import stats
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
-from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
+from minimax_cal.measuring.faults.fault import NO_ERROR, NONE, Amount, Fault
 from minimax_cal.measuring.faults.limits import FALSE_ALARM
-from minimax_cal.measuring.history import sessions
+from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
+
+ROUNDS = 10  # of asking each jump again
+CLEAR = 0.1  # of the squares that all poses as one body leave: a jump explains so much, or is none
 
 
 def mixed_units(data: Measurements) -> tuple[Fault, ...]:
@@ -52,47 +57,130 @@ def strange_ratios(
 
 
 def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
-    """A notice if the residual of a fit moves as a whole from session to session.
-
-    The mean error of each pose's targets is explained by one small displacement (6) for all poses
-    or one for each session (F-test).
-    """
-    session = sessions(data)
-    if not len(error) or session.max() == 0:
+    """A notice if the residual of a fit moves as a whole from some pose on; see `jumps`."""
+    rows, sizes = jumps(data, error) if len(error) else (NONE, np.zeros(0))
+    if not len(rows):
         return ()
-    count = np.maximum(np.isfinite(error[..., 0]).sum(axis=0), 1)[:, None]
-    mean = np.nansum(error, axis=0) / count
-    place = np.nansum(np.where(np.isfinite(error), np.moveaxis(data.y, 1, 0), np.nan), axis=0)
-    known = np.isfinite(error[..., 0]).any(axis=0)
-    rows, label = np.flatnonzero(known), session[known]
-    many = np.bincount(label)
-    if len(many) < 2 or many[many > 0].min() < FEWEST:
-        return ()
-    place = (place / count)[rows]
-    place = place - place.mean(axis=0)
-    lever = max(float(np.sqrt((place**2).mean())), FAINT)
-    turn = np.cross(np.eye(3)[None], place[:, None] / lever)  # a turn about each axis, in levers
-    design = np.concatenate([np.broadcast_to(np.eye(3), turn.shape), turn], axis=1)
-    design = np.swapaxes(design, 1, 2)
-    value = mean[rows].reshape(-1)
-    one = design.reshape(-1, 6)
-    each = np.concatenate(
-        [np.where((label == s)[:, None, None], design, 0.0) for s in np.unique(label)], axis=2
-    ).reshape(len(value), -1)
-    left = [float(((value - a @ np.linalg.lstsq(a, value)[0]) ** 2).sum()) for a in (one, each)]
-    dof, more = len(value) - each.shape[1], each.shape[1] - 6
-    ratio = (left[0] - left[1]) / more / max(left[1] / dof, 1e-30)
-    if stats.f.sf(ratio, more, dof) > 0.1 * FALSE_ALARM or left[0] < 1.1 * left[1]:
-        return ()
-    jump = float(np.sqrt(max(left[0] - left[1], 0.0) / len(rows)))
+    told = ", ".join(
+        f"line {line} on by {1e3 * size:.3g} mm"
+        for line, size in zip(data.line[rows], sizes, strict=True)
+    )
     return (
         Fault(
             "session_jump",
             "frame",
-            "the whole robot stands elsewhere from session to session (about "
-            f"{1e3 * jump:.3g} mm): was the instrument or the base moved, or is the workspace "
-            "another one?",
-            rows[label > label[0]],
-            parameters=(Amount("size", jump, "m"),),
+            f"{data.source}: all targets stand elsewhere from {told}: was the instrument or the "
+            "base moved, or another workspace measured? name the sessions in a column `session`, "
+            "or free the jump (--effects session_jump)",
+            rows,
+            parameters=tuple(Amount("size", float(size), "m") for size in sizes),
         ),
     )
+
+
+def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
+    """Rows (j,) from which on, as visited, all targets have moved as one body, and how far [m].
+
+    The mean errors of the poses' targets are explained by one small displacement (6) for all, or
+    by another one from some pose on: the best such pose is tried against chance (F-test times the
+    poses tried), and so are both sides (`jumps_in`).  error: (k, m, 3) of a fit, in the axes of
+    the data [m].
+    """
+    known = np.isfinite(error[..., 0]) & data.seen.T
+    order = visits(data)
+    order = order[np.asarray(known.any(axis=0))[order]]
+    count = known.sum(axis=0)[order, None]
+    mean = np.where(known[..., None], error, 0.0).sum(axis=0)[order] / count
+    place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
+    poses = Rigid.of(place, mean)
+    starts = jumps_in(poses, len(order))
+    steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(order)])]
+    sizes = [poses.size(later - earlier) for earlier, later in pairwise(steps)]
+    return order[np.array(starts, dtype=int)], np.array(sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """Small displacements of poses as one body, summed up pose by pose.
+
+    design: (m, 3, 6) motion of each pose's mean point along and about the axes, turns in levers.
+    value: (m, 3) its error [m].  gram: (m + 1, 6, 6), pull: (m + 1, 6), square: (m + 1,) sums over
+    the poses before.
+    """
+
+    design: Array
+    value: Array
+    gram: Array
+    pull: Array
+    square: Array
+
+    @staticmethod
+    def of(place: Array, value: Array) -> Rigid:
+        """Of poses in their order.  place: (m, 3) mean point, value: (m, 3) mean error [m]."""
+        place = place - place.mean(axis=0)
+        lever = max(float(np.sqrt((place**2).mean())), FAINT)
+        turn = np.cross(np.eye(3)[None], place[:, None] / lever)
+        shift = np.broadcast_to(np.eye(3), turn.shape)
+        design = np.swapaxes(np.concatenate([shift, turn], axis=1), 1, 2)
+        parts = (
+            np.swapaxes(design, 1, 2) @ design,
+            np.einsum("mij,mi->mj", design, value),
+            (value**2).sum(axis=1),
+        )
+        sums = [np.concatenate([0.0 * part[:1], np.cumsum(part, axis=0)]) for part in parts]
+        return Rigid(design, value, *sums)
+
+    def left(self, first: Array, last: Array) -> Array:
+        """(...) squares that one displacement for the poses first to last - 1 leaves [m^2]."""
+        gram, pull = self.gram[last] - self.gram[first], self.pull[last] - self.pull[first]
+        gram = gram + 1e-9 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] * np.eye(6)
+        explained = np.einsum("...i,...i", pull, np.linalg.solve(gram, pull[..., None])[..., 0])
+        return np.asarray(self.square[last] - self.square[first] - explained)
+
+    def fitted(self, first: int, last: int) -> Array:
+        """(6,) the displacement of some poses."""
+        gram, pull = self.gram[last] - self.gram[first], self.pull[last] - self.pull[first]
+        return np.asarray(np.linalg.lstsq(gram, pull, rcond=1e-9)[0])
+
+    def size(self, step: Array) -> float:
+        """RMS motion of all poses by a displacement [m]."""
+        return float(np.sqrt(((self.design @ step) ** 2).sum(axis=1).mean()))
+
+
+def jumps_in(poses: Rigid, count: int) -> list[int]:
+    """Where the poses jump: parts are split while one clearly does; then each jump is asked again.
+
+    Between its neighbours a jump may turn out to stand elsewhere, or nowhere.
+    """
+    found, waiting = [0, count], [(0, count)]
+    while waiting:
+        first, last = waiting.pop()
+        at = jump_between(poses, first, last)
+        if at:
+            found.append(at)
+            waiting += [(first, at), (at, last)]
+    found.sort()
+    for _ in range(ROUNDS):
+        before = list(found)
+        for old in before[1:-1]:
+            i = found.index(old)
+            at = jump_between(poses, found[i - 1], found[i + 1])
+            found[i : i + 1] = [at] if at else []
+        if found == before:
+            break
+    return found[1:-1]
+
+
+def jump_between(poses: Rigid, first: int, last: int) -> int:
+    """The best place for a jump among the poses first to last - 1; 0 where none is clear."""
+    at = np.arange(first + FEWEST, last - FEWEST + 1)
+    dof = 3 * (last - first) - 12
+    if not len(at) or dof < 1:
+        return 0
+    apart = poses.left(np.full_like(at, first), at) + poses.left(at, np.full_like(at, last))
+    best = int(np.argmin(apart))
+    whole, two = float(poses.left(np.array(first), np.array(last))), float(apart[best])
+    ratio = (whole - two) / 6.0 / max(two / dof, 1e-30)
+    chance = stats.f.sf(ratio, 6, dof) * len(at)
+    clear = whole - two > CLEAR * poses.left(np.array(0), np.array(len(poses.value)))
+    return int(at[best]) if clear and chance < 0.1 * FALSE_ALARM else 0

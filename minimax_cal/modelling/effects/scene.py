@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import stood
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import MASS_PER_METRE, G, centres, torques
 from minimax_cal.robots.kinematics import Chain
@@ -82,8 +83,13 @@ class Scene:
 
     @property
     def instrument(self) -> Array:
-        """(3,) where the instrument stands [m]: the origin of the measurement frame."""
+        """(3,) where the instrument stands [m]: the origin of the (first) measurement frame."""
         return np.asarray(-self.origin @ self.rotation)
+
+    @property
+    def instruments(self) -> Array:
+        """(3, m) where it stood at each pose [m]."""
+        return np.asarray(((stood(self.data) - self.origin) @ self.rotation).T)
 
     def column(self, stem: str) -> Array:
         """(m,) an optional column; zeros where it is empty or absent."""

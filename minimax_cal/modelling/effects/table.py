@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
+from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
 from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE
 from minimax_cal.modelling.effects.gears import (
@@ -24,6 +25,7 @@ from minimax_cal.modelling.effects.gears import (
 from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
 from minimax_cal.modelling.effects.time import (
     FRAME_DRIFT,
+    SESSION_JUMP,
     TARGET_OFFSET,
     TARGET_SHIFT,
     THERMAL_GROWTH,
@@ -46,6 +48,7 @@ EFFECTS: dict[str, Effect] = {
         SETTLING,
         THERMAL_GROWTH,
         FRAME_DRIFT,
+        SESSION_JUMP,
         TARGET_SHIFT,
         TARGET_OFFSET,
     )
@@ -77,6 +80,11 @@ class Term:
         return f"{self.effect}:{self.place}"
 
     @property
+    def frees_frames(self) -> bool:
+        """Whether it is that of `of_sessions`, which says nothing of the robot."""
+        return "sessions" in self.choice
+
+    @property
     def text(self) -> str:
         """As gear_error:J2:turns=2.0, with the whole choice."""
         return ":".join([self.label, *(f"{k}={float(v)!r}" for k, v in self.choice.items())])
@@ -86,6 +94,13 @@ class Term:
         if self.text not in scene.laws:
             scene.laws[self.text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
         return scene.laws[self.text]
+
+
+def of_sessions(frames: Frames) -> tuple[Term, ...]:
+    """What frees the frames of all sessions but the first, where there are several."""
+    if len(frames) < 2:
+        return ()
+    return (Term("session_jump", "frame", {"sessions": float(len(frames))}),)
 
 
 def parse(text: str) -> tuple[str, str, dict[str, float]]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.stations import station
 from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
 from minimax_cal.robots.kinematics import cross
 
@@ -92,16 +93,20 @@ THERMAL_GROWTH = Effect(
 )
 
 
+RIGID = ("x", "y", "z", "rx", "ry", "rz")
+RIGID_UNITS = ("m",) * 3 + ("rad",) * 3
+
+
+def rigid(scene: Scene) -> Array:
+    """(6, k, 3, m) motion of the points with the base: along and about its axes."""
+    eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
+    return np.concatenate([eye, cross(eye, np.broadcast_to(scene.points, eye.shape))])
+
+
 def drift(scene: Scene, place: str, choice: Choice) -> Columns:
     """The base moves and turns with time."""
-    f = course(scene, choice)
-    eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
-    turned = cross(eye, np.broadcast_to(scene.points, eye.shape))
     return Columns(
-        ("x", "y", "z", "rx", "ry", "rz"),
-        ("m",) * 3 + ("rad",) * 3,
-        shift=f * np.concatenate([eye, turned]),
-        fixed=told(choice),
+        RIGID, RIGID_UNITS, shift=course(scene, choice) * rigid(scene), fixed=told(choice)
     )
 
 
@@ -155,9 +160,36 @@ TARGET_SHIFT = Effect(
 )
 
 
+def jump(scene: Scene, place: str, choice: Choice) -> Columns:
+    """The base stands elsewhere from a moment on, or in each session but the first."""
+    if "sessions" not in choice:
+        after = (scene.column("clock") >= choice["since"]).astype(float)
+        fixed = {"since": choice["since"]}
+        return Columns(RIGID, RIGID_UNITS, shift=after * rigid(scene), fixed=fixed)
+    one, where = rigid(scene), station(scene.data)
+    further = range(1, int(choice["sessions"]))
+    return Columns(
+        tuple(f"{name}{number + 1}" for number in further for name in RIGID),
+        RIGID_UNITS * len(further),
+        shift=np.concatenate([(where == number) * one for number in further]),
+    )
+
+
+SESSION_JUMP = Effect(
+    "session_jump",
+    "instrument or robot was set up anew",
+    "the base stands elsewhere by (t, r) after row k, or in a further session",
+    lambda scene: ("frame",) if scene.has("clock") else (),
+    jump,
+    needs=lambda scene: "" if scene.has("clock") else "column order or time_s",
+    choices=lambda scene, place: (),  # its moment is read off the errors: `faults.jumps`
+    typical=1e-2,
+)
+
+
 def sight(scene: Scene, place: str, choice: Choice) -> Columns:
     """The distance reads r too far along the line of sight."""
-    seen = scene.points - scene.instrument[:, None]
+    seen = scene.points - scene.instruments
     unit = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     shift = np.zeros((1, *scene.points.shape))
     chosen = slice(None) if place == "all" else scene.data.target_names.index(place)

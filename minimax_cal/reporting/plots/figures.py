@@ -37,15 +37,14 @@ def save(figure: Figure, path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.text import Text
 
-    ticks = {
-        label
-        for axes in figure.axes
-        for axis in (axes.xaxis, axes.yaxis)
-        for tick in (*axis.majorTicks, *axis.minorTicks)
-        for label in (tick.label1, tick.label2)
-    }
     for words in figure.findobj(Text):
-        words.set_parse_math(words in ticks)  # a name may hold a dollar sign; ticks hold powers
+        words.set_parse_math(False)  # a name may hold a dollar sign
+    figure.draw_without_rendering()  # makes the ticks, which hold powers
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            for tick in (*axis.majorTicks, *axis.minorTicks):
+                tick.label1.set_parse_math(True)
+                tick.label2.set_parse_math(True)
     kind = path.suffix.lower().lstrip(".")
     stream = io.BytesIO()
     stamp = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": None}[kind]

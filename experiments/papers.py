@@ -1,0 +1,166 @@
+"""The two papers, item by item: every table and figure, and one table of verdicts.
+
+    python -m experiments papers [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
+
+Runs the studies that the papers need, each into a folder of its own, and writes verdicts.csv: item,
+command, paper's figure, ours, verdict, remark.  A verdict follows from the figures of this run.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import click
+
+from experiments import (
+    any_base,
+    by_pose,
+    conditions,
+    convergence,
+    courses,
+    errata,
+    measuring_loop,
+    methods,
+    splits,
+    sweep,
+    verdicts_m,
+    verdicts_s,
+)
+from experiments.real import SHARED
+from experiments.record import save_figure
+from experiments.sweep import Study, study_options
+from experiments.verdicts import HEADER, HOLDS, MISSING, NO, Verdict, table_of
+from minimax_cal.ground.files import write_whole
+
+
+def own(study: Study, name: str) -> Study:
+    """The same options for one of the studies: its own kept parts, a folder of its own."""
+    return replace(study, name=name, out=study.out / name, json=None)
+
+
+def from_convergence(study: Study) -> list[Verdict]:
+    """Paper S, Table 2 and Fig. 3."""
+    rows, setting = convergence.study_of(study)
+    convergence.save(study, rows, setting)
+    return verdicts_s.table_2(rows)
+
+
+def from_courses(study: Study) -> list[Verdict]:
+    """Paper S, Fig. 4-7."""
+    found = courses.study_of(study)
+    courses.save(study, found)
+    return verdicts_s.courses(found)
+
+
+def from_any_base(study: Study) -> list[Verdict]:
+    """Paper S, with the tracker anywhere."""
+    found = any_base.study_of(study)
+    any_base.save(study, found)
+    return verdicts_s.anywhere(found)
+
+
+def from_conditions(study: Study) -> list[Verdict]:
+    """Paper M, Table 3 and Fig. 2-6."""
+    found = conditions.study_of(study)
+    conditions.save(study, found)
+    for robot, outcomes in found.items():
+        name = conditions.ROBOTS[robot][0]
+        save_figure(study.out, f"by_pose_{robot}", by_pose.picture(name, outcomes))
+    return [
+        *verdicts_m.condition_3(found),
+        *verdicts_m.improvements(found),
+        verdicts_m.worst(found),
+    ]
+
+
+def from_methods(study: Study) -> list[Verdict]:
+    """Paper M, Tables 1 and 4."""
+    found = methods.run(study.quick, study.seed, SHARED, study.sweep)
+    tables = [methods.PROPERTIES, methods.PRINTED, methods.claims_table(found)]
+    tables += [methods.accuracy_table(case, results) for case, results in found]
+    study.save(tables, {}, methods.figures(found))
+    return verdicts_m.tables_1_4(found)
+
+
+def from_splits(study: Study) -> list[Verdict]:
+    """Paper M, minimax against the sum on many splits."""
+    found = splits.study_of(study)
+    splits.save(study, found)
+    return verdicts_m.many_splits(found)
+
+
+def from_measuring_loop(study: Study) -> list[Verdict]:
+    """Both papers' cells."""
+    found = measuring_loop.study_of(study)
+    measuring_loop.save(study, found)
+    return verdicts_m.measuring(found)
+
+
+def from_errata(study: Study) -> list[Verdict]:
+    """Both papers as printed."""
+    study.save([errata.table()], {})
+    write_whole(study.out / "list.md", errata.page())
+    count = len(errata.ERRATA)
+    shown = sum(errata.stands(one) for one in errata.ERRATA)
+    return [
+        Verdict("S, M: the formulas as printed", "errata", f"{count} slips",
+                f"{shown} shown by counter-example", HOLDS if shown == count else NO,
+                "list with proofs: docs/errata.md")
+    ]  # fmt: skip
+
+
+STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
+    "convergence": from_convergence,
+    "courses": from_courses,
+    "any_base": from_any_base,
+    "conditions": from_conditions,
+    "methods": from_methods,
+    "splits": from_splits,
+    "measuring_loop": from_measuring_loop,
+    "errata": from_errata,
+}
+
+
+def study_of(study: Study) -> list[Verdict]:
+    """All verdicts, paper S first."""
+    found = {name: make(own(study, name)) for name, make in STUDIES.items()}
+    return [
+        *verdicts_s.model(),
+        *found["convergence"],
+        *found["courses"],
+        *found["any_base"],
+        *verdicts_s.own_cell(),
+        *found["methods"],
+        *found["conditions"],
+        *found["splits"],
+        *verdicts_m.subproblems(study.quick),
+        *verdicts_m.own_cell(),
+        *found["measuring_loop"],
+        *found["errata"],
+    ]
+
+
+@click.command()
+@study_options("papers")
+def main(study: Study) -> None:
+    """Every table and figure of the two papers, and a table of verdicts."""
+    verdicts = study_of(study)
+    table = table_of(verdicts)
+    content = {
+        "verdicts": [dict(zip(HEADER, row, strict=True)) for row in table.rows],
+        "count": dict(Counter(verdict.verdict for verdict in verdicts)),
+        "not_covered": [verdict.remark for verdict in verdicts if verdict.verdict == MISSING],
+    }
+    study.save([table], content)
+    write_whole(study.out / "verdicts.csv", table.csv())
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)

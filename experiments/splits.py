@@ -1,0 +1,204 @@
+"""Does minimax calibrate better than the sum?  Many splits, at random and by groups: paper M.
+
+    python -m experiments.splits [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
+
+One split tells little: on held-out poses the two objectives differ by less than two splits do.
+Random: so many training poses, the others held out.  By groups: the poses of a region of the joint
+space (clusters by k-means) are held out together, each region once a clustering.  Ratios of minimax
+over sum: below one minimax is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from experiments import sweep
+from experiments.conditions import FOLDERS, ROBOTS
+from experiments.real import here
+from experiments.sweep import Study, study_options
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import Measurements
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+REGIONS = 6
+WAYS = ("random", "by groups")
+MEASURES = ("RMSE(phi)", "largest")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One split of one robot.  train: training poses of a random one."""
+
+    robot: str
+    way: str
+    split: int
+    train: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Held:
+    """Held-out RMSE(phi) and largest error, under sum and under minimax [mm]."""
+
+    sum: tuple[float, float]
+    minimax: tuple[float, float]
+
+    @property
+    def ratio(self) -> tuple[float, float]:
+        """Minimax over sum."""
+        first, second = (b / a for a, b in zip(self.sum, self.minimax, strict=True))
+        return first, second
+
+
+def regions(q: Array, seed: int) -> Array:
+    """(m,) the region of each pose: k-means on the joints, each measured by its spread.
+
+    q: (m, n) [rad, m].
+    """
+    spread = q.std(axis=0)
+    points = q / np.where(spread > 0.0, spread, 1.0)
+    centres = [points[np.random.default_rng(seed).integers(len(points))]]
+    while len(centres) < REGIONS:  # each next one as far as can be from those there are
+        apart = np.linalg.norm(points[:, None] - np.array(centres), axis=-1).min(axis=1)
+        centres.append(points[apart.argmax()])
+    _, label = kmeans2(points, np.array(centres), minit="matrix")
+    return np.asarray(label)
+
+
+def held_rows(data: Measurements, job: Job) -> Array:
+    """(m,) True where a pose is held out."""
+    if job.way == "by groups":
+        clustering, region = divmod(job.split, REGIONS)
+        return np.asarray(regions(data.q, 1000 * job.seed + clustering) == region)
+    order = np.random.default_rng([job.seed, job.split]).permutation(data.poses)
+    held = np.ones(data.poses, dtype=bool)
+    held[order[: job.train]] = False
+    return held
+
+
+def run(job: Job) -> Held:
+    """Calibrate both ways and judge on the poses held out."""
+    robot, data = ROBOTS[job.robot][1](job.seed + (job.split if job.robot == "irb2600" else 0))
+    held = held_rows(data, job)
+    out = {}
+    for objective in ("sum", "minimax"):
+        fit = calibrate(robot, data.take(~held), objective, holdout=0.0)
+        some = data.take(held)
+        distance = 1e3 * np.linalg.norm(some.y - fit.predict(some.q), axis=-1)
+        phi = float(np.sqrt((distance**2).mean(axis=0).max()))
+        out[objective] = (phi, float(distance.max()))
+    return Held(out["sum"], out["minimax"])
+
+
+def jobs_of(study: Study) -> list[Job]:
+    """Random splits and groups of every robot whose measurements are here."""
+    robots = [name for name in ROBOTS if name not in FOLDERS or here(FOLDERS[name])]
+    count, clusterings = (2, 1) if study.quick else (24, 4)
+    number = {"random": count, "by groups": 2 if study.quick else clusterings * REGIONS}
+    return [
+        Job(name, way, split, ROBOTS[name][2], study.seed)
+        for name in (robots[:2] if study.quick else robots)
+        for way in WAYS
+        for split in range(number[way])
+    ]
+
+
+def study_of(study: Study) -> dict[Job, Held]:
+    """Every split."""
+    jobs = jobs_of(study)
+    return dict(zip(jobs, study.sweep(run, jobs, "splits"), strict=True))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Ratios over splits: median, quartiles, and how often minimax wins."""
+
+    median: float
+    low: float
+    high: float
+    wins: int
+    splits: int
+
+
+def spread_of(found: dict[Job, Held], robot: str, way: str, measure: int) -> Spread:
+    """How minimax fares on one robot."""
+    ratio = ratios(found, robot, way, measure)
+    low, median, high = (float(x) for x in np.quantile(ratio, (0.25, 0.5, 0.75)))
+    return Spread(median, low, high, int((ratio < 1.0).sum()), len(ratio))
+
+
+def ratios(found: dict[Job, Held], robot: str, way: str, measure: int) -> Array:
+    """(splits,) minimax over sum."""
+    chosen = [held for job, held in found.items() if (job.robot, job.way) == (robot, way)]
+    return np.array([held.ratio[measure] for held in chosen])
+
+
+def robots_of(found: dict[Job, Held]) -> Sequence[str]:
+    """The robots of a study."""
+    return list(dict.fromkeys(job.robot for job in found))
+
+
+def table_of(found: dict[Job, Held]) -> Table:
+    """Median, quartiles and wins."""
+    rows: list[tuple[Cell, ...]] = []
+    for robot in robots_of(found):
+        for way in WAYS:
+            for number, measure in enumerate(MEASURES):
+                s = spread_of(found, robot, way, number)
+                rows.append(
+                    (ROBOTS[robot][0], way, measure, s.splits, s.median, s.low, s.high, s.wins)
+                )
+    return Table(
+        "minimax over sum on poses held out: below 1 minimax is better",
+        ("robot", "held out", "measure", "splits", "median", "lower quartile", "upper quartile",
+         "minimax wins"),
+        tuple(rows),
+        ("", "", "", "d", ".4f", ".4f", ".4f", "d"),
+    )  # fmt: skip
+
+
+def picture(found: dict[Job, Held]) -> Figure:
+    """All ratios of RMSE(phi)."""
+    from matplotlib.figure import Figure
+
+    rows = [(robot, way) for robot in robots_of(found) for way in WAYS]
+    figure = Figure(figsize=(7.0, 0.5 * len(rows) + 1.2), layout="constrained")
+    axes = figure.subplots()
+    axes.boxplot(
+        [ratios(found, robot, way, 0) for robot, way in rows],
+        orientation="horizontal",
+        tick_labels=[f"{ROBOTS[robot][0]}, {way}" for robot, way in rows],
+    )
+    axes.axvline(1.0, color="0.5", ls=":")
+    axes.set(xlabel="held-out RMSE(phi), minimax over sum")
+    axes.invert_yaxis()
+    return figure
+
+
+def save(study: Study, found: dict[Job, Held]) -> None:
+    """Table and picture."""
+    table = table_of(found)
+    rows = plain([dict(zip(table.header, row, strict=True)) for row in table.rows])
+    study.save([table], {"rows": rows}, {"splits": picture(found)})
+
+
+@click.command()
+@study_options("splits")
+def main(study: Study) -> None:
+    """Minimax against the sum over many splits, at random and by groups."""
+    save(study, study_of(study))
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)

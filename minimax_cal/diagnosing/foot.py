@@ -1,0 +1,116 @@
+"""Reflectors on the robot's foot: they say of themselves how base and instrument moved apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import moved, station
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import Term
+
+MOVES = ("frame_drift", "session_jump")  # laws that move the foot as a whole, in time
+BLOCKS = 10  # of the visits, left out in turn: what the law misses goes on for a while
+LEAST = 30  # poses at which a reflector was measured
+AGREE = 3.0  # sigmas of a difference that is one
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How far the middle of the foot's reflectors moved, as a law has it.  (3,) base axes [m]."""
+
+    value: Array
+    sigma: Array
+
+
+def reflectors(data: Measurements) -> Array:
+    """(m, n, 3) the foot's reflectors as the first session saw them, NaN where not measured [m]."""
+    names = [name[:-2] for name in data.columns if name.startswith("base") and name.endswith("_x")]
+    every = [[f"{name}_{axis}" for axis in "xyz"] for name in names]
+    whole = [
+        np.stack([data.columns[name] for name in three], axis=-1)
+        for three in every
+        if all(name in data.columns for name in three)
+    ]
+    if not whole:
+        return np.zeros((data.poses, 0, 3))
+    points = np.stack(whole, axis=1)
+    points = np.where(np.isfinite(points).all(axis=2, keepdims=True), points, np.nan)
+    if data.frames:
+        points = moved(points, np.stack(list(data.frames.values()))[station(data)])
+    return points[:, np.isfinite(points[..., 0]).sum(axis=0) >= LEAST]
+
+
+def seen_foot(cell: Cell, data: Measurements) -> Scene | None:
+    """The scene of a cell with the foot's reflectors in the place of the targets; None without."""
+    scene = cell.scene(data)
+    points = reflectors(cell.placed(data))
+    if not points.shape[1]:
+        return None
+    points = (points - scene.origin) @ scene.rotation
+    return replace(scene, points=np.moveaxis(points, 0, 2))
+
+
+def measured(scene: Scene, term: Term) -> Motion:
+    """What the reflectors themselves say of a law: its six parameters fitted to them alone.
+
+    Each stands where it stands: constants are free.  sigma: by blocks of visits left out.
+    """
+    columns = term.columns(replace(scene, points=np.nan_to_num(scene.points))).shift
+    clock = scene.column("clock")
+    block = np.minimum((np.argsort(np.argsort(clock)) * BLOCKS) // len(clock), BLOCKS - 1)
+    whole = fitted(scene.points, columns, np.ones(len(clock), dtype=bool))
+    spared = np.array([fitted(scene.points, columns, block != b) for b in range(BLOCKS)])
+    middle = motion(scene, term)
+    values = spared @ middle.T
+    sigma = np.sqrt((BLOCKS - 1) / BLOCKS * ((values - values.mean(axis=0)) ** 2).sum(axis=0))
+    return Motion(middle @ whole, sigma)
+
+
+def fitted(points: Array, columns: Array, rows: Array) -> Array:
+    """(6,) parameters of a law from reflectors (n, 3, m) alone.  columns: (6, n, 3, m)."""
+    gram, pull = np.zeros((6, 6)), np.zeros(6)
+    for own, field in zip(points, np.moveaxis(columns, 1, 0), strict=True):
+        known = rows & np.isfinite(own[0])
+        y = own[:, known] - own[:, known].mean(axis=1, keepdims=True)
+        x = field[..., known] - field[..., known].mean(axis=2, keepdims=True)
+        gram += np.einsum("acm,bcm->ab", x, x)
+        pull += np.einsum("acm,cm->a", x, y)
+    return np.asarray(np.linalg.lstsq(gram, pull, rcond=1e-9)[0])
+
+
+def motion(scene: Scene, term: Term) -> Array:
+    """(3, 6) motion of the reflectors' middle by each parameter, from first visit to last."""
+    middle = np.nanmean(scene.points, axis=(0, 2))
+    points = np.broadcast_to(middle[None, :, None], (1, 3, scene.poses))
+    field = term.columns(replace(scene, points=points)).shift[:, 0]
+    clock = scene.column("clock")
+    return np.asarray((field[..., np.argmax(clock)] - field[..., np.argmin(clock)]).T)
+
+
+def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
+    """Whether the reflectors on the foot confirm the laws of a fit that move it."""
+    scene, at = seen_foot(fit.cell, data), fit.model.names.geometric
+    for term in fit.terms:
+        count = len(term.columns(fit.study.scene).names)
+        own, at = slice(at, at + count), at + count
+        if scene is None or term.effect not in MOVES or term.frees_frames:
+            continue
+        across, told = motion(scene, term), measured(scene, term)
+        value = across @ fit.cell.effects.values[fit.terms.index(term)]
+        spread = across @ np.nan_to_num(fit.uncertainty.covariance[own, own]) @ across.T
+        sigma = np.hypot(np.sqrt(np.diag(spread)), told.sigma)
+        wrong = np.abs(value - told.value) > AGREE * sigma
+        shown = ", ".join(
+            f"{axis} {1e6 * a:+.0f} um named, {1e6 * b:+.0f} +- {1e6 * s:.0f} measured"
+            for axis, a, b, s in zip("xyz", value, told.value, told.sigma, strict=True)
+        )
+        odd = ", ".join(np.array(list("xyz"))[wrong])
+        verdict = f"they contradict it in {odd}" if odd else "they agree with it"
+        yield f"{term.label}: the reflectors on the foot moved by {shown}: {verdict}"

@@ -1,0 +1,141 @@
+"""Frames of sessions: a start from the robot as drawn, and small steps of them taken exactly.
+
+In a fit the frame of each further session is six linear parameters (`session_jump`), in base axes
+about where it was taken to stand.  What they find is put into the frame as a whole turn, so that
+the next pass has them near zero, where they are exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.fitting.start import fit_base, project
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import Frames, labels, seen_from
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
+
+LEAST = 3  # points that give a frame
+ALONE = 12  # poses of a session that place the robot by themselves
+ROUNDS, SAME = 20, 1e-9  # of placing targets and frames in turn, until these move less [m]
+
+
+def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
+    """The data with the points of all sessions in the frame of the first, as the drawing has it.
+
+    train: (m,) True for the rows that may be looked at.  Sessions that have none there are taken to
+    be in the first frame (`unplaced` says so).  Raises DataError for a session of too few points.
+    """
+    label, names = labels(data), sessions_of(data.take(train))
+    if len(names) < 2 or data.frames:
+        return data
+    for name in names:
+        rows = train & (label == name)
+        if data.seen[rows].sum() < LEAST:
+            raise DataError(
+                f"{data.source}: session {name!r} has {data.seen[rows].sum()} points to place its "
+                "measurement frame by; measure more, leave its rows out, or give them the session "
+                "whose frame they share"
+            )
+    return seen_from(data, placed(robot, data.take(train), names))
+
+
+def sessions_of(data: Measurements) -> list[str]:
+    """The names of sessions in the order of their first rows."""
+    return list(dict.fromkeys(labels(data).tolist()))
+
+
+def unplaced(data: Measurements, train: Array) -> tuple[str, ...]:
+    """A notice on sessions that are held out whole: no row tells where their frame stands."""
+    names = sessions_of(data.take(train))
+    lost = [name for name in sessions_of(data) if name not in names]
+    if not lost:
+        return ()
+    return (
+        f"{data.source}: held out whole: session {', '.join(lost)}; judged in the frame of session "
+        f"{names[0]}",
+    )
+
+
+def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Array]:
+    """Where the frames of sessions stand in that of the first, for the robot as drawn."""
+    label = labels(data)
+    count = [int((label == name).sum()) for name in names]
+    largest = data.take(label == names[int(np.argmax(count))])
+    state = fit_base(model_of(robot, largest), robot.mdh).state
+    frames = {}
+    for name, poses in zip(names, count, strict=True):
+        own = data.take(label == name)
+        if poses >= ALONE:
+            mine = fit_base(model_of(robot, own), robot.mdh).state
+            frames[name] = pose_of(state) @ np.linalg.inv(pose_of(mine))
+        else:
+            frames[name] = fitting(own, robot, state)
+    for _ in range(ROUNDS):
+        common = seen_from(data, frames)
+        state = fit_base(model_of(robot, common), robot.mdh).state
+        turned = {name: fitting(data.take(label == name), robot, state) for name in names}
+        step = max(np.abs(turned[name] - frames[name]).max() for name in names)
+        frames = turned
+        if step < SAME:
+            break
+    first = np.linalg.inv(frames[names[0]])
+    return {name: np.eye(4) if name == names[0] else first @ frames[name] for name in names}
+
+
+def fitting(data: Measurements, robot: Robot, state: State) -> Array:
+    """(4, 4) what takes points as they are given to where a state has them [Kabsch 1976]."""
+    there = Cell.of(robot, state, data.target_names).predict(data.q)[data.seen]
+    here = data.y[data.seen]
+    centre, goal = here.mean(axis=0), there.mean(axis=0)
+    turn = project(((there - goal).T @ (here - centre))[None])[0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, goal - turn @ centre
+    return pose
+
+
+def pose_of(state: State) -> Array:
+    """(4, 4) pose of the base in the measurement frame."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = state.rotation, state.origin
+    return pose
+
+
+def turned_in(frames: Frames, state: State) -> tuple[Frames, State]:
+    """Frames with the steps that a state holds for them, first of its effects, and it without."""
+    if not len(state.effects):
+        return frames, state
+    steps = state.effects[: steps_of(frames)].reshape(-1, 6)
+    base, out = pose_of(state), dict(frames)
+    for name, step in zip(list(frames)[1:], steps, strict=True):
+        jump = np.eye(4)
+        jump[:3, :3], jump[:3, 3] = kinematics.rotation(step[3:]), step[:3]
+        out[name] = base @ np.linalg.inv(jump) @ np.linalg.inv(base) @ frames[name]
+    rest = np.concatenate([0.0 * steps.reshape(-1), state.effects[steps.size :]])
+    return out, replace(state, effects=rest)
+
+
+def steps_of(frames: Frames) -> int:
+    """How many parameters free the frames."""
+    return 6 * max(len(frames) - 1, 0)
+
+
+def jumps(frames: Frames, base: Array) -> Array:
+    """(6 (s - 1),) where the base stands in each further session, as seen from the first.
+
+    Three lengths along its own axes there [m], and its turn as a vector [rad].  base: (4, 4).
+    """
+    out = []
+    for frame in list(frames.values())[1:]:
+        jump = np.linalg.inv(base) @ np.linalg.inv(frame) @ base
+        turn = jump[:3, :3]
+        out += [turn.T @ jump[:3, 3], Rotation.from_matrix(turn).as_rotvec()]
+    return np.concatenate([np.zeros(0), *out])

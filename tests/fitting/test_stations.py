@@ -1,0 +1,220 @@
+"""Sessions measured from several stations, jumps, and the clock that a fit keeps."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.fitting.calibrate import again
+from minimax_cal.fitting.stations import jumps, stationed, turned_in
+from minimax_cal.measuring.stations import seen_from, stood
+from minimax_cal.modelling.cell import strangers
+from minimax_cal.modelling.parameters import State
+
+ROBOT = "irb2600"
+NOISE = mc.Truth(noise=20e-6, noise_per_metre=0.0, compliance=0.0)
+HELD = 24  # poses of three targets that judge each fit
+SAMPLING = 1.0 / np.sqrt(2.0 * 9.0 * HELD)  # relative, of an RMS over so many coordinates
+EXACT = 1e-12  # metres, of transforms there and back
+SHIFT = np.array([0.6e-3, -0.8e-3, 0.0])  # 1 mm
+
+
+def labelled(data: mc.Measurements, session: np.ndarray) -> mc.Measurements:
+    return replace(data, columns={**data.columns, "session": session})
+
+
+def elsewhere(data: mc.Measurements, session: np.ndarray, seed: int = 0) -> mc.Measurements:
+    """The same points, those of each session but the first seen from anywhere, turned anyhow."""
+    y, rng = data.y.copy(), np.random.default_rng(seed)
+    for name in np.unique(session)[1:]:
+        turn, away = Rotation.random(rng=rng).as_matrix(), 4.0 * rng.normal(size=3)
+        y[session == name] = y[session == name] @ turn.T + away
+    return labelled(data.with_y(y), session)
+
+
+ONE = mc.simulate(ROBOT, 120, 3, seed=1, truth=NOISE).data
+SESSION = np.where(np.arange(120) % 2 == 0, "monday", "tuesday")
+TWO = elsewhere(ONE, SESSION)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[mc.Fit, Path]:
+    fit = mc.calibrate(ROBOT, TWO, "minimax")
+    path = tmp_path_factory.mktemp("stations") / "fit.json"
+    fit.save(path)
+    return fit, path
+
+
+@pytest.mark.parametrize("objective", ["sum", "minimax", "pose"])
+def test_two_stations_calibrate_as_well_as_one(objective: str) -> None:
+    one, two = (mc.calibrate(ROBOT, data, objective) for data in (ONE, TWO))
+    assert str(two.status) == "converged"
+    assert two.accuracy["holdout"].poses == HELD
+    assert_allclose(
+        two.accuracy["holdout"].rms_mm, one.accuracy["holdout"].rms_mm, rtol=SAMPLING, atol=0
+    )
+    for name in ("a2", "d4", "alpha1", "smr1_x"):  # the same data, six unknowns more
+        a, b = one.parameters[name], two.parameters[name]
+        assert abs(a.value - b.value) < 2.0 * b.sigma
+        assert a.sigma < 1.05 * b.sigma < 1.5 * a.sigma
+
+
+def test_the_station_is_found(saved: tuple[mc.Fit, Path]) -> None:
+    """Points of the second station, in the first one's frame, are those it would have measured."""
+    fit, _ = saved
+    common = fit.cell.placed(TWO)
+    assert list(fit.cell.sessions.frames) == ["monday", "tuesday"]
+    assert_allclose(common.y, ONE.y, rtol=0, atol=30e-6)  # sigma of a frame, three metres away
+    truth = jumps(fit.cell.sessions.frames, fit.cell.base)
+    told = [p for p in fit.parameters if p.of_effect]
+    assert_allclose([p.value for p in told], truth, rtol=1e-12)
+    assert all(0.0 < p.sigma < 3e-5 for p in told)
+    assert_allclose(stood(common)[SESSION == "monday"], 0.0, atol=EXACT)
+    away = np.linalg.inv(fit.cell.sessions.frames["tuesday"])[:3, 3]
+    assert_allclose(np.linalg.norm(stood(common)[1]), np.linalg.norm(away), rtol=1e-12)
+
+
+def test_a_saved_fit_places_each_session(saved: tuple[mc.Fit, Path]) -> None:
+    fit, path = saved
+    again = mc.load_fit(path)
+    assert_array_equal(again.cell.error(again.data), fit.cell.error(fit.data))
+    cell = mc.load_cell(path)
+    assert_allclose(cell.error(TWO), fit.error, rtol=0, atol=1e-9)  # digits of millimetres
+    # predictions are in the frame of each row's session
+    assert_allclose(
+        np.linalg.norm(TWO.y - cell.follow(TWO), axis=-1),
+        np.linalg.norm(fit.error, axis=-1).T,
+        rtol=0,
+        atol=1e-9,
+    )
+    assert mc.evaluate(cell, TWO).rms_mm < 1.05 * mc.evaluate(cell, ONE).rms_mm
+    assert strangers(cell, TWO) == ()
+    (said,) = strangers(cell, labelled(TWO, np.full(120, "friday")))
+    assert "session friday is new to the fit" in said
+    (said,) = strangers(cell, ONE)
+    assert "no session is named" in said
+
+
+def test_a_fit_of_stations_is_as_good_a_source_as_any(
+    saved: tuple[mc.Fit, Path],
+) -> None:
+    fit, path = saved
+    other = again(fit, objective="sum")
+    assert len(other.parameters) == len(fit.parameters)
+    found = mc.bootstrap(other, 20)
+    assert found.lost == 0
+    said: list[object] = []
+    mc.export(path, "dh-csv", notify=said.append)
+    assert not any("session_jump" in str(text) for text in said)
+    assert mc.tradeoff(fit, steps=0).choices[0].train.rms_mm < fit.accuracy["train"].rms_mm + 1e-9
+
+
+def test_a_session_of_few_poses_is_placed_by_the_others() -> None:
+    session = np.where(np.arange(120) < 5, "c", np.where(np.arange(120) % 2, "b", "a"))
+    three = elsewhere(ONE, session, seed=3)
+    fit = mc.calibrate(ROBOT, three, "sum", holdout=0.0)
+    one = mc.calibrate(ROBOT, ONE, "sum", holdout=0.0)
+    assert list(fit.cell.sessions.frames) == ["c", "b", "a"]
+    assert_allclose(fit.accuracy["train"].rms_mm, one.accuracy["train"].rms_mm, rtol=0.02)
+
+
+def test_one_session_costs_nothing() -> None:
+    alone = mc.calibrate(ROBOT, labelled(ONE, np.full(120, "a")), "sum")
+    plain = mc.calibrate(ROBOT, ONE, "sum")
+    assert alone.cell.sessions.frames == {}
+    assert_array_equal(alone.error, plain.error)
+
+
+def test_a_session_without_points_enough_is_refused() -> None:
+    data = elsewhere(ONE.only(0), np.where(np.arange(120) < 2, "a", "b"))
+    with pytest.raises(mc.DataError, match=r"session 'a' has \d points to place"):
+        mc.calibrate(ROBOT, data, "sum", holdout=0.0)
+
+
+def test_a_session_held_out_whole_is_judged_in_the_first_frame() -> None:
+    session = np.repeat(["a", "b"], 60)
+    fit = mc.calibrate(ROBOT, labelled(ONE, session), "sum", holdout=0.5, holdout_by="session")
+    assert fit.cell.sessions.frames == {}
+    assert len(set(session[fit.held])) == 1
+    assert any("held out whole: session" in text for text in fit.notices)
+    assert fit.accuracy["holdout"].rms_mm < 2.0 * fit.accuracy["train"].rms_mm
+
+
+def test_a_station_held_out_whole_fails_in_words() -> None:
+    fit = mc.calibrate(ROBOT, TWO, "sum", holdout=0.5, holdout_by="session")
+    assert str(fit.status) == "failed"
+    assert mc.Fit.from_dict(fit.to_dict()).status == fit.status
+    assert "NaN" not in fit.json()
+
+
+def test_small_steps_of_frames_are_taken_as_whole_turns() -> None:
+    """Points moved by the step, to first order, are where the new frame puts them."""
+    rng = np.random.default_rng(0)
+    robot = mc.load_robot(ROBOT)
+    data = stationed(robot, TWO, np.ones(120, dtype=bool))
+    turn, origin = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    step = 1e-6 * rng.normal(size=6)
+    state = State(robot.mdh, turn, origin, np.zeros((3, 3)), np.append(step, 7.0))
+    frames, rest = turned_in(data.frames, state)
+    assert_array_equal(rest.effects, [0, 0, 0, 0, 0, 0, 7.0])
+    moved = seen_from(data, frames)
+    point = (data.y - origin) @ turn
+    back = point - step[:3] - np.cross(step[3:], point)
+    expected = np.where((SESSION == "tuesday")[:, None, None], back @ turn.T + origin, data.y)
+    assert_allclose(moved.y, expected, rtol=0, atol=1e-10)  # second order of 1e-6 rad at metres
+
+
+# ---------------------------------------------------------------- jumps that nobody named
+
+
+def jumped(data: mc.Measurements, row: int) -> mc.Measurements:
+    return data.with_y(data.y + np.where(np.arange(data.poses) >= row, 1.0, 0.0)[:, None, None]
+                       * SHIFT)  # fmt: skip
+
+
+def test_a_station_that_moved_is_told_with_its_size_and_freed_on_request() -> None:
+    moved = jumped(ONE, 70)
+    plain, spoilt = mc.calibrate(ROBOT, ONE, "sum"), mc.calibrate(ROBOT, moved, "sum")
+    assert not any("stand elsewhere" in text for text in plain.notices)
+    (said,) = (text for text in spoilt.notices if "stand elsewhere" in text)
+    assert f"line {ONE.line[70]} on by" in said
+    told = float(said.partition("on by ")[2].split()[0])
+    assert_allclose(told, 1.0, rtol=0.1)  # the geometry takes up a part of it
+    freed = mc.calibrate(ROBOT, moved, "sum", effects=["session_jump"])
+    assert not any("stand elsewhere" in text for text in freed.notices)
+    assert_allclose(
+        freed.accuracy["holdout"].rms_mm, plain.accuracy["holdout"].rms_mm, rtol=SAMPLING
+    )
+    (term,) = freed.cell.effects.terms
+    assert_allclose(term.choice["since"], 70 / 119, rtol=1e-12)
+    value = freed.cell.effects.values[0]
+    sigma = freed.uncertainty.sigma[-6:] if freed.uncertainty else np.zeros(6)
+    truth = np.concatenate([SHIFT @ freed.cell.base[:3, :3], np.zeros(3)])
+    assert np.all(np.abs(value - truth) < 4.0 * sigma)
+
+
+def test_no_jump_is_no_moment() -> None:
+    with pytest.raises(mc.OptionError, match="write session_jump:frame:since=NUMBER"):
+        mc.calibrate(ROBOT, ONE, "sum", effects=["session_jump"])
+
+
+# ---------------------------------------------------------------- the clock
+
+
+def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path: Path) -> None:
+    drift = ["frame_drift:frame:constant=0.5"]
+    fit = mc.calibrate(ROBOT, ONE, "sum", effects=drift, holdout=0.0)
+    fit.save(tmp_path / "fit.json")
+    cell = mc.load_cell(tmp_path / "fit.json")
+    late = np.arange(120) >= 96
+    assert_allclose(cell.error(ONE.take(late)), fit.error[:, late], rtol=0, atol=1e-9)
+    assert strangers(cell, ONE.take(late)) == ()
+    later = replace(ONE, columns={"order": ONE.columns["order"] + 1000})
+    (said,) = strangers(cell, later)
+    assert "extrapolated: by order these poses lie from 8.4 to 9.4" in said
+    (said,) = strangers(cell, replace(ONE, columns={}))
+    assert "does not run here" in said
