@@ -434,7 +434,7 @@ def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> No
     assert run(f"{original}#wrist_1_link", "--to", "dh-csv").stdout.count("revolute") == 4
     for arguments, words in (
         (("irb120", "--to", "step"), "no such format; choose one of urdf, ur-yaml"),
-        (("irb120", "--to", "moc"), "add --experimental"),
+        (("irb120", "--to", "moc"), "agree (experimental)"),
         (("irb120", "--to", "moc", "--experimental"), "holds no nominal robot"),
         (("irb120", "--to", "json", "--urdf", original), "urdf goes with the format urdf"),
         (("irb120", "--to", "urdf", "--tip", "x"), "tip names a link of the file"),
