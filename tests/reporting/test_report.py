@@ -741,7 +741,7 @@ def test_what_is_not_installed_is_said(
         command(results / "fit.json", "-o", tmp_path / "a.html", "--pdf", tmp_path / "a.pdf")
     assert list(tmp_path.iterdir()) == []  # before any work
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(OptionError, match=r"pip install minimax-cal\[report\]"):
+    with pytest.raises(OptionError, match=r"in a clone of the repository"):
         page.render(compose(sources, WORDING))
 
 
