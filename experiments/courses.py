@@ -27,8 +27,8 @@ from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.judging.saved import evaluate
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.modelling.cell import evaluate
 from minimax_cal.robots.robot import Robot
 
 if TYPE_CHECKING:

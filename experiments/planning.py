@@ -33,8 +33,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.judging.saved import evaluate
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.cell import Cell, evaluate
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.simulate import Truth, gravity
 from minimax_cal.planning.candidates import Poses, candidates, free_poses
 from minimax_cal.planning.designs.criteria import Largest, Trace, size_of

@@ -15,8 +15,15 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.instruments.kinds import relative
     from minimax_cal.fitting.options import Options
-    from minimax_cal.ground.errors import CalibrationError, DataError, OptionError, RobotError
+    from minimax_cal.ground.errors import (
+        CalibrationError,
+        CalibrationWarning,
+        DataError,
+        OptionError,
+        RobotError,
+    )
     from minimax_cal.judging.bootstrap import bootstrap
+    from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
     from minimax_cal.judging.tradeoff import tradeoff
     from minimax_cal.measuring import datasets
@@ -27,7 +34,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
         read_measurements,
         write_measurements,
     )
-    from minimax_cal.modelling.cell import Cell, evaluate, load_cell
+    from minimax_cal.modelling.cell import Cell, load_cell
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
     from minimax_cal.planning.plan import plan
@@ -43,6 +50,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
 __all__ = [
     "EFFECTS",
     "CalibrationError",
+    "CalibrationWarning",
     "Cell",
     "Compensation",
     "DataError",
@@ -85,6 +93,7 @@ __all__ = [
 
 MODULES = {  # name: where it is defined
     "CalibrationError": "ground.errors",
+    "CalibrationWarning": "ground.errors",
     "DataError": "ground.errors",
     "OptionError": "ground.errors",
     "RobotError": "ground.errors",
@@ -99,7 +108,6 @@ MODULES = {  # name: where it is defined
     "import_files": "measuring.importers",
     "datasets": "measuring.datasets",  # the module itself
     "Cell": "modelling.cell",
-    "evaluate": "modelling.cell",
     "load_cell": "modelling.cell",
     "EFFECTS": "modelling.effects.table",
     "register": "modelling.effects.table",
@@ -112,6 +120,7 @@ MODULES = {  # name: where it is defined
     "calibrate": "fitting.calibrate",
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
+    "evaluate": "judging.saved",
     "iso9283": "judging.standard",
     "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",

@@ -6,6 +6,7 @@ import inspect
 import os
 import re
 import runpy
+import shlex
 import shutil
 import subprocess
 import sys
@@ -318,7 +319,7 @@ def execute(line: str) -> None:
     """One line of a shell; its exit code is 0, or the one that its comment tells."""
     command, _, comment = line.partition("  #")
     expected = re.search(r"exit code (\d)", comment)
-    program, *arguments = command.replace('"', "").split()
+    program, *arguments = shlex.split(command)
     if program == "python":
         runpy.run_path(arguments[0], run_name="__main__")
     elif program == "minimax-cal":

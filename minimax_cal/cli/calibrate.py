@@ -8,7 +8,15 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import DATA, ROBOT, Output, options_from, result_options
+from minimax_cal.cli.options import (
+    DATA,
+    ROBOT,
+    ROWS,
+    InGroups,
+    Output,
+    options_from,
+    result_options,
+)
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
@@ -17,10 +25,11 @@ from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
 from minimax_cal.reporting.plots.figures import save_errors
 
 
-@click.command(name="calibrate")
+@click.command(name="calibrate", cls=InGroups)
 @ROBOT
 @DATA
 @options_from(Options)
+@ROWS
 @click.option(
     "--bootstrap",
     "replicates",
@@ -30,11 +39,11 @@ from minimax_cal.reporting.plots.figures import save_errors
 )
 @result_options("the result (JSON)", figure="the errors before and after")
 def calibrate_command(
-    robot: str, data: Path, replicates: int | None, to: Output, **chosen: Any
+    robot: str, data: Path, replicates: int | None, in_rows: bool, to: Output, **chosen: Any
 ) -> int:
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
     with to.stages() as progress:
-        fit = calibrate(robot, data, progress=progress, **chosen)
+        fit = calibrate(robot, options.measured(data, in_rows), progress=progress, **chosen)
         more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
     if to.deliver(lambda: text_of(fit, *more), fit.status):

@@ -75,7 +75,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         ),
         "export": (
             "export",
-            "Write the robot of FIT (a saved calibration or a robot) as a file others can load.",
+            "Write the robot of FIT (a saved result or a robot) as a file others can load.",
         ),
     },
     "Simulate": {
@@ -88,7 +88,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
     "Report": {
         "report": (
             "report",
-            "One HTML page of RESULTS: a calibration, a diagnosis, or both of the same "
+            "A page to sign of RESULTS: a calibration, a diagnosis, or both of the same "
             "measurements.",
         ),
     },

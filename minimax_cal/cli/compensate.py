@@ -12,6 +12,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     FIT,
     PATH,
+    RUNG,
     SAFE_CELLS,
     WIDTH,
     Output,
@@ -46,6 +47,7 @@ from minimax_cal.robots.robot import load_robot
     clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
 )
 @SAFE_CELLS
+@RUNG
 @result_options("the targets (CSV)")
 def compensate_command(
     fit: Path, targets: Path, robot: str | None, safe_cells: bool, to: Output, **chosen: Any
@@ -62,6 +64,7 @@ def compensate_command(
     text = to.cells(given.corrected(found), safe_cells)
     if to.path:
         write_whole(to.path, text)
+        to.wrote(to.path)
     if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
     elif to.path:

@@ -12,6 +12,7 @@ from minimax_cal.cli.options import (
     DATA,
     JSON,
     ROBOT,
+    ROWS,
     SOME_DATA,
     Output,
     options_from,
@@ -25,7 +26,6 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.measuring.history import with_history
-from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, where_tables
 
@@ -44,11 +44,12 @@ from minimax_cal.reporting.tables import effects_list, effects_table, where_tabl
     ),
     quick=Option("Leave no parts of the poses out in turn: no claim beyond the measured poses."),
 )
+@ROWS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")
-def diagnose_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
+def diagnose_command(robot: str, data: Path, in_rows: bool, to: Output, **chosen: Any) -> int:
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
     with to.stages() as progress:
-        found = diagnose(robot, data, progress=progress, **chosen)
+        found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
     to.notice(*found.notices)
     if to.deliver(found.json):
         options.terminal().print(found.headline() + "\n", markup=False)
@@ -60,14 +61,15 @@ def diagnose_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
 @click.command(name="effects")
 @click.argument("robot", required=False)
 @SOME_DATA
+@ROWS
 @JSON
-def effects_command(robot: str | None, data: Path | None, as_json: bool) -> int:
+def effects_command(robot: str | None, data: Path | None, in_rows: bool, as_json: bool) -> int:
     """The library of effects; with ROBOT and DATA, where these measurements can test them."""
     scene = None
     if robot is not None:
         if data is None:
             raise OptionError("effects needs both ROBOT and DATA, or neither")
-        measured = with_history(read_measurements(data))
+        measured = with_history(options.measured(data, in_rows))
         fit = calibrate(robot, measured, objective="sum", holdout=0.0)
         scene = fit.cell.scene(measured)
     entries = effects_list(scene)

@@ -7,29 +7,36 @@ from pathlib import Path
 import click
 import numpy as np
 
-from minimax_cal.cli.options import DATA, FIT, Output, result_options, show
+from minimax_cal.cli.options import DATA, FIT, RUNG, Output, result_options, show
 from minimax_cal.fitting.checks import POOR_FIT
+from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.files import json_text
 from minimax_cal.measuring import checks
+from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import read_measurements
-from minimax_cal.modelling.cell import evaluate, load_cell, strangers
+from minimax_cal.modelling.cell import strangers
 
 
 @click.command(name="evaluate")
 @FIT
 @DATA
+@RUNG
 @result_options("the accuracy (JSON)")
-def evaluate_command(fit: Path, data: Path, to: Output) -> int:
-    """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted."""
-    cell, measured = load_cell(fit), read_measurements(data)
-    found = evaluate(cell, measured)
+def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int:
+    """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
+
+    FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.
+    """
+    measured = read_measurements(data)
+    cell, _, said = open_result(fit, rung).placed_by(measured)
+    found = accuracy(cell.error(measured))
     doubts = checks.outliers(measured, np.linalg.norm(cell.error(measured), axis=-1))
     if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
         doubts.append(
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
-    to.notice(*measured.notices, *strangers(cell, measured), *doubts)
+    to.notice(*measured.notices, *said, *strangers(cell, measured), *doubts)
     content = {
         "schema": 1,
         "kind": "evaluation",

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, QUIET, Output, options_of, output, with_output
+from minimax_cal.cli.options import PATH, QUIET, RUNG, Output, options_of, output, with_output
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.ground.options import Option
@@ -32,14 +32,16 @@ from minimax_cal.ground.options import Option
     tip=Option("Last link of the chain in that file.", metavar="LINK"),
     experimental=Option("Agree to a format whose frames its maker does not document (moc)."),
 )
+@RUNG
 @output("the robot")
 @QUIET
 @with_output
 def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
-    """Write the robot of FIT (a saved calibration or a robot) as a file others can load."""
+    """Write the robot of FIT (a saved result or a robot) as a file others can load."""
     made = exported(fit, kind, to.path, **chosen)
     written(made, to.path)
     to.notice(*made.notices)
+    to.wrote(to.path)
     if not to.path:
         click.echo(made.content, nl=False)
     return 0

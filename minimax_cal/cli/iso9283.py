@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import FIT, SOME_DATA, Output, options_of, result_options, show
+from minimax_cal.cli.options import FIT, RUNG, SOME_DATA, Output, options_of, result_options, show
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
@@ -38,12 +38,14 @@ def point_of(text: str) -> str | Sequence[float]:
     ),
 )
 @click.option("--poses", is_flag=True, help="A row for every pose, too.")
+@RUNG
 @result_options("the values (JSON)")
 def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **chosen: Any) -> int:
     """Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.
 
-    FIT is what `calibrate -o` wrote, DATA the measurements [default: those of the fit].  Held-out
-    poses stand apart from training poses.  Poses that were visited again give repeatability.
+    FIT is what `calibrate`, `diagnose` or `relative` wrote with -o, DATA the measurements [default:
+    those of the fit].  Held-out poses stand apart from training poses.  Poses that were visited
+    again give repeatability.
     """
     found = iso9283(fit, data, **chosen)
     to.notice(*found.notices)

@@ -12,6 +12,7 @@ from minimax_cal.cli.options import (
     JSON,
     PATH,
     QUIET,
+    RUNG,
     SOME_DATA,
     Output,
     options_from,
@@ -21,15 +22,15 @@ from minimax_cal.cli.options import (
 from minimax_cal.fitting.uncertainty import FRAMES
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.maps import Grid, Predict, predictor, unknown, workspace_map
-from minimax_cal.judging.saved import Saved, open_fit
+from minimax_cal.judging.saved import AFTER, Saved, open_saved
 from minimax_cal.reporting.plots.map import save_map
 
 
 def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str, ...]]:
     """What the covariance of a saved fit predicts, and a notice where it holds none."""
-    if saved.fit.uncertainty is None:
+    if saved.uncertainty is None:
         return unknown, (f"{source}: holds no covariance, so nothing is predicted",)
-    return predictor(saved.fit.cell, saved.fit.uncertainty, frame), ()
+    return predictor(saved.cells[AFTER], saved.uncertainty, frame), ()
 
 
 @click.command(name="map")
@@ -44,16 +45,23 @@ def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str
     help="In which positions are predicted; base leaves out where the base stands.",
 )
 @options_from(Grid, "samples", "bins", "seed")
+@RUNG
 @JSON
-@click.option("-o", "--output", "figure", type=PATH, help="Draw to this PNG, SVG or PDF.")
+@click.option(
+    "-o", "--output", "figure", type=PATH,
+    help="Draw to this PNG, SVG or PDF, or write the numbers to a .json.",
+)  # fmt: skip
 @QUIET
 @with_output
-def map_command(fit: Path, data: Path | None, frame: str, to: Output, **chosen: Any) -> int:
+def map_command(
+    fit: Path, data: Path | None, frame: str, rung: int | None, to: Output, **chosen: Any
+) -> int:
     """Where FIT is sure of a position, and where the arm missed, over the workspace.
 
-    FIT is what `calibrate -o` wrote, DATA the measurements [default: those of the fit].
+    FIT is what `calibrate`, `diagnose` or `relative` wrote with -o, DATA the measurements [default:
+    those of the fit].
     """
-    saved = open_fit(fit, data or "")
+    saved = open_saved(fit, data or "", rung=rung)
     predict, said = predicted(saved, frame, str(fit))
     found = workspace_map(saved, predict, Grid(**chosen))
     to.notice(*saved.notices, *said, *found.notices)

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
 from inspect import signature
 from math import inf, isnan
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
+from rich.text import Text
 
 from minimax_cal.cli import FAILED
+from minimax_cal.cli.progress import stages
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import one_line, visible, without_formulas
 from minimax_cal.solvers.status import Status
 
+if TYPE_CHECKING:
+    from minimax_cal.measuring.measurements import Measurements
+
 WIDTH = 110  # of text that goes to no terminal
 MOST_NOTICES = 50
 MOST = 1e12  # of any number: squares of what is larger overflow somewhere
+RESULT = "Measurements and result"
+DRAWN = (".png", ".svg", ".pdf")
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 
@@ -32,6 +40,18 @@ ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
+ROWS = click.option(
+    "--rows-in-visit-order",
+    "in_rows",
+    is_flag=True,
+    help="The file tells no order: its rows stand as the poses were visited.",
+)
+RUNG = click.option(
+    "--rung",
+    type=int,
+    metavar="N",
+    help="Of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: the last].",
+)
 JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
@@ -86,6 +106,8 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
     return click.option(
         flag,
         name,
+        cls=Grouped,
+        group=told.group,
         type=kind,
         is_flag=kind is bool,
         default=shown,
@@ -96,6 +118,30 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
         callback=in_si,
         help=told.help or None,
     )
+
+
+class Grouped(click.Option):
+    """An option that the help lists under a heading."""
+
+    def __init__(self, *given: Any, group: str = "", **more: Any) -> None:
+        super().__init__(*given, **more)
+        self.group = group
+
+
+class InGroups(click.Command):
+    """A command whose help lists its options part by part, those of the result last."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The options under their headings, in the order in which these come first."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for each in self.get_params(ctx):
+            if record := each.get_help_record(ctx):
+                groups.setdefault(getattr(each, "group", "") or RESULT, []).append(record)
+        last = groups.pop(RESULT, [])
+        for title, records in (*groups.items(), (RESULT, last)):
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 def kind_of(default: Any, told: Option, flag: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
@@ -124,11 +170,9 @@ class Output:
     figure: Path | None
     quiet: bool
 
-    @contextmanager
-    def stages(self) -> Iterator[Callable[[str], None]]:
-        """To be told of each stage of long work, which a terminal shows on stderr."""
-        with Console(stderr=True, quiet=self.quiet, highlight=False).status("reading") as status:
-            yield status.update
+    def stages(self) -> AbstractContextManager[Callable[[str], None]]:
+        """To be told of each stage of long work, which stderr shows."""
+        return stages(self.quiet)
 
     def notice(self, *texts: str) -> None:
         """Print notices on stderr, one a line."""
@@ -148,10 +192,17 @@ class Output:
             )
         return quoted if safe else text
 
+    def wrote(self, *paths: Path | None) -> None:
+        """Say on stderr which files were written."""
+        for path in paths:
+            if path and not self.quiet:
+                click.echo(f"written: {path}", err=True)
+
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
         if self.figure:
             save(result, self.figure)
+            self.wrote(self.figure)
 
     def deliver(self, text: Callable[[], str], status: Status = Status.CONVERGED) -> bool:
         """Write the JSON of a result where it was asked for; whether people want to read it too.
@@ -161,6 +212,7 @@ class Output:
         made = text() if self.path or self.as_json else ""
         if self.path and status is not Status.FAILED:
             write_whole(self.path, made)
+            self.wrote(self.path)
         if self.as_json:
             click.echo(made, nl=False)
         return not self.as_json
@@ -178,6 +230,7 @@ def with_output(command: Command) -> Command:
         figure: Path | None = None,
         **more: Any,
     ) -> Any:
+        output, figure = by_ending(command, output, figure)
         writable(output)
         drawable(figure)
         return command(*given, to=Output(output, as_json, figure, quiet), **more)
@@ -185,10 +238,46 @@ def with_output(command: Command) -> Command:
     return handed
 
 
+def measured(path: Path, in_rows: bool) -> Measurements:
+    """The measurements of a file; in_rows: visited row by row, where it tells no order."""
+    from minimax_cal.measuring.history import ordered
+    from minimax_cal.measuring.measurements import read_measurements
+
+    data = read_measurements(path)
+    return data.in_visit_order() if in_rows and not ordered(data) else data
+
+
+def by_ending(
+    command: Command, output: Path | None, figure: Path | None
+) -> tuple[Path | None, Path | None]:
+    """Where the result and where its picture go: by the ending of a file, as .json or .svg.
+
+    Raises OptionError for a picture of a command that draws none, or for two of a kind.
+    """
+    if output and output.suffix.lower() in DRAWN:
+        if not getattr(command, "draws", False):
+            raise OptionError(f"{output}: this command draws no picture; write a .json")
+        if figure:
+            raise OptionError(f"{output}: the picture goes to {figure} already")
+        return None, output
+    if figure and figure.suffix.lower() == ".json" and not output:
+        return figure, None
+    return output, figure
+
+
+def drawing(command: Command) -> Command:
+    """A command that can draw its result."""
+    command.draws = True  # type: ignore[attr-defined]
+    return command
+
+
 def result_options(what: str, *, figure: str = "") -> Decorator:
     """The options of a result.  what: what -o writes.  figure: what --figure draws, if anything."""
     drawn = click.option("--figure", type=PATH, help=f"Draw {figure} to this PNG, SVG or PDF.")
-    return stacked(*([drawn] if figure else []), JSON, output(what), QUIET, with_output)
+    if not figure:
+        return stacked(JSON, output(what), QUIET, with_output)
+    what = f"{what}, or by its ending the picture,"
+    return stacked(drawn, JSON, output(what), QUIET, with_output, drawing)
 
 
 def output(what: str) -> Decorator:
@@ -203,12 +292,13 @@ def terminal() -> Console:
 
 
 def show(*tables: Table, headline: str = "") -> None:
-    """Print tables on stdout, and what they come to."""
+    """Print what tables come to on stdout, and the tables."""
     console = terminal()
+    if headline:
+        console.print(Text(visible(headline)), soft_wrap=not console.is_terminal)
+        click.echo()
     for table in tables:
         console.print(table.rich())
-    if headline:
-        click.echo(f"\n{visible(headline)}")
 
 
 def writable(*paths: Path | None) -> None:

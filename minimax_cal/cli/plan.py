@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import PATH, ROBOT, Output, options_from, result_options
+from minimax_cal.cli.options import PATH, ROBOT, InGroups, Output, options_from, result_options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.planning.options import PlanOptions, limits_of
@@ -17,7 +17,7 @@ from minimax_cal.reporting.plots.plan import save_plan
 from minimax_cal.robots.robot import load_robot
 
 
-@click.command(name="plan")
+@click.command(name="plan", cls=InGroups)
 @ROBOT
 @click.option("--poses", type=int, required=True, metavar="N", help="How many to measure.")
 @click.option("--fit", type=PATH, help="Calibration (JSON): robot, base, targets, its poses.")
@@ -41,6 +41,7 @@ def plan_command(robot: str, unit: str, to: Output, **chosen: Any) -> int:
     to.notice(*found.notices)
     if to.path:
         write_whole(to.path, found.csv(unit))
+        to.wrote(to.path)
     to.draw(save_plan, found)
     if to.as_json:
         click.echo(found.json(), nl=False)

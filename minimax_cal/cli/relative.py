@@ -8,12 +8,12 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import DATA, ROBOT, Output, options_from, result_options
+from minimax_cal.cli.options import DATA, ROBOT, InGroups, Output, options_from, result_options
 from minimax_cal.fitting.instruments import RelativeOptions, relative
 from minimax_cal.fitting.options import Options
 
 
-@click.command(name="relative")
+@click.command(name="relative", cls=InGroups)
 @ROBOT
 @DATA
 @options_from(Options, "holdout", "seed", "fix", "free")

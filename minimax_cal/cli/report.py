@@ -8,35 +8,46 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, QUIET, Output, options_of, with_output
+from minimax_cal.cli.options import PATH, QUIET, RUNG, Output, options_of, with_output
 from minimax_cal.ground.options import Option
-from minimax_cal.reporting.report import report
+from minimax_cal.reporting.report import Chosen, report, signed
 
 
 @click.command(name="report")
 @click.argument("results", nargs=-1, required=True, type=PATH)
 @click.option(
     "-o", "--output", "path", type=PATH, default="report.html", show_default=True,
-    help="Write the report to this HTML file.",
+    help="Write the report to this file: .html, .pdf, or .png of its first page.",
 )  # fmt: skip
 @options_of(
     report,
+    tolerance=Option('What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS"),
+    tolerance_for=Option("Of poses within or beyond the measured ones.", metavar="CLAIM"),
+    facts=Option(
+        "TOML with serial_number, controller, tool, payload, temperature, instrument, "
+        "certificate, place, validity.",
+        metavar="FILE",
+    ),
     title=Option("Title [default: of the robot]."),
     customer=Option("Who accepts the report.", metavar="NAME"),
     author=Option("Who measured and evaluated.", metavar="NAME"),
     date=Option("Date of the report [default: SOURCE_DATE_EPOCH, or today].", metavar="YYYY-MM-DD"),
 )
-@click.option(
-    "--pdf", type=PATH, metavar="FILE",
-    help="Print it to this PDF as well, with an installed Chromium, Chrome or Edge.",
-)  # fmt: skip
+@RUNG
+@click.option("--pdf", type=PATH, metavar="FILE", help="Print it to this PDF as well.")
 @QUIET
 @with_output
-def report_command(results: Sequence[Path], path: Path, to: Output, **chosen: Any) -> int:
-    """One HTML page of RESULTS: a calibration, a diagnosis, or both of the same measurements.
+def report_command(
+    results: Sequence[Path], path: Path, pdf: Path | None, to: Output, **chosen: Any
+) -> int:
+    """A page to sign of RESULTS: a calibration, a diagnosis, or both of the same measurements.
 
-    RESULTS are files that `calibrate -o` and `diagnose -o` wrote; that of `gap -o` may come with
-    them.  The page needs no network.
+    RESULTS are files that `calibrate`, `diagnose` or `relative` wrote with -o; that of `gap -o` may
+    come with them.  The page needs no network; PDF and PNG need an installed Chromium, Chrome or
+    Edge.
     """
-    report(results, path, notify=to.notice, **chosen)
+    found = signed(results, path, Chosen(**chosen), pdf, to.notice)
+    for line in found.lines():
+        click.echo(line)
+    to.wrote(path, pdf)
     return 0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import sys
+import warnings
 from collections.abc import Sequence
 
 import click
 
 from minimax_cal.cli import FAILED, INTERRUPTED, MISUSED
 from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.words import one_line
 
 
@@ -33,7 +34,9 @@ def outcome(arguments: Sequence[str] | None) -> int:
             stream.reconfigure(errors="replace")  # a terminal without the letter shows another
     code: int | None
     try:
-        code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CalibrationWarning)  # the notices say the same
+            code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except CalibrationError as error:
         code = complain(str(error))
     except click.exceptions.NoArgsIsHelpError as error:

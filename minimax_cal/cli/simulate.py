@@ -42,4 +42,7 @@ def simulate_command(
     if truth:
         content = {"robot": made.cell.robot.to_dict(), **made.cell.to_dict()}
         write_whole(truth, json_text(content))
+    for path in (output, truth):
+        if path:
+            click.echo(f"written: {path}", err=True)
     return 0

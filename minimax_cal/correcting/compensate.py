@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.correcting.reach import Outcome, Reach, bent, motion, seen
-from minimax_cal.fitting.fit import Fit, opened
+from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.history import ordered
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
@@ -142,7 +142,7 @@ class Compensation:
 
 
 def compensate(
-    fit: Fit | Cell | Path | str,
+    fit: Result,
     targets: Measurements | Array | Sequence[Sequence[float]],
     nominal: Robot | None = None,
     *,
@@ -151,26 +151,27 @@ def compensate(
     most_change: float = np.pi / 36.0,
     lever: float = np.nan,
     clock: float = 0.0,
+    rung: int | None = None,
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
 
-    fit: a calibration, its cell, or its file.  targets: (m, n) commanded joints in the order of the
-    path [rad, m], or measurements, whose columns (payload, approach ...) then count.
-    nominal: the arm the controller believes in; that of the fit unless given.
-    frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of the
-    orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
+    fit: a calibration, its cell, a diagnosis, a relative calibration, or its file.  targets: (m, n)
+    commanded joints in the order of the path [rad, m], or measurements, whose columns (payload,
+    approach ...) then count. nominal: the arm the controller believes in; that of the fit unless
+    given. frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of
+    the orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
     lever: what a radian counts as [m], NaN for the targets' own.  clock: moment of the
-    calibration's session, 0 to 1, that effects of time are taken at.  Raises CalibrationError for
-    wrong input.
+    calibration's session, 0 to 1, that effects of time are taken at.  rung: of a diagnosis, the
+    last unless given.  Raises CalibrationError for wrong input.
 
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)
-    cell, robot, drawn = cells_of(fit)
+    cell, robot, drawn = cells_of(fit, rung)
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None
     if robot is None:
-        raise CalibrationError("the fit does not tell its nominal robot; give it (--robot)")
+        raise CalibrationError("the fit does not tell its nominal robot; name it (nominal)")
     check_like(robot, cell.robot)
     arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
     base, tool, said = placed(cell, arm, robot, drawn, frame)
@@ -218,12 +219,12 @@ def lever_of(cell: Cell) -> float:
     return own if own > LEAST_LEVER else USUAL_LEVER
 
 
-def cells_of(source: Fit | Cell | Path | str) -> tuple[Cell, Robot | None, Cell | None]:
-    """The calibrated cell; the nominal robot and its cell, where the fit tells them."""
-    fit = opened(source)
-    if isinstance(fit, Cell):
-        return fit, None, None
-    return fit.cell, fit.nominal.robot if fit.nominal else None, fit.nominal
+def cells_of(source: Result, rung: int | None) -> tuple[Cell, Robot | None, Cell | None]:
+    """The calibrated cell; the nominal robot, and its cell, where the result tells them."""
+    known = open_result(source, rung)
+    nominal = known.nominal
+    robot = nominal.robot if nominal else None
+    return known.cell, robot, nominal if known.placed else None
 
 
 def same(one: Robot, other: Robot) -> bool:
@@ -241,13 +242,13 @@ def check_like(nominal: Robot, robot: Robot) -> None:
     if nominal.joints != robot.joints:
         raise OptionError(
             f"{nominal.name} has {nominal.joints} joints, the calibrated {robot.name} "
-            f"{robot.joints}; give the nominal robot of this fit (--robot)"
+            f"{robot.joints}; give the nominal robot of this fit (nominal)"
         )
     odd = (nominal.prismatic != robot.prismatic) | (nominal.sign != robot.sign)
     if odd.any():
         raise OptionError(
             f"joint {int(np.argmax(odd)) + 1} of {nominal.name} has another type or sign than the "
-            "calibrated one's; give the nominal robot of this fit (--robot)"
+            "calibrated one's; give the nominal robot of this fit (nominal)"
         )
 
 
@@ -271,6 +272,7 @@ def path_of(
     if not data.poses:
         raise DataError(f"{data.source}: holds no targets")
     check_joints(robot, data)
+    data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
 
 
@@ -308,7 +310,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
     if timed:
         out.append(
             f"{', '.join(timed)} depends on the time in the calibration's session: taken at "
-            f"{data.columns['clock'][0]:g} of it (--clock 0 is its start, 1 its end)"
+            f"{data.columns['clock'][0]:g} of it (clock 0 is its start, 1 its end)"
         )
     scene = arm.scene(data.take(np.arange(1)))
     whole = any(

@@ -9,16 +9,15 @@ from pathlib import Path
 
 from minimax_cal.correcting.exporters import table
 from minimax_cal.correcting.exporters.job import Export, read_job
-from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.opened import Result
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf_file import read_urdf
 
 
 def export(
-    fit: Fit | Cell | Robot | Path | str,
+    fit: Result | Robot,
     to: str,
     path: Path | str | None = None,
     *,
@@ -26,15 +25,17 @@ def export(
     mjcf: Path | str | None = None,
     tip: str = "",
     experimental: bool = False,
+    rung: int | None = None,
     notify: Callable[[str], object] = warnings.warn,
 ) -> str:
     """The robot of a calibration in a format that other programs load.
 
-    fit: a calibration, its cell or a robot, or the file or name of one.  to: urdf, ur-yaml,
-    ros-yaml, dh-csv, json, moc or mjcf.  path: written to as well, where given.  urdf: a file whose
-    joint origins are corrected, all else left as it is; mjcf: one whose bodies, gains and springs
-    are.  tip: last link of the chain in that file.
-    experimental: agree to a format whose frames its maker does not document (moc).  notify: called
+    fit: a calibration, its cell, a diagnosis, a relative calibration or a robot, or the file or
+    name of one.  to: urdf, ur-yaml, ros-yaml, dh-csv, json, moc or mjcf.  path: written to as well,
+    where given.  urdf: a file whose joint origins are corrected, all else left as it is; mjcf: one
+    whose bodies, gains and springs are.  tip: last link of the chain in that file.
+    experimental: agree to a format whose frames its maker does not document (moc).  rung: of a
+    diagnosis, the last unless given.  notify: called
     with what the format cannot hold and other notices.  Lengths and angles are in the units of the
     format.  Raises CalibrationError for wrong input.
 
@@ -43,7 +44,9 @@ def export(
     if path is not None:
         check_writable(path)
     place = None if path is None else Path(path)
-    made = exported(fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental)
+    made = exported(
+        fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental, rung=rung
+    )
     written(made, place)
     for notice in made.notices:
         notify(notice)
@@ -51,7 +54,7 @@ def export(
 
 
 def exported(
-    fit: Fit | Cell | Robot | Path | str,
+    fit: Result | Robot,
     to: str,
     path: Path | None = None,
     *,
@@ -59,12 +62,13 @@ def exported(
     mjcf: Path | str | None = None,
     tip: str = "",
     experimental: bool = False,
+    rung: int | None = None,
 ) -> Export:
     """The bytes of the file and its notices; arguments as of `export`."""
     originals = () if urdf is None else (read_urdf(urdf),)
     model = None if mjcf is None else Path(mjcf)
     job = replace(
-        read_job(fit), originals=originals, model=model, path=path, tip=tip,
+        read_job(fit, rung), originals=originals, model=model, path=path, tip=tip,
         experimental=experimental,
     )  # fmt: skip
     return table.export(job, to)

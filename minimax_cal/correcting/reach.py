@@ -48,8 +48,8 @@ ADVICE = {
     Outcome.CLOSEST: "the arm has fewer than six joints: what remains no joint can correct",
     Outcome.LIMIT: "a joint limit is in the way: move the target inwards, or check lower and upper "
     "in the robot file",
-    Outcome.CHANGE: "a joint would have to change by more than allowed: raise --max-change, or "
-    "move the target away from a singular pose",
+    Outcome.CHANGE: "a joint would have to change by more than allowed: raise the largest change, "
+    "or move the target away from a singular pose",
     Outcome.SINGULAR: "a singular pose or the edge of the workspace: move the target a little",
     Outcome.STALLED: "no joints were found that hold for this path: play in the gears may pull "
     "both ways (go there by a point before it, or give columns approach1 ...)",

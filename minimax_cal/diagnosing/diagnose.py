@@ -185,6 +185,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),
         cells=tuple(fit.cell for fit in ladder.fits),
+        nominal=study.nominal,
     )
 
 

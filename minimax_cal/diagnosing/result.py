@@ -186,7 +186,7 @@ class Diagnosis:
     noise: of a coordinate [m].  jitter: of a joint [rad].
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
-    held out.  cells: geometric, then with each effect.
+    held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -214,6 +214,7 @@ class Diagnosis:
     cells: tuple[Cell, ...]
     stated_errors: tuple[Array, Array] | None = None
     stated_curves: Mapping[str, Curve] | None = None
+    nominal: Cell | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -289,6 +290,7 @@ class Diagnosis:
             "not_testable": [{"effect": name, "needs": needs} for name, needs in self.not_testable],
             "curves": {name: curve.to_dict() for name, curve in self.curves.items()},
             "cells": [cell.whole() for cell in (self.cells[0], self.cells[-1])],
+            "rungs": [{"name": name, **cell.whole()} for name, cell in self.rungs()],
             "poses": pose_rows(
                 self.data, self.held, dict(zip(("geometric", "final"), self.errors, strict=True))
             ),
@@ -297,12 +299,18 @@ class Diagnosis:
             "provenance": vars(self.provenance),
         }
 
+    def rungs(self) -> tuple[tuple[str, Cell], ...]:
+        """Every arm with its name: nominal, geometric, then with each effect."""
+        if self.nominal is None:
+            return ()
+        added = [f"+ {cell.effects.terms[-1].effect} {cell.effects.terms[-1].place}"
+                 for cell in self.cells[1:]]  # fmt: skip
+        names = ("nominal", "geometric", *added)
+        return tuple(zip(names, (self.nominal, *self.cells), strict=True))
+
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "diagnosis") -> Diagnosis:
-        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError.
-
-        Of the cells between geometry and the last effect nothing is kept.
-        """
+        """From `to_dict`, or from the JSON of an earlier version.  Raises CalibrationError."""
         from minimax_cal.diagnosing.result_file import read
         from minimax_cal.ground.records import reading
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -174,13 +175,15 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
     if content.get("kind") != "diagnosis":
         raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose -o")
     part = checked(DiagnosisPart, content, source)
+    key = "rungs" if content.get("rungs") else "cells"  # an earlier version kept two of them
     cells = tuple(
-        cell_from_dict(cell, f"{source}: cells[{i}]")
-        for i, cell in enumerate(content.get("cells", ()))
+        cell_from_dict(cell, f"{source}: {key}[{i}]") for i, cell in enumerate(content.get(key, ()))
     )
     if len({(cell.robot.joints, cell.target_names) for cell in cells}) > 1:
         raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose -o")
-    return assembled(content, source, part, cells)
+    if key == "cells":
+        return assembled(content, source, part, cells)
+    return replace(assembled(content, source, part, cells[1:]), nominal=cells[0])
 
 
 def assembled(

@@ -198,7 +198,8 @@ class Bench:
         both = self.fixed.gram(np.concatenate(fields), at)
         size = float(one.value @ both[:d, :d] @ one.value)
         across = one.value @ both[:d, d:]
-        scale = np.sqrt(np.maximum(np.diag(both)[d:], 1e-300))
+        own = np.diag(both)[d:]  # zero where geometry imitates a column
+        scale = np.sqrt(np.maximum(own, 1e-12 * own.max(initial=0.0) + 1e-300))
         inverse = np.linalg.pinv(both[d:, d:] / np.outer(scale, scale), 1e-9, hermitian=True)
         shared = float((across / scale) @ inverse @ (across / scale))
         return size / one.variance, min(shared / max(size, 1e-300), 1.0)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.intervals import max_interval, rms_interval
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite
@@ -45,13 +46,16 @@ class Beyond:
     """The claim for poses where none was measured.
 
     typical: RMS over all parts together.  worst: of the worst part.  Both [mm], NaN with a
-    `reason` where nothing can be left out.  geometric: the same for geometry alone.
+    `reason` where nothing can be left out.  geometric: the same for geometry alone.  rms_high,
+    max_high: upper 95 % limits, of the worst part and of the part with the largest distance [mm].
     """
 
     folds: tuple[Fold, ...] = ()
     typical_mm: float = math.nan
     geometric_typical_mm: float = math.nan
     reason: str = ""
+    rms_high_mm: float = math.nan
+    max_high_mm: float = math.nan
 
     @property
     def worst(self) -> Fold | None:
@@ -97,6 +101,8 @@ class Beyond:
             "typical_mm": finite(self.typical_mm),
             "worst_mm": finite(self.worst_mm),
             "worst_where": self.worst.where if self.worst else None,
+            "worst_high95_mm": finite(self.rms_high_mm),
+            "max_high95_mm": finite(self.max_high_mm),
             "folds": [vars(fold) for fold in self.folds],
             "geometric": {
                 "typical_mm": finite(self.geometric_typical_mm),
@@ -130,7 +136,20 @@ class Errors:
             Fold(name, one.poses, one.rms_mm, one.max_mm, other.rms_mm)
             for name, one, other in zip(self.names, every, plain, strict=True)
         )
-        return Beyond(folds, pooled(every), pooled(plain))
+        return Beyond(folds, pooled(every), pooled(plain), "", *self.limits(folds))
+
+    def limits(self, folds: Sequence[Fold]) -> tuple[float, float]:
+        """Upper 95 % limits of the largest RMS and of the largest distance [mm]."""
+        rng = np.random.default_rng(0)
+        worst, far = (
+            max(range(len(folds)), key=lambda i: getattr(folds[i], kind))
+            for kind in ("rms_mm", "max_mm")
+        )
+        rms, largest = (
+            rms_interval(self.final[worst], rng=rng),
+            max_interval(self.final[far], rng=rng),
+        )
+        return 1e3 * rms.high, 1e3 * largest.high
 
 
 def pooled(every: Sequence[Accuracy]) -> float:

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
-from minimax_cal.fitting.claims import bad_rows, beyond_of, contradiction, unseen_suspects
+from minimax_cal.fitting.claims import (
+    bad_rows,
+    beyond_of,
+    contradiction,
+    crossed_of,
+    is_crossed,
+    unseen_suspects,
+)
+from minimax_cal.fitting.crossed import few_poses
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
+from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
+    Solver,
     check_options,
     listed,
     objective_of,
+    qp_name,
+    sigmas_of,
     silent,
     usable,
 )
@@ -27,12 +41,13 @@ from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.stations import jumps, pose_of, stationed, unplaced
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
-from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
@@ -59,43 +74,47 @@ class Parts:
 
 def calibrate(
     robot: Robot | str | Path,
-    data: Measurements | str | Path,
+    data: Measurements | str | Path | tuple[ArrayLike, ArrayLike],
     objective: str = "minimax",
-    qp: str = "daqp",
+    qp: str | Solver = "daqp",
     *,
     holdout: float = 0.2,
     seed: int = 0,
     holdout_by: str | None = None,
+    cv: bool = False,
     instrument: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
-    priors: Mapping[str, float] | None = None,
+    priors: Mapping[str, float | str] | None = None,
     method: str = "snllm",
     lever: float | None = None,
     hessian: str = "gauss-newton",
     distance: str = "two-sided",
     distance_tolerance: float | None = None,
     resolution: float = identify.RESOLUTION,
-    effects: str | Sequence[str | Term] = (),
+    effects: str | Path | Writes | Sequence[str | Path | Term] = (),
     loss: str = SQUARE,
     trim: float = 0.0,
     progress: Progress = silent,
 ) -> Fit:
     """Calibrate a robot from measurements.
 
-    robot, data: loaded, or a name or path.  objective: sum, minimax (the worst target), point (the
-    worst point), pose, or smr:K.  qp: backend of the minimax QPs.  holdout: share of the poses kept
-    out of the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together.  instrument: u95 of a coordinate, as 10um+2.5um/m, where the data
-    do not say.  fix, free: parameters as ``beta*``, a list or a text with
-    commas.  priors: sigma of a parameter's deviation from nominal, by name [m, rad].  method: of
-    the least squares.  lever: what a radian counts as in the pose objective [m], the targets' own
-    unless given.  hessian: gauss-newton or bfgs.  distance: form of the distance constraints,
-    two-sided, squared or off; distance_tolerance: theirs [m], as measured unless given.
-    resolution: relative singular value that counts as not measured.  effects: beyond geometry, as
-    joint_compliance:J2.  loss: square, huber, cauchy or tukey.  trim: share of the points that may
-    be set aside.  progress: called with a word on each stage.
-    Raises CalibrationError for wrong input; how the numbers ended is in the result's `status`.
+    robot, data: loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
+    3).  objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.  qp:
+    backend of the minimax QPs, or a function from Problem to a verified Solution.  holdout: share
+    of the poses kept out of the fit; seed: of that choice; holdout_by: a column (session, group
+    ...) or region, whose poses are held out together.  instrument: u95 of a coordinate, as
+    10um+2.5um/m, where the data do not say.  cv: judge every pose by a fit without it, which is
+    done anyway where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list
+    or a text with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad],
+    or a text as 0.5mm.  method: of the least squares.  lever: what a radian counts as in the pose
+    objective [m], the targets' own unless given.  hessian: gauss-newton or bfgs.  distance: form of
+    the distance constraints, two-sided, squared or off; distance_tolerance: theirs [m], as measured
+    unless given. resolution: relative singular value that counts as not measured.  effects: beyond
+    geometry, as joint_compliance:J2, or a diagnosis (or its file), whose established effects are
+    taken.  loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
+    progress: called with a word on each stage. Raises CalibrationError for wrong input; how the
+    numbers ended is in the result's `status`.
 
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
@@ -106,28 +125,44 @@ def calibrate(
         holdout=holdout,
         seed=seed,
         holdout_by=holdout_by,
+        cv=cv,
         instrument=instrument,
         fix=listed(fix),
         free=listed(free),
-        priors=priors or {},
+        priors=sigmas_of(priors or {}),
         method=method,
         lever=lever,
         hessian=hessian,
         distance=distance,
         distance_tolerance=distance_tolerance,
         resolution=resolution,
-        effects=listed(effects),
+        effects=listed_effects(effects),
         loss=loss,
         trim=trim,
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    data = data if isinstance(data, Measurements) else read_measurements(data)
+    data = measured(data)
     check(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
     options = with_jump(robot, poses, options, progress)
     solved = fit_cell(robot, poses.train, options, progress)
-    return judged(robot, options, poses, solved, began)
+    fit = judged(robot, options, poses, solved, began)
+    for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
+        warnings.warn(doubt, CalibrationWarning, stacklevel=2)
+    return fit
+
+
+def measured(data: Measurements | str | Path | tuple[ArrayLike, ArrayLike]) -> Measurements:
+    """Measurements as they are, of a file, or of joints (m, n) and points.  Raises DataError."""
+    if isinstance(data, tuple):
+        return measurements(*(np.asarray(part, dtype=float) for part in data))
+    return data if isinstance(data, Measurements) else read_measurements(data)
+
+
+def ran(qp: str | Solver) -> str:
+    """Name of the QP solver that ran."""
+    return usable(qp)[0] if isinstance(qp, str) else qp_name(qp)
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -147,7 +182,8 @@ def check(robot: Robot, data: Measurements, options: Options) -> None:
     """Raise an error, before any work, for what cannot be done."""
     objective_of(options.objective, data)
     check_options(options)
-    usable(options.qp)
+    if isinstance(options.qp, str):
+        usable(options.qp)
     checks.check_joints(robot, data)
     checks.check_spread(data)
 
@@ -206,7 +242,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *(fault.text for fault in faults.session_jumps(data, after)),
-        *doubts(robot, solved, before[:, ~held]),
+        *alarms(robot, poses, solved, before[:, ~held]),
         *bad_rows(suspects, data.source),
         *([wrong] if wrong else []),
     )
@@ -214,7 +250,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         cell=cell,
         nominal=nominal,
         objective=options.objective,
-        qp=usable(options.qp)[0],  # the one that ran
+        qp=ran(options.qp),
         status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
@@ -243,13 +279,31 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
         beyond=beyond_of(robot, options, data, held, solved, suspects),
+        error_crossed=crossed_of(robot, options, data, held, solved),
     )
+
+
+def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:
+    """Why the result should not be used as it is.  nominal_error: (k, training poses, 3) [m]."""
+    free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
+    if few := few_poses(poses.train, int(free.sum())):
+        yield few
+    yield from doubts(robot, solved, nominal_error)
 
 
 def remarks(options: Options, poses: Parts) -> Iterator[str]:
     """What the reader should know about the data behind a result."""
+    if is_crossed(options, poses.held) and not options.cv:
+        yield (
+            f"only {poses.held.poses} poses are held out: the result is cross-validated, every "
+            "pose judged by a fit without it"
+        )
     if not poses.held.poses:
         yield "no pose is held out: nothing here says how the fit does on new poses"
+    if options.objective.startswith("smr:") and len(poses.data.target_names) > 1:
+        name = options.objective.replace(":", "")
+        others = ", ".join(other for other in poses.data.target_names if other != name)
+        yield f"objective {options.objective}: {name} alone is fitted; {others} took no part"
     if options.objective == "minimax" and len(poses.data.target_names) == 1:
         yield "there is one target: minimax and sum are the same"
     if checks.collinear(poses.train):

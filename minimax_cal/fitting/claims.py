@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond, left_out
+from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
@@ -16,7 +17,7 @@ from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.floor import floor_of
-from minimax_cal.measuring.grouping import parts
+from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
@@ -84,6 +85,36 @@ def contradiction(
     return ""
 
 
+def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
+    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
+    every, free = solved.effects.terms, of_sessions(data.frames)
+    names, sessions = data.target_names, Sessions.of(data)
+    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
+
+    def error_of(state: State, rows: Array) -> Array:
+        terms = free if len(state.effects) == steps_of(data.frames) else every
+        effects = fitted(terms, scene, state.effects)
+        return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
+
+    return error_of
+
+
+def is_crossed(options: Options, held: Measurements) -> bool:
+    """Whether to cross-validate: asked for, or few poses are held out."""
+    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < FEW)
+
+
+def crossed_of(
+    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
+) -> Array:
+    """Errors (k, m, 3) of every pose by a fit without it [m]; empty unless cross-validated."""
+    if not is_crossed(options, data.take(held)):
+        return NOT_CROSSED
+    group = grouped(data, options.holdout_by)
+    return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
+                   options.seed)  # fmt: skip
+
+
 def beyond_of(
     robot: Robot,
     options: Options,
@@ -99,19 +130,11 @@ def beyond_of(
     wrong = [one for one in suspects if one.held]
     data = data.with_y(np.moveaxis(aside(np.moveaxis(data.y, 1, 0), data, wrong), 0, 1))
     every, free = solved.effects.terms, of_sessions(data.frames)
-    names, sessions = data.target_names, Sessions.of(data)
-    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
-
-    def error_of(state: State, rows: Array) -> Array:
-        terms = free if len(state.effects) == steps_of(data.frames) else every
-        effects = fitted(terms, scene, state.effects)
-        return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))
-
     geometric = None
     if len(every) > len(free):
-        train = data.take(~held)
+        train, names = data.take(~held), data.target_names
         active = solved.identification.active[: 5 * robot.joints + 6 + 3 * len(names)]
         model, state = refitted(robot, train, solved.state, active)
         geometric = Estimator(model, np.ones(len(names))), state
-    found = parts(data, options.holdout_by)
+    found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
     return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)

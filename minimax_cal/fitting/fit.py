@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, overload
@@ -16,6 +17,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
@@ -31,7 +33,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
+from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
 from minimax_cal.robots.robot import Robot
@@ -181,7 +183,7 @@ def parameter_table(parameters: Iterable[Parameter]) -> Table:
         for p in parameters
     )  # fmt: skip
     header = ("name", "unit", "nominal", "calibrated", "change", "sigma", NOT_IDENTIFIED)
-    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".4f", ""))
+    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".2g", ""))
 
 
 @dataclass(frozen=True)
@@ -258,6 +260,7 @@ class Fit:
     weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
+    error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated.
     """
 
     cell: Cell
@@ -288,9 +291,14 @@ class Fit:
     provenance: Provenance
     beyond: Beyond
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
+    error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
 
     def __repr__(self) -> str:
-        return f"<Fit of {self.robot.name}: {self.objective}. {self.headline()}>"
+        after, known = self.within.after, sum(p.identifiable for p in self.parameters)
+        return (
+            f"<Fit of {self.robot.name}: {self.objective}, RMS {after.rms_mm:.3f} mm, largest "
+            f"{after.max_mm:.3f} mm, {known} of {len(self.parameters)} parameters, {self.status}>"
+        )
 
     def _repr_html_(self) -> str:
         """For a notebook."""
@@ -392,12 +400,35 @@ class Fit:
             for key in ("nominal", "holdout")
         }
 
+    @cached_property
+    def within(self) -> Within:
+        """Before and after on poses that the fit had not seen: cross-validated, or held out."""
+        group = grouped(self.data, self.options.holdout_by) if self.data.poses else np.zeros(0)
+        if self.error_crossed.size:
+            judged = np.isfinite(self.error_crossed).any(axis=(0, 2))
+            before, after = accuracy(self.error_nominal[:, judged]), accuracy(self.error_crossed)
+            where = f"{after.poses} poses, each judged by a fit without it"
+            ends = intervals_of(self.error_crossed, group, self.options.seed)
+            return Within(before, after, where, len(np.unique(group[judged])), *ends)
+        before, after, where = before_and_after(self.accuracy)
+        if not self.accuracy["holdout"].poses:
+            return Within(before, after, where)
+        poses = len(np.unique(group[self.held])) or after.poses
+        return Within(before, after, where, poses, *self.intervals["holdout"])
+
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def plot(self) -> Any:
+        """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""
+        # reporting stands below; what it needs is imported when a picture is asked for
+        return import_module("minimax_cal.reporting.plots.figures").errors_figure(self)
+
     def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
         """What the table of accuracy tells, with titles."""
+        if self.error_crossed.size:
+            yield "cross-validated", self.within.after
         for title, key in ACCURACIES:
             yield title, self.accuracy[key]
             if key == "holdout" and any(one.held for one in self.suspects):
@@ -450,7 +481,7 @@ class Fit:
 
     def headline(self) -> str:
         """The result in a sentence or two."""
-        before, after, where = before_and_after(self.accuracy)
+        before, after, where = self.within.before, self.within.after, self.within.where
         identified = sum(p.identifiable for p in self.parameters)
         beyond = f"{self.beyond.sentence()} " if self.beyond.worst else ""
         text = (
@@ -474,7 +505,7 @@ class Fit:
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
-        return "\n\n".join([*(table.text(width) for table in self.tables()), self.headline()])
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back to the last digit."""
@@ -508,15 +539,3 @@ def load_fit(path: Path | str) -> Fit:
     >>> print(mc.load_fit("fit.json").summary())
     """
     return Fit.from_dict(saved_content(path), str(path))
-
-
-def opened(source: Fit | Cell | Path | str) -> Fit | Cell:
-    """A fit, or the bare cell where a file tells no more (the truth of a simulation).
-
-    Raises CalibrationError.
-    """
-    if isinstance(source, Fit | Cell):
-        return source
-    content = saved_content(source)
-    whole = {"parameters", "accuracy", "provenance"} <= set(content)
-    return (Fit.from_dict if whole else cell_from_dict)(content, str(source))

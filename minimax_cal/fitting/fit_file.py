@@ -17,6 +17,7 @@ from pydantic import Field
 
 from minimax_cal.fitting.beyond import Beyond, Fold
 from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.crossed import NOT_CROSSED
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
@@ -87,11 +88,14 @@ class BeyondPart(Part):
     typical_mm: Number = math.nan
     geometric: dict[str, Number] = Field(default_factory=dict)
     reason: str = ""
+    worst_high95_mm: Number = math.nan
+    max_high95_mm: Number = math.nan
 
     def beyond(self) -> Beyond:
         """As the code has it."""
         plain = self.geometric.get("typical_mm", math.nan)
-        return Beyond(self.folds, self.typical_mm, plain, self.reason)
+        high = self.worst_high95_mm, self.max_high95_mm
+        return Beyond(self.folds, self.typical_mm, plain, self.reason, *high)
 
 
 class AccuraciesPart(Part):
@@ -210,6 +214,7 @@ def written(fit: Fit) -> dict[str, Any]:
             **{key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
             "holdout_trusted": fit.trusted.to_dict(),
             "beyond": fit.beyond.to_dict(),
+            **({"cv": crossed_to_dict(fit)} if fit.error_crossed.size else {}),
         },
         "condition": finite(fit.identification.condition),
         "trace_mm2": [value * 1e6 for value in fit.trace],
@@ -234,6 +239,15 @@ def ends(fit: Fit, key: str) -> dict[str, list[float | None]]:
     return {
         name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
         for name, interval in zip(names, fit.intervals.get(key, ()), strict=False)
+    }
+
+
+def crossed_to_dict(fit: Fit) -> dict[str, Any]:
+    """The cross-validated accuracy."""
+    names = ("rms_ci95_mm", "max_ci95_mm")
+    return fit.within.after.to_dict() | {
+        name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
+        for name, interval in zip(names, (fit.within.rms, fit.within.largest), strict=True)
     }
 
 
@@ -282,6 +296,8 @@ def arrays_of(fit: Fit) -> dict[str, Any]:
         out["noise"] = np.array([fit.uncertainty.noise.variance])
     if fit.data.poses:
         out["measured"] = fit.data.y
+    if fit.error_crossed.size:
+        out["crossed"] = fit.error_crossed
     return {name: packed(values) for name, values in out.items()}
 
 
@@ -375,6 +391,7 @@ def assembled(
         provenance=part.provenance,
         beyond=part.accuracy.beyond.beyond(),
         stated=intervals_of(part, arrays),
+        error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -19,21 +20,30 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import METHODS
-from qp_backends import BackendError, Problem
+from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 
 FALLBACK = "daqp"  # a required package
+FUNCTION = "function "  # before the name of a QP solver that is none of the backends
 TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
 UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
 LENGTHS = ("mm", "um", "m")
 
 
 Progress = Callable[[str], None]
+Solver = Callable[[Problem], Solution]
+QpSolver = str | Solver
 T = TypeVar("T")
 
 
 def silent(message: str) -> None:
     """Say nothing."""
+
+
+def sigmas_of(priors: Mapping[str, float | str]) -> dict[str, float]:
+    """Sigmas of priors in SI, from numbers or texts with a unit.  Raises OptionError."""
+    read = [prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in priors.items()]
+    return dict(read)
 
 
 def prior_of(text: str) -> tuple[str, float]:
@@ -43,15 +53,13 @@ def prior_of(text: str) -> tuple[str, float]:
     for unit in sorted(UNITS, key=len, reverse=True):
         if size.endswith(unit) and kind in MDH_NAMES and (kind in "ad") != (unit in LENGTHS):
             what = "a length: give mm" if kind in "ad" else "an angle: give mrad or deg"
-            raise OptionError(f"--prior {text!r}: {name} is {what}")
+            raise OptionError(f"prior {text!r}: {name} is {what}")
         if equals and name and size.endswith(unit):
             try:
                 return name, float(size.removesuffix(unit)) * UNITS[unit]
             except ValueError:
                 break
-    raise OptionError(
-        f"--prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad"
-    )
+    raise OptionError(f"prior {text!r}: write NAME=SIGMA with a unit, as a*=0.5mm or theta2=1mrad")
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,7 @@ class Options:
     qp: backend of the minimax QPs.  holdout: share of the poses kept out of the fit.
     seed: of that choice.  holdout_by: what is held out together, a column as session or group, or
     region; None for poses that repeat each other or stand in a cluster.
+    cv: judge every pose by a fit without it, however many are held out.
     instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
     fix, free: names or patterns as ``beta*``.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
@@ -75,18 +84,50 @@ class Options:
     """
 
     objective: str = option(
-        "minimax", "sum, minimax (worst target), point (worst point), pose, or one target: smr:K."
+        "minimax",
+        "What is made small: sum, minimax (the worst target), point (the worst point), pose, or "
+        "one target alone, as smr:2.",
+        group="What is fitted",
     )
-    qp: str = option("daqp", "QP backend of minimax.")
+    qp: QpSolver = option(  # noqa: RUF009
+        "daqp",
+        "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them.",
+        group="How it is solved",
+    )
     holdout: float = option(
-        0.2, "Share of the poses kept out of the fit; a split column overrides it."
+        0.2,
+        "The share of the poses that the fit does not see; a split column overrides it.",
+        group="What is held out",
     )
-    seed: int = option(0, "Seed of the choice of held-out poses.")
+    seed: int = option(
+        0,
+        "The seed of the choice of held-out poses.",
+        group="What is held out",
+    )
     holdout_by: str | None = option(
         None,
         "Hold out whole groups of poses: a column, as session or group, or region; those are also "
         "left out in turn.",
         metavar="COLUMN",
+        group="What is held out",
+    )
+    cv: bool = option(
+        False,
+        "Cross-validate: judge every pose by a fit without it [default: when fewer than 20 are "
+        "held out].",
+        group="What is held out",
+    )
+    fix: Sequence[str] = option(
+        (),
+        "Keep these parameters nominal, as d2,beta*.",
+        many=tuple,
+        group="What is fitted",
+    )
+    free: Sequence[str] = option(
+        (),
+        "Keep these ones where several cannot be told apart.",
+        many=tuple,
+        group="What is fitted",
     )
     instrument: str | None = option(
         None,
@@ -94,47 +135,66 @@ class Options:
         "the noise floor.",
         metavar="10um+2.5um/m",
     )
-    fix: Sequence[str] = option((), "Parameters to keep nominal, as d2,beta*.", many=tuple)
-    free: Sequence[str] = option((), "Parameters to prefer among redundant ones.", many=tuple)
     priors: Mapping[str, float] = option(
         dict,
-        "Known tolerance of a parameter about its nominal value, as a*=0.5mm.",
+        "What is known of a parameter: how far it may be from its nominal value, as a*=0.5mm.",
         flag="--prior",
         metavar="NAME=SIGMA",
         read=prior_of,
         many=dict,
+        group="What is fitted",
     )
     effects: Sequence[str | Term] = option(
         (),
         "Fit these too, as joint_compliance:all,backlash:J6; `minimax-cal effects` lists them.",
         metavar="NAME:PLACE",
         many=tuple,
+        group="What is fitted",
     )
-    method: str = option("snllm", f"Least squares: {', '.join(METHODS)}.")
+    method: str = option(
+        "snllm",
+        f"The method of least squares: {', '.join(METHODS)}.",
+        group="How it is solved",
+    )
     loss: str = option(
-        SQUARE, f"Of the distances, against outliers: {', '.join((SQUARE, *LOSSES))}."
+        SQUARE,
+        f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}.",
+        group="Points that stand out",
     )
     trim: float = option(
         0.0,
-        "Set at most this share of the points aside: those that stand out.",
+        "Set at most this share of the points aside, those that stand out.",
         metavar="SHARE",
+        group="Points that stand out",
     )
-    hessian: str = option("gauss-newton", "Of the minimax SQP: gauss-newton or bfgs.")
+    hessian: str = option(
+        "gauss-newton",
+        "The Hessian of the minimax: gauss-newton or bfgs.",
+        group="How it is solved",
+    )
     distance: str = option(
-        "two-sided", "Form of the distance constraints: two-sided, squared or off."
+        "two-sided",
+        "How distances between targets are kept: two-sided, squared or off.",
+        group="How it is solved",
     )
     lever: float | None = option(
-        None, "What a radian counts as in the pose objective [default: the targets' own].", "mm"
+        None,
+        "What a radian counts as in the pose objective [default: the targets' own].",
+        "mm",
+        group="What is fitted",
     )
     distance_tolerance: float | None = option(
-        None, "How far a distance between targets may be off [default: as measured].", "mm"
+        None,
+        "How far a distance between targets may be off [default: as measured].",
+        "mm",
+        group="How it is solved",
     )
     resolution: float = identify.RESOLUTION
 
     def settings(self) -> dict[str, object]:
         """For the record, effects in their written form."""
         effects = [e.text if isinstance(e, Term) else e for e in self.effects]
-        return {**vars(self), "effects": effects}
+        return {**vars(self), "effects": effects, "qp": qp_name(self.qp)}
 
 
 def listed(names: str | Sequence[T]) -> Sequence[T | str]:
@@ -184,12 +244,27 @@ def check_options(options: Options) -> None:
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
 
 
+def qp_name(qp: str | Solver) -> str:
+    """What a QP solver is called in results."""
+    return qp if isinstance(qp, str) else f"{FUNCTION}{getattr(qp, '__name__', 'unnamed')}"
+
+
+def solver_of(qp: str | Solver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
+    """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
+    if not isinstance(qp, str):
+        return qp, ()
+    name, notices = usable(qp)
+    return partial(solve_qp, name=name, tolerance=tolerance), notices
+
+
 def usable(qp: str) -> tuple[str, tuple[str, ...]]:
     """The QP backend to use, and a notice where it is not the one that was named.
 
     A backend that exists but is not installed is replaced; a name that does not exist is a
     mistake.  Raises OptionError.
     """
+    if qp.startswith(FUNCTION):
+        return FALLBACK, (f"QP: the solver was a {qp}; {FALLBACK} is used",)
     try:
         solve_qp(TRIVIAL, qp)
     except BackendError as error:

@@ -194,10 +194,10 @@ def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: floa
     if suspects:
         yield f"{len(suspects)} of {at.count} points stand out from the fit: {EXPLANATION}"
     if trim:
-        yield f"--trim {trim:g}: {away} of {at.count} points are set aside"
-    more = f"--trim {trim:g}: {len(suspects) - away} more points stand out"
+        yield f"trim {trim:g}: {away} of {at.count} points are set aside"
+    more = f"trim {trim:g}: {len(suspects) - away} more points stand out"
     if trim and len(suspects) > away and away == at.most(trim):
-        yield f"{more} and pull at the fit; give a larger share or another --loss"
+        yield f"{more} and pull at the fit; give a larger share or another loss"
     elif trim and len(suspects) > away:
         yield f"{more}, but not from a fit without them; they stay in it"
     names = at.plain.names.all

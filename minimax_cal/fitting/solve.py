@@ -14,7 +14,7 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
-from minimax_cal.fitting.options import Options, Progress, objective_of, silent, usable
+from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
@@ -44,7 +44,6 @@ from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
-from qp_backends import solve as solve_qp
 
 QP_TOLERANCE = 1e-9
 # With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
@@ -275,20 +274,18 @@ def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
 def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, Array]:
     """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
     names = model.names
-    allowed = ~names.match(options.fix, "--fix")
+    allowed = ~names.match(options.fix, "fix")
     order = identify.drop_order(robot, names)
-    kept = names.match(options.free, "--free")
+    kept = names.match(options.free, "free")
     if (kept & ~allowed).any():
         name = names.all[int(np.argmax(kept & ~allowed))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     order = np.concatenate([order[~kept[order]], order[kept[order]]])
     sigma = np.full(names.count, np.inf)
     for pattern, value in options.priors.items():
-        chosen = names.match([pattern], "--prior")
+        chosen = names.match([pattern], "prior")
         if (chosen & ~names.links).any():
-            raise OptionError(
-                f"--prior {pattern}: base and targets have no nominal value to keep to"
-            )
+            raise OptionError(f"prior {pattern}: base and targets have no nominal value to keep to")
         sigma[chosen] = value
     return allowed, order, sigma
 
@@ -398,8 +395,7 @@ def worst_case(
         return None, None, ()
     progress("minimax")
     problem = minimax_problem(model, state, distances, options.distance, per)
-    name, notices = usable(options.qp)
-    qp = partial(solve_qp, name=name, tolerance=QP_TOLERANCE)
+    qp, notices = solver_of(options.qp, QP_TOLERANCE)
     settings = Sqp(hessian=options.hessian)
     if problem.size > (HOPELESS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))

@@ -23,6 +23,10 @@ class OptionError(CalibrationError):
     """A choice that does not exist or does not fit the data."""
 
 
+class CalibrationWarning(UserWarning):
+    """A result that should not be used before its reason has been looked at."""
+
+
 def said(error: Exception) -> str:
     """What is wrong with the content of a file, without Python's and NumPy's words for it."""
     text = str(error).partition("\n")[0]

@@ -30,6 +30,7 @@ class Option:
     the value in the help.  flag: the option's name where it is not the field's.  read: the value
     from a text.  values: how many the option takes.  many: what gathers those of an option that
     may be given several times; without `read` they are names, also separated by commas.
+    group: under which heading the help lists it.
     """
 
     help: str = ""
@@ -39,6 +40,7 @@ class Option:
     read: Callable[[str], Any] | None = None
     values: int = 1
     many: Callable[[Iterable[Any]], Any] | None = None
+    group: str = ""
 
 
 def option(default: Any, help: str = "", unit: str = "", **more: Any) -> Any:

@@ -9,7 +9,6 @@ errors but that poses are independent.  The poses left out of a replicate judge 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
-from minimax_cal.fitting.options import Progress, silent, usable
+from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
@@ -30,7 +29,6 @@ from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.minimax import Sqp
 from minimax_cal.solvers.status import Status
-from qp_backends import solve as solve_qp
 
 BUNDLES = 2000  # more poses than these are drawn in bundles
 LEAST = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
@@ -229,7 +227,7 @@ def stepped(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Array]:
 def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Array]:
     """Replicates of a minimax, each solved from the fit.  Returns as `stepped`."""
     options, estimator, state, train = fit.options, fit.estimator, fit.cell.state, fit.train
-    qp = partial(solve_qp, name=usable(options.qp)[0], tolerance=QP_TOLERANCE)
+    qp, _ = solver_of(options.qp, QP_TOLERANCE)
     active = estimator.model.active
     part, _ = normal_parts(estimator.model, state, draws)
     good = determined(draws, part, estimator.model.prior.weight[active])

@@ -1,4 +1,4 @@
-"""A saved calibration and measurements to judge it by: who predicts, and what no fit has seen."""
+"""A saved result and measurements to judge it by: who predicts, and what no fit has seen."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -29,45 +31,67 @@ FAR = 5e-3  # errors above this share of the arm's reach are not what calibratio
 class Saved:
     """Cells before (nominal) and after (calibrated), and poses to judge them by.
 
-    held: (m,) True where the fit has not seen the pose.
+    held: (m,) True where the fit has not seen the pose.  uncertainty: of the fit, where it tells.
     """
 
     cells: Mapping[str, Cell]
     data: Measurements
     held: Array
-    fit: Fit
+    uncertainty: Uncertainty | None
     notices: tuple[str, ...]
 
 
-def open_fit(source: Fit | Path | str, data: Path | str = "", nominal: str = "") -> Saved:
-    """A fit, or its file, with the measurements in a file, or with its own.
+def evaluate(source: Result, data: Measurements | Path | str, rung: int | None = None) -> Accuracy:
+    """Accuracy of a calibrated arm on new measurements in the same measurement frame.
 
-    nominal: the robot before calibration, file or name; that of the fit unless given.
-    Raises CalibrationError.
+    source: a calibration, its cell, a diagnosis, a relative calibration, or the file of one.  data:
+    points, and the columns that effects look at; nothing is fitted to them, but for base and
+    targets of a relative calibration, which knows none.  rung: of a diagnosis (0 nominal, 1
+    geometric ...), the last unless given.  Errors of the result are in mm.  Raises
+    CalibrationError.
+
+    >>> print(mc.evaluate(fit, "new_poses.csv").rms_mm)
     """
-    fit = source if isinstance(source, Fit) else load_fit(source)
-    cell = fit.cell
-    notices: tuple[str, ...] = ()
+    data = data if isinstance(data, Measurements) else read_measurements(data)
+    cell, _, _ = open_result(source, rung).placed_by(data)
+    return accuracy(cell.error(data))
+
+
+def open_saved(
+    source: Result, data: Path | str = "", nominal: str = "", rung: int | None = None
+) -> Saved:
+    """A result, or its file, with the measurements in a file, or with its own.
+
+    nominal: the robot before calibration, file or name; that of the result unless given.
+    rung: see `open_result`.  Raises CalibrationError.
+    """
+    known = open_result(source, rung)
+    notices: list[str] = []
     if data:
-        measured, said = known_targets(read_measurements(data), cell)
-        said += strangers(cell, measured)
-        measured = cell.placed(measured)
-        held, more = unseen(measured, fit)
-        notices = (*measured.notices, *said, *more)
-    elif fit.data.poses:
-        measured, held = fit.data, fit.held
-        check_own(fit, str(source))
+        measured = read_measurements(data)
+        notices += measured.notices
+        if known.placed:
+            measured, said = known_targets(measured, known.cell)
+            notices += [*said, *strangers(known.cell, measured)]
+            measured = known.cell.placed(measured)
+        held, said = unseen(measured, known)
+        notices += said
+    elif known.data.poses:
+        measured, held = known.data, known.held
+        check_own(known)
     else:
-        raise CalibrationError(f"{source}: holds no poses; name the file of measurements too")
-    train = fit.train if fit.data.poses else measured.take(~held)
-    before, said = nominal_cell(fit, train, nominal, str(source))
+        raise CalibrationError(f"{known.source}: holds no poses; name the file of measurements too")
+    cell, drawn, said = known.placed_by(measured)
+    train = known.train if known.data.poses else measured.take(~held)
+    before, more = nominal_cell(cell, drawn, train, nominal, known.source)
+    notices += [*said, *more]
     miss = np.nanmedian(np.linalg.norm(cell.error(measured), axis=-1))
     if miss > FAR * cell.robot.reach():
-        said += (
+        notices.append(
             f"{measured.source}: the fit misses by {1e3 * miss:.3g} mm: check that data and fit "
-            "belong to the same robot, measurement frame, units and order of targets",
+            "belong to the same robot, measurement frame, units and order of targets"
         )
-    return Saved({BEFORE: before, AFTER: cell}, measured, held, fit, (*notices, *said))
+    return Saved({BEFORE: before, AFTER: cell}, measured, held, known.uncertainty, tuple(notices))
 
 
 def known_targets(data: Measurements, cell: Cell) -> tuple[Measurements, tuple[str, ...]]:
@@ -79,14 +103,14 @@ def known_targets(data: Measurements, cell: Cell) -> tuple[Measurements, tuple[s
     return data.keep(known), (f"{data.source}: {names} left out: the fit does not know them",)
 
 
-def unseen(data: Measurements, fit: Fit) -> tuple[Array, tuple[str, ...]]:
+def unseen(data: Measurements, known: Opened) -> tuple[Array, tuple[str, ...]]:
     """(m,) True where the fit has not seen the pose, by its own split or by the joints; notices."""
-    if not fit.data.poses:
+    if not known.data.poses:
         said = "the fit does not tell its training poses: all count as training poses"
         return np.zeros(data.poses, dtype=bool), (said,)
-    if data.digest and data.digest == fit.provenance.data_sha256:
-        return np.isin(data.line, fit.data.line[fit.held]), ()
-    held = np.asarray(KDTree(fit.train.q).query(data.q)[0]) > REPEAT
+    if data.digest and data.digest == known.digest:
+        return np.isin(data.line, known.data.line[known.held]), ()
+    held = np.asarray(KDTree(known.train.q).query(data.q)[0]) > REPEAT
     said = (
         f"{data.source}: is not the file of the fit; {int((~held).sum())} of its {data.poses} rows "
         "have the joints of a training pose, the others count as held out"
@@ -94,34 +118,37 @@ def unseen(data: Measurements, fit: Fit) -> tuple[Array, tuple[str, ...]]:
     return held, (said,)
 
 
-def check_own(fit: Fit, source: str) -> None:
+def check_own(known: Opened) -> None:
     """Raise DataError if the poses in a file do not give back the errors in it."""
-    if not np.nanmax(np.abs(fit.cell.error(fit.data) - fit.error), initial=0.0) <= SAME:
+    told = known.rungs[known.number].error
+    if told is None:
+        return
+    if not np.nanmax(np.abs(known.cell.error(known.data) - told), initial=0.0) <= SAME:
         raise DataError(
-            f"{source}: its effects need columns of the measurements that it does not hold; name "
-            "the file of measurements too"
+            f"{known.source}: its effects need columns of the measurements that it does not hold; "
+            "name the file of measurements too"
         )
 
 
 def nominal_cell(
-    fit: Fit, train: Measurements, nominal: str, source: str
+    cell: Cell, before: Cell | None, train: Measurements, nominal: str, source: str
 ) -> tuple[Cell, tuple[str, ...]]:
-    """The arm before calibration in its place: the fit's, else as it fits poses best; notices.
+    """The arm before calibration in its place: the result's, else as it fits poses best; notices.
 
-    train: the training poses.  nominal: its robot, "" for the fit's own.  Raises CalibrationError.
+    before: that of the result.  train: the training poses.  nominal: its robot, "" for the
+    result's own.  Raises CalibrationError.
     """
     if not nominal:
-        if fit.nominal is None:
+        if before is None:
             raise CalibrationError(
-                f"{source}: does not tell its nominal robot; give it (--nominal)"
+                f"{source}: does not tell its nominal robot; name it (`nominal`)"
             )
-        return fit.nominal, ()
+        return before, ()
     robot = load_robot(nominal)
-    missing = [name for name in fit.cell.target_names if name not in train.target_names]
+    missing = [name for name in cell.target_names if name not in train.target_names]
     if missing:
         raise DataError(f"{train.source}: {missing[0]} was not measured")
     check_joints(robot, train)
-    state = fit_base(model_of(robot, fit.cell.placed(train)), robot.mdh).state
+    state = fit_base(model_of(robot, cell.placed(train)), robot.mdh).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
-    sessions = fit.cell.sessions
-    return Cell.of(robot, state, train.target_names, sessions=sessions), (said,)
+    return Cell.of(robot, state, train.target_names, sessions=cell.sessions), (said,)

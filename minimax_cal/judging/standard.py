@@ -6,28 +6,30 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.opened import Result
 from minimax_cal.judging.iso9283 import Iso9283
 from minimax_cal.judging.iso9283.result import iso9283 as characteristics
-from minimax_cal.judging.saved import open_fit
+from minimax_cal.judging.saved import open_saved
 
 
 def iso9283(
-    fit: Fit | Path | str,
+    fit: Result,
     data: Path | str | None = None,
     *,
     nominal: str = "",
+    rung: int | None = None,
     tcp: str | Sequence[float] = "centroid",
 ) -> Iso9283:
     """Pose and distance accuracy of a calibration by the formulas of ISO 9283, before and after.
 
-    fit: a calibration, or its file.  data: file of the measurements; the fit's own unless
-    given.  nominal: robot before the calibration, file
-    or name; that of the fit unless given.  tcp: centroid of the targets, one target (smr1), or a
-    point (3,) in the last frame [m].  Raises CalibrationError for wrong input.
+    fit: a calibration, a diagnosis, a relative calibration, or the file of one.  data: file of the
+    measurements; the fit's own unless given.  nominal: robot before the calibration, file or name;
+    that of the fit unless given.  rung: of a diagnosis, the last unless given.  tcp: centroid of
+    the targets, one target (smr1), or a point (3,) in the last frame [m].  Raises CalibrationError
+    for wrong input.
 
     >>> print(mc.iso9283("fit.json").summary())
     """
-    saved = open_fit(fit, data or "", nominal)
+    saved = open_saved(fit, data or "", nominal, rung)
     found = characteristics(saved.cells, saved.data, saved.held, tcp)
     return replace(found, notices=(*saved.notices, *found.notices))

@@ -60,7 +60,7 @@ def check_count(data: Measurements, poses: int, unknowns: int, known: int) -> No
         raise DataError(
             f"{data.source}: {poses} different poses for the fit, but {unknowns} unknown "
             f"parameters need at least {needed}; measure more poses, hold out fewer, fix "
-            "parameters (--fix) or give priors (--prior)"
+            "parameters (fix) or give priors"
         )
 
 

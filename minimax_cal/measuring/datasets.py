@@ -97,7 +97,7 @@ def downloaded(source: Source) -> Path:
         import pooch
     except ModuleNotFoundError as error:
         raise CalibrationError(
-            "downloading needs 'pooch': pip install minimax-cal[datasets]"
+            "downloading needs 'pooch': pip install '.[datasets]' in a clone"
         ) from error
     name = Path(source.name)
     try:

@@ -18,8 +18,14 @@ def with_history(data: Measurements) -> Measurements:
 
     approach1..n: (m,) sign of the joint's last move, 0 unknown.  move1..n: (m,) the move from the
     pose before [rad, m], 0 unknown.  followed: (m,) 1 where the pose before is known, else 0.
-    clock: (m,) place in the session, 0 first to 1 last.
+    clock: (m,) place in the session, 0 first to 1 last.  Without an order or times nothing of this
+    is known: all are 0.
     """
+    if not ordered(data):
+        joints = range(data.q.shape[1])
+        names = [f"{stem}{j + 1}" for stem in ("approach", "move") for j in joints]
+        zero = dict.fromkeys((*names, "followed", "clock"), np.zeros(data.poses))
+        return replace(data, columns={**zero, **data.columns})
     order = visits(data)
     linked = followed(data)
     move = moves(data)
@@ -38,6 +44,20 @@ def sessions(data: Measurements) -> Array:
         return np.zeros(data.poses, dtype=int)
     _, first, label = np.unique(data.columns["session"], return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[label.reshape(-1)])
+
+
+def ordered(data: Measurements) -> bool:
+    """Whether anything tells in which order the poses were visited."""
+    if "followed" in data.columns:
+        return True  # part of data whose history is known, or is known to be unknown
+    time = data.columns.get("time", np.zeros(0)).astype(float)
+    return numbered(data) or int(np.isfinite(time).sum()) > 1
+
+
+def is_timed(data: Measurements) -> bool:
+    """Whether a change during the session can be told: an order, times, or a clock that goes."""
+    clocked = data.columns.get("clock")
+    return bool(np.ptp(clocked) > 0.0) if clocked is not None else ordered(data)
 
 
 def numbered(data: Measurements) -> bool:

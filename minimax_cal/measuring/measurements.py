@@ -72,6 +72,10 @@ class Measurements:
         """(m, k) True where a target was measured."""
         return np.isfinite(self.y[:, :, 0])
 
+    def in_visit_order(self) -> Measurements:
+        """The same, its rows taken as visited one after the other."""
+        return replace(self, columns={**self.columns, "order": np.arange(self.poses, dtype=float)})
+
     def take(self, rows: Array) -> Measurements:
         """The measurements at some rows only.  rows: indices or a mask."""
         return replace(

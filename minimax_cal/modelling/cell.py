@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, said
 from minimax_cal.ground.files import json_of, read_text
-from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import Clock
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
@@ -252,17 +251,6 @@ def saved_content(path: Path | str) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise NotSaved(f"{path}: is not a saved calibration")
     return content
-
-
-def evaluate(cell: Cell, data: Measurements) -> Accuracy:
-    """Accuracy of a calibrated cell on new measurements in the same measurement frame.
-
-    cell: of a fit, or of its file.  data: points, and the columns that effects look at; nothing is
-    fitted to them.  Errors of the result are in mm.  Raises DataError.
-
-    >>> print(mc.evaluate(fit.cell, mc.read_measurements("new_poses.csv")).rms_mm)
-    """
-    return accuracy(cell.error(data))
 
 
 def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:

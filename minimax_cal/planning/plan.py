@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.opened import Result
 from minimax_cal.fitting.options import silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
 from minimax_cal.planning.candidates import Poses, candidates, near, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse
 from minimax_cal.planning.designs.exchange import Menu, exchange, polar
@@ -36,7 +35,7 @@ def plan(
     robot: Robot | str | Path,
     poses: int,
     *,
-    fit: Fit | Cell | str | Path | None = None,
+    fit: Result | None = None,
     data: Measurements | str | Path | None = None,
     criterion: str = "I",
     effects: Sequence[str] = (),
@@ -115,7 +114,7 @@ def planned(
     robot: Robot,
     poses: int,
     options: PlanOptions,
-    fit: Fit | Cell | str | Path,
+    fit: Result,
     data: Measurements | str | Path,
     progress: Progress,
 ) -> Plan:

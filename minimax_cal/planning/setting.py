@@ -10,7 +10,7 @@ import numpy as np
 
 from minimax_cal.evidence.noise import Noise, linearised, restricted
 from minimax_cal.fitting.calibrate import calibrate
-from minimax_cal.fitting.fit import Fit, opened
+from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -41,7 +41,7 @@ class Ground:
 
 def ground_of(
     robot: Robot,
-    fit: Fit | Cell | str | Path,
+    fit: Result,
     data: Measurements | str | Path,
     options: PlanOptions,
 ) -> Ground:
@@ -50,9 +50,9 @@ def ground_of(
     own: tuple[Measurements, ...] = ()
     cells: list[Cell] = []
     if fit:
-        known = opened(fit)
-        cells = [known if isinstance(known, Cell) else known.cell]
-        own = (known.data,) if isinstance(known, Fit) and known.data.poses else ()
+        known = open_result(fit)
+        cells = [known.cell] if known.placed else []
+        own = (known.data,) if known.data.poses else ()
     if isinstance(data, Measurements):
         own = (data,)
     elif data:

@@ -5,27 +5,30 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from datetime import date as Date
 from pathlib import Path
 
-from minimax_cal.diagnosing.result import Diagnosis
-from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.judging.tolerance import CLAIMS, limits_of
 from minimax_cal.reporting.html import (
     Wording,
     compose,
     find_browser,
+    picture,
     print_pdf,
     read_sources,
     render,
 )
+from minimax_cal.reporting.html.facts import WORDS, read_facts
+from minimax_cal.reporting.html.first_page import Signed
+from minimax_cal.reporting.html.first_page import signed as judgement
 from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
-from minimax_cal.simulators.result import SimulatorGap
 
-PAGES, PAPERS = (".html", ".htm"), (".pdf",)
+PAGES, PAPERS, PICTURES = (".html", ".htm"), (".pdf",), (".png",)
 
 
 def report(
@@ -36,35 +39,88 @@ def report(
     customer: str = "",
     author: str = "",
     date: str = "",
+    tolerance: str = "",
+    tolerance_for: str = "within",
+    facts: Path | str | None = None,
+    rung: int | None = None,
     pdf: Path | str | None = None,
     notify: Callable[[str], object] = warnings.warn,
 ) -> Path:
-    """One HTML page of a calibration, a diagnosis, or both of the same measurements.
+    """A page to sign of a calibration, a diagnosis, or both of the same measurements.
 
-    results: each itself or the file that it was saved to; a gap in a simulator may come with them.
-    path: of the page, which needs no network.  title: that of the robot unless given.  customer,
-    author: who accepts, who measured.  date: YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
-    pdf: printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called
-    with what the reader should know of both together, which the page says too.  Lengths on the page
-    are in mm, angles in mrad.  Returns its path.  Raises CalibrationError for wrong input.
+    results: each itself or the file that it was saved to; a gap in a simulator may come with them,
+    a relative calibration stands
+    alone.  path: of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
+    title: that of the robot unless given.  customer, author: who accepts, who measured.  date:
+    YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  tolerance: what is required in mm, as
+    ``rms 0.2, max 0.5``; tolerance_for: within or beyond the measured poses. facts: a TOML file
+    with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.  pdf:
+    printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called with
+    what the reader should know of both together, which the page says too.  Lengths on the page are
+    in mm, angles in mrad. Returns the path of the page.  Raises CalibrationError for wrong input.
 
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """
-    check_writable(path, PAGES)
+    chosen = Chosen(title, customer, author, date, tolerance, tolerance_for, facts, rung)
+    signed(results, path, chosen, pdf, notify)
+    return Path(path)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What people say of a report: see `report`."""
+
+    title: str = ""
+    customer: str = ""
+    author: str = ""
+    date: str = ""
+    tolerance: str = ""
+    tolerance_for: str = "within"
+    facts: Path | str | None = None
+    rung: int | None = None
+
+    def wording(self) -> Wording:
+        """As the page needs it.  Raises OptionError."""
+        if self.tolerance_for not in CLAIMS:
+            raise OptionError(f"tolerance for {self.tolerance_for!r}: choose {' or '.join(CLAIMS)}")
+        told = read_facts(self.facts) if self.facts else {}
+        title, customer, author, date = (
+            getattr(self, name) or told.get(name, "") for name in WORDS
+        )
+        return Wording(date_of(date), title, customer, author, told, limits_of(self.tolerance),
+                       self.tolerance_for, self.rung)  # fmt: skip
+
+
+def signed(
+    results: Result | Sequence[Result],
+    path: Path | str,
+    chosen: Chosen,
+    pdf: Path | str | None,
+    notify: Callable[[str], object],
+) -> Signed:
+    """Write the report; what it judges."""
+    check_writable(path, (*PAGES, *PAPERS, *PICTURES))
     needed()
+    wording = chosen.wording()
     if pdf is not None:
         check_writable(pdf, PAPERS)
-    browser = find_browser() if pdf is not None else ""
-    if isinstance(results, Fit | Diagnosis | SimulatorGap | Path | str):
+    suffix = Path(path).suffix.lower()
+    browser = find_browser() if pdf is not None or suffix not in PAGES else ""
+    if not isinstance(results, Sequence) or isinstance(results, str):
         results = [results]
     sources = read_sources(results)
-    content = compose(sources, Wording(date_of(date), title, customer, author))
-    write_whole(path, render(content))
+    content = compose(sources, wording)
+    if suffix in PAGES:
+        write_whole(path, render(content))
+    elif suffix in PAPERS:
+        print_pdf(render(content, paper=True), Path(path), browser)
+    else:
+        picture(render(content, paper=True), Path(path), browser)
     if pdf is not None:
         print_pdf(render(content, paper=True), Path(pdf), browser)
     for notice in sources.notices:
         notify(notice)
-    return Path(path)
+    return judgement(sources, wording.limits, wording.which, wording.rung)
 
 
 def date_of(given: str) -> str:
@@ -73,7 +129,7 @@ def date_of(given: str) -> str:
         if given:
             return Date.fromisoformat(given).isoformat()
     except ValueError:
-        raise OptionError(f"--date {given!r}: write it as 2026-01-31") from None
+        raise OptionError(f"date {given!r}: write it as 2026-01-31") from None
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
         now = datetime.fromtimestamp(int(epoch), UTC) if epoch else datetime.now(UTC)

@@ -47,7 +47,7 @@ def minimize_max(
     fun: Callable[..., Any],
     x0: Any,
     jac: Callable[..., Any] | str = "2-point",
-    bounds: Bounds | None = None,
+    bounds: Bounds | Sequence[tuple[float | None, float | None]] | None = None,
     constraints: Constraint | Sequence[Constraint] = (),
     qp: str | Callable[[Problem], Solution] = "daqp",
     *,
@@ -59,8 +59,9 @@ def minimize_max(
     """Minimise over x the largest of several smooth functions.
 
     fun: (n,) -> (m,).  x0: (n,).  jac: (n,) -> (m, n), or "cs" for the complex step (exact; fun
-    must take complex numbers) or "2-point" for finite differences (least accurate).
-    bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint.
+    must take complex numbers), or "3-point" or "2-point" for finite differences (least accurate).
+    bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint; bounds also
+    as n pairs, None where open.
     qp: name of a QP backend, or a function from Problem to a verified Solution.
     args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
     the largest at x0.  maxiter: QPs at most.  callback: called with fun, nit, kkt after each QP.
@@ -79,9 +80,10 @@ def minimize_max(
     if not np.all(np.isfinite(x)):
         raise OptionError("minimize_max: x0 holds NaN or infinite entries")
     listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
-    rows = Rows.of(len(x), bounds, listed)
-    if bounds is not None:
-        x = np.clip(x, bounds.lb, bounds.ub)
+    box = bounds if bounds is None or isinstance(bounds, Bounds) else box_of(bounds, len(x))
+    rows = Rows.of(len(x), box, listed)
+    if box is not None:
+        x = np.clip(x, box.lb, box.ub)
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
     problem = MaxOfFunctions.at(x, function, derivative(function, jac, args, count), rows)
@@ -101,6 +103,17 @@ def minimize_max(
         best = minimax.solve(problem, lower, solver, settings, tell)
     far = best.status is not Status.CONVERGED and falls_on(problem, x, best.x)
     return answer(best, function(best.x), problem.size, count, endless=far)
+
+
+def box_of(pairs: Sequence[tuple[float | None, float | None]], n: int) -> Bounds:
+    """Bounds from pairs, None where open.  Raises OptionError."""
+    try:
+        ends = [(-np.inf if low is None else low, np.inf if high is None else high)
+                for low, high in pairs]  # fmt: skip
+        low, high = np.array(ends, dtype=float).reshape(n, 2).T
+    except (TypeError, ValueError):
+        raise OptionError(f"minimize_max: bounds: give {n} pairs (low, high), or Bounds") from None
+    return Bounds(low, high)
 
 
 def falls_on(problem: MaxOfFunctions, start: Array, end: Array) -> bool:
@@ -197,10 +210,14 @@ def derivative(
             return dense(matrix)
         if jac == "cs":
             return complex_step(function, x)
+        if jac == "3-point":
+            return central(function, x)
         return np.atleast_2d(approx_fprime(x, function))
 
-    if not callable(jac) and jac not in ("cs", "2-point"):
-        raise OptionError(f"minimize_max: jac {jac!r}: give a function, 'cs' or '2-point'")
+    if not callable(jac) and jac not in ("cs", "3-point", "2-point"):
+        raise OptionError(
+            f"minimize_max: jac {jac!r}: give a function, 'cs', '3-point' or '2-point'"
+        )
     return run
 
 
@@ -208,6 +225,16 @@ def dense(matrix: Any) -> Array:
     """A matrix, sparse or not, as a two-dimensional array of floats."""
     whole: Any = matrix.toarray() if hasattr(matrix, "toarray") else matrix
     return np.atleast_2d(np.array(whole, dtype=float))
+
+
+def central(function: Function, x: Array) -> Array:
+    """Derivative (m, n) by central differences; the error of the formula is of second order."""
+    size = np.finfo(float).eps ** (1.0 / 3.0) * np.maximum(np.abs(x), 1.0)
+    slopes = [
+        (function(x + step) - function(x - step)) / (2.0 * length)
+        for step, length in zip(np.diag(size), size, strict=True)
+    ]
+    return np.stack(slopes, axis=-1)
 
 
 def complex_step(function: Function, x: Array) -> Array:
@@ -290,7 +317,7 @@ def with_derivative(constraint: NonlinearConstraint) -> tuple[Function, Function
     """The function of a constraint and its derivative."""
     function = counted(lambda x: one_row(constraint.fun(x)), Count())
     kind = constraint.jac
-    kind = kind if callable(kind) or kind == "cs" else "2-point"
+    kind = kind if callable(kind) or kind in ("cs", "3-point") else "2-point"
     return function, derivative(function, kind, (), Count())
 
 

@@ -167,7 +167,7 @@ def test_a_figure_needs_matplotlib_and_says_so(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert run("diagnose", "ur10", "gap.csv", "--figure", "gap.png") == 2
-    assert "pip install minimax-cal[plot]" in capsys.readouterr().err
+    assert "pip install '.[plot]' in a clone" in capsys.readouterr().err
     assert not (here / "gap.png").exists()
 
 

@@ -17,7 +17,7 @@ from minimax_cal.cli.map import map_command
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.judging.saved import open_fit
+from minimax_cal.judging.saved import open_saved
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.modelling.simulate import Simulation
 
@@ -208,7 +208,7 @@ def test_effects_are_part_of_what_is_commanded(folder: Path, poses: Path, robot:
     fitted = mc.calibrate(robot, poses, "sum", effects=["joint_compliance:all"])
     path = folder / "effects.json"
     fitted.save(path)
-    saved = open_fit(path)
+    saved = open_saved(path)
     assert_allclose(
         saved.cells["after"].error(saved.data), fitted.cell.error(fitted.data), rtol=0, atol=1e-9
     )

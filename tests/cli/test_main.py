@@ -210,7 +210,7 @@ def test_evaluate_doubts_data_that_do_not_belong(
     assert "the same robot, measurement frame, units" in capsys.readouterr().err
     (tmp_path / "other.json").write_text('{"schema": 1, "kind": "diagnosis"}')
     assert run("evaluate", tmp_path / "other.json", csv) == 2
-    assert "is a diagnosis" in capsys.readouterr().err
+    assert "holds no arm" in capsys.readouterr().err
 
 
 def test_a_bootstrap_is_shown_and_saved(

@@ -227,7 +227,7 @@ def test_another_robot_is_refused(original: Path) -> None:
         export(replace(job_of(flipped), originals=(urdf,)), "urdf")
     with pytest.raises(OptionError, match="6 moving joints, the robot 4; name another last link"):
         export(replace(job_of(mc.load_robot("scara_600")), originals=(urdf,)), "urdf")
-    with pytest.raises(OptionError, match="--urdf goes with --to urdf"):
+    with pytest.raises(OptionError, match="urdf goes with the format urdf"):
         export(replace(job_of(ur10), originals=(urdf,)), "json")
 
 
@@ -384,7 +384,7 @@ def test_moc_holds_the_corrections_of_a_fit() -> None:
         rpy = [row.get(f"error_{name}", 0.0) for name in ("roll", "pitch", "jaw")]
         pose = link(nominal.mdh[i]) @ from_rpy(np.array(xyz), np.array(rpy))
         assert_allclose(pose, link(robot.mdh[i]), **EXACT)
-    with pytest.raises(OptionError, match="add --experimental"):
+    with pytest.raises(OptionError, match="agree \\(experimental\\)"):
         export(replace(job, experimental=False), "moc")
     with pytest.raises(OptionError, match="holds no nominal robot"):
         export(replace(job, fitted=False), "moc")
@@ -434,10 +434,10 @@ def test_command_on_a_robot_and_its_errors(original: Path, tmp_path: Path) -> No
     assert run(f"{original}#wrist_1_link", "--to", "dh-csv").stdout.count("revolute") == 4
     for arguments, words in (
         (("irb120", "--to", "step"), "no such format; choose one of urdf, ur-yaml"),
-        (("irb120", "--to", "moc"), "add --experimental"),
+        (("irb120", "--to", "moc"), "agree (experimental)"),
         (("irb120", "--to", "moc", "--experimental"), "holds no nominal robot"),
-        (("irb120", "--to", "json", "--urdf", original), "--urdf goes with --to urdf"),
-        (("irb120", "--to", "urdf", "--tip", "x"), "--tip names a link of the file"),
+        (("irb120", "--to", "json", "--urdf", original), "urdf goes with the format urdf"),
+        (("irb120", "--to", "urdf", "--tip", "x"), "tip names a link of the file"),
         (("irb120", "--to", "urdf", "-o", tmp_path / "no" / "x"), "no such folder"),
         (("irb12", "--to", "urdf"), "did you mean 'irb120'"),
         (("irb120", "--to", "urdf", "--urdf", tmp_path / "x"), "cannot be read"),

@@ -226,13 +226,15 @@ def test_qkm_gravity_is_named() -> None:
 
 
 def test_fanuc_gravity_is_named() -> None:
-    found = mc.diagnose(*shared("fanuc_r2000"), quick=True)
+    robot, file = shared("fanuc_r2000")
+    found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
     assert found.findings[0].term.effect in ("joint_compliance", "link_bending")
     assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
 
 
 def test_meca_has_no_gravity() -> None:
-    found = mc.diagnose(*shared("meca500_r"), quick=True)
+    robot, file = shared("meca500_r")
+    found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
     gravity = {"joint_compliance", "link_bending", "base_flex", "gravity_compensator", "tool_flex"}
     assert not gravity & {f.term.effect for f in found.findings}
     assert ("backlash", "J6") in {(f.term.effect, f.term.place) for f in found.findings}

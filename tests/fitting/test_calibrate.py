@@ -230,6 +230,7 @@ def test_saved_fit_comes_back(robot: mc.Robot, noisy: Simulation, tmp_path: Path
         "nominal_train",
         "holdout_trusted",
         "beyond",
+        "cv",
     }
 
 

@@ -346,7 +346,8 @@ def test_what_was_not_moved_is_one_stop(cell: mc.Cell) -> None:
     q = level_poses(cell.robot, 3)[[0, 0, 0, 1, 2, 0]]
     data = seen_at(cell, q)
     data = data.with_y(data.y + np.arange(6)[:, None, None] * 1e-5)
-    stops = stops_of(with_history(data), {"after": data.y}, np.zeros(6, dtype=bool))
+    told = with_history(data.in_visit_order())
+    stops = stops_of(told, {"after": data.y}, np.zeros(6, dtype=bool))
     assert_array_equal(stops.pose, ["line 1", "line 4", "line 5", "line 1"])
     assert_allclose(stops.attained[0], data.y[:3].mean(axis=0), **EXACT)
     found = of(cell, data)

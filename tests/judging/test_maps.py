@@ -28,7 +28,7 @@ from minimax_cal.judging.maps import (
 from minimax_cal.judging.saved import Saved
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.modelling.simulate import Simulation, random_poses
-from minimax_cal.reporting.plots.map import hatch, save_map
+from minimax_cal.reporting.plots.map import REACHED, outline, save_map
 from minimax_cal.robots.kinematics import forward
 
 SMALL = Grid(samples=3000, bins=16)
@@ -246,12 +246,24 @@ def test_without_a_covariance_only_what_was_observed_is_drawn(saved: Saved, tmp_
     assert found.to_dict()["sections"][0]["radius95_median_mm"][0][0] is None
 
 
-def test_hatching_covers_what_is_not_reached(saved: Saved) -> None:
+def test_the_line_parts_what_is_reached_from_what_is_not(saved: Saved) -> None:
+    """Each edge of the line has a bin that the training poses reach on one side alone."""
     from matplotlib.figure import Figure
 
     part = workspace_map(saved, unknown, SMALL).sections[0]
     axes = Figure().subplots()
-    hatch(axes, part)
-    drawn = {patch.get_hatch(): len(patch.get_path().vertices) // 5 for patch in axes.patches}
-    none, few = part.reached == 0.0, (part.reached > 0.0) & (part.reached < 0.5)
-    assert drawn == {"xxx": none.sum(), "///": few.sum()}
+    outline(axes, part)
+    (line,) = axes.collections
+    reached = {
+        ((part.x[i] + part.x[i + 1]) / 2, (part.y[j] + part.y[j + 1]) / 2)
+        for i, j in np.argwhere(part.reached >= REACHED)
+    }
+    inner = np.array(sorted(reached))
+    step = np.diff(part.x).mean(), np.diff(part.y).mean()
+    edges = np.array(line.get_segments())
+    assert len(edges)
+    for one, other in edges:
+        middle = (one + other) / 2
+        aside = np.array([step[0], 0.0] if one[0] == other[0] else [0.0, step[1]]) / 2
+        sides = [np.abs(inner - (middle + way * aside)).max(axis=1).min() < 1e-9 for way in (1, -1)]
+        assert sum(sides) == 1

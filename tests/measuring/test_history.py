@@ -15,7 +15,7 @@ def walk(q: list[float], **columns: object) -> Measurements:
 
 
 def test_a_joint_that_stands_still_keeps_its_approach() -> None:
-    columns = with_history(walk([0.0, 1.0, 1.0, 1.0 + 5e-8, 0.5, 0.5])).columns
+    columns = with_history(walk([0.0, 1.0, 1.0, 1.0 + 5e-8, 0.5, 0.5]).in_visit_order()).columns
     assert_array_equal(columns["approach1"], [0, 1, 1, 1, -1, -1])
     assert_allclose(columns["move1"], [0, 1, 0, 5e-8, -0.5, 0], atol=1e-15)
     assert_array_equal(columns["followed"], [0, 1, 1, 1, 1, 1])
@@ -82,7 +82,7 @@ def test_time_sets_the_clock() -> None:
 
 
 def test_columns_of_the_file_are_kept() -> None:
-    data = walk([0.0, 1.0, 2.0], approach1=[-1.0, -1.0, -1.0])
+    data = walk([0.0, 1.0, 2.0], approach1=[-1.0, -1.0, -1.0]).in_visit_order()
     columns = with_history(data).columns
     assert_array_equal(columns["approach1"], [-1, -1, -1])
     assert_array_equal(columns["move1"], [0, 1, 1])

@@ -54,8 +54,8 @@ from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
 SECTIONS = [
-    "verdict", "accuracy", "workspace", "joints", "gap", "causes", "where", "untestable",
-    "suspects", "parameters", "correlations", "iso9283", "solution", "provenance",
+    "verdict", "accuracy", "workspace", "joints", "suspects", "parameters", "correlations",
+    "iso9283", "solution", "diagnosis", "gap", "causes", "where", "untestable", "provenance",
 ]  # fmt: skip
 NASTY = '<script>alert(1)</script>&amp;"\u2028</script><img src=x onerror=alert(2)>'
 WORDING = Wording("2026-11-21", author="A. Smith", customer="Example Ltd")
@@ -183,7 +183,8 @@ def test_accuracy_is_that_of_the_calibration(results: Path, seen: Seen) -> None:
     found = table_of(seen, "position accuracy")
     assert found == [list(own.header), *own.cells()]
     assert {"count", "RMS mm", "mean mm", "max mm", "smr1 RMS mm", "smr3 RMS mm"} <= set(found[0])
-    assert [row[0] for row in found[1:3]] == ["held out, nominal", "held out, calibrated"]
+    first = ["cross-validated", "held out, nominal", "held out, calibrated"]
+    assert [row[0] for row in found[1:4]] == first
 
 
 def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> None:
@@ -195,13 +196,13 @@ def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> No
         assert unit == {"rad": "mrad", "mm": "mm"}[p["unit"]]
         assert (nominal, value) == (f"{scale * p['nominal']:.4f}", f"{scale * p['value']:.4f}")
         assert change == f"{scale * (p['value'] - p['nominal']):+.4f}"
-        assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.4f}")
+        assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.2g}")
         assert reason == ("" if p["identifiable"] else p["reason"])
 
 
 def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
     for reason in gap["reasons"]:
-        assert reason in seen.text["verdict"]
+        assert reason in seen.text["diagnosis"]
     ladder = table_of(seen, "the gap, step by step")[1:]
     assert [row[0] for row in ladder[:-1]] == [r["step"] for r in gap["gap"]["ladder"]]
     for row, rung in zip(ladder, gap["gap"]["ladder"], strict=False):
@@ -229,8 +230,8 @@ def test_solution_names_the_backend_of_every_step(fit: dict[str, Any], seen: See
     assert [row[0] for row in multipliers] == fit["minimax"]["functions"]
 
 
-def test_verdict_states_the_held_out_numbers(fit: dict[str, Any], seen: Seen) -> None:
-    text = seen.text["verdict"].replace("\N{NO-BREAK SPACE}", " ")
+def test_accuracy_states_the_held_out_numbers(fit: dict[str, Any], seen: Seen) -> None:
+    text = seen.text["accuracy"].replace("\N{NO-BREAK SPACE}", " ")
     for key in ("nominal", "holdout"):
         for kind in ("rms_mm", "max_mm"):
             assert f"{fit['accuracy'][key][kind]:.3f} mm" in text
@@ -270,7 +271,7 @@ def test_what_later_files_tell_is_shown(
     seen = rendered(tmp_path, fit, gap)
     (row,) = table_of(seen, "95 % intervals")[1:]  # the file does not tell the nominal robot's
     assert [row[0], *row[2:4], *row[5:]] == ["calibrated", "0.1110", "0.2220", "0.2220", "-"]
-    assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["verdict"]
+    assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["accuracy"]
     assert seen.tables["Strongest correlations"][1] == ["a1", "theta2", "+0.500"]
     assert seen.tables["points that stand out (may be real effects: run minimax-cal diagnose)"][1][
         :4
@@ -516,7 +517,7 @@ def test_hostile_names_are_text(tmp_path: Path, fit: dict[str, Any], gap: dict[s
     assert kinds.count("application/json") == len(kinds) - 2  # figures, plotly, the page's own
     assert kinds.count(None) == plain.tags.count("body") == 1
     text = visible(NASTY)
-    for name in ("verdict", "provenance", "untestable", "solution", "parameters"):
+    for name in ("diagnosis", "provenance", "untestable", "solution", "parameters"):
         assert text in seen.text[name]
     assert seen.tables["Files"][2][1] == text
 
@@ -633,7 +634,7 @@ def test_the_same_files_give_the_same_page(
     text = (tmp_path / "a.html").read_text()
     assert "2026-01-31" in text
     assert "<h1>For &lt;Bob&gt;</h1>" in text
-    for day, word in (("yesterday", "--date"), ("", "SOURCE_DATE_EPOCH")):
+    for day, word in (("yesterday", "2026-01-31"), ("", "SOURCE_DATE_EPOCH")):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "soon")
         with pytest.raises(OptionError, match=word):
             command(*files, "-o", tmp_path / "c.html", "--date", day)
@@ -742,7 +743,7 @@ def test_what_is_not_installed_is_said(
         command(results / "fit.json", "-o", tmp_path / "a.html", "--pdf", tmp_path / "a.pdf")
     assert list(tmp_path.iterdir()) == []  # before any work
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(OptionError, match=r"pip install minimax-cal\[report\]"):
+    with pytest.raises(OptionError, match=r"in a clone of the repository"):
         page.render(compose(sources, WORDING))
 
 
@@ -772,6 +773,7 @@ def test_real_arm_in_three_commands(tmp_path: Path, capsys: pytest.CaptureFixtur
     seen = Seen(out.read_text())
     told = json.loads(fit.read_text())["accuracy"]["holdout"]
     assert math.isfinite(told["rms_mm"])
-    assert f"{told['rms_mm']:.3f}" in seen.text["verdict"]
+    shown = json.loads(fit.read_text())["accuracy"].get("cv", told)  # few poses are held out
+    assert f"{shown['rms_mm']:.3f}" in seen.text["verdict"]
     assert hashlib.sha256(data.read_bytes()).hexdigest() in seen.text["provenance"]
     assert list(seen.text) == [SECTIONS[0], "signatures", *SECTIONS[1:]]

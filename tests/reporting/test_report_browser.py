@@ -6,6 +6,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from test_report import NASTY, WORDING, hostile, results, write
 
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
+from minimax_cal.judging.tolerance import limits_of
 from minimax_cal.reporting.html import compose, read_sources, render
 from minimax_cal.reporting.html.content import Figure
 
@@ -31,6 +33,7 @@ FLAGS = (
     "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-gpu",
     "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--window-size=1100,1400",
 )  # fmt: skip
+A4 = (680, 993)  # pixels between the margins
 PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
 
 __all__ = ["results"]  # the fixture
@@ -210,6 +213,50 @@ def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
     opened.execute_script("window.dispatchEvent(new Event('afterprint'))")
     scheme(opened, "light")
     assert opened.execute_script(shown, ".view .flat") == "none"
+
+
+def test_the_first_page_is_one_sheet_with_all_that_is_signed(
+    driver: Any, results: Path, tmp_path: Path
+) -> None:
+    """On A4: robot, requirement, result, verdict and signatures, and nothing else."""
+    limits = limits_of("rms 0.2, max 0.5")
+    facts = {"serial_number": "26-104711", "tool": "three-ball nest, " * 4}
+    wording = replace(WORDING, limits=limits, facts=facts)
+    sources = read_sources([results / "fit.json", results / "gap.json"])
+    path = tmp_path / "page.html"
+    path.write_text(render(compose(sources, wording)))
+    open_page(driver, path)
+    size = {"width": A4[0], "height": A4[1], "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    scheme(driver, "light", "print")
+    box = driver.execute_script(
+        "const b = document.getElementById('first').getBoundingClientRect();"
+        "return [b.width, b.height, getComputedStyle(document.getElementById('first')).breakAfter]"
+    )
+    text = driver.execute_script("return document.getElementById('first').innerText")
+    scheme(driver, "light")
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert box[1] < A4[1]
+    assert box[2] == "page"
+    for word in (sources.robot, "26-104711", "required mm", "0.2", "Not passed",
+                 "What limits it now", "Signatures", "Checked", "A. Smith"):  # fmt: skip
+        assert word in text, word
+    assert "Contents" not in text
+
+
+def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
+    """As wide as a phone, light and dark: nothing stands out of the page."""
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    time.sleep(0.5)
+    wide = "return [document.documentElement.scrollWidth, innerWidth]"
+    width, room = opened.execute_script(wide)
+    button = "const b = document.getElementById('theme').getBoundingClientRect(),"
+    button += " h = document.querySelector('h1').getBoundingClientRect();"
+    clear = opened.execute_script(button + "return b.bottom <= h.top || b.left >= h.right")
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert width <= room
+    assert clear
 
 
 def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:

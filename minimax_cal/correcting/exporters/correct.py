@@ -90,7 +90,7 @@ def match(nominal: Robot, model: UrdfRobot) -> tuple[Array, float]:
     if n != nominal.joints:
         raise OptionError(
             f"{source}: its chain to {chain[-1].child!r} has {n} moving joints, "
-            f"the robot {nominal.joints}; name another last link with --tip"
+            f"the robot {nominal.joints}; name another last link with tip"
         )
     slides = np.array([joint.kind == "prismatic" for joint in moving])
     if (slides != nominal.prismatic).any():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Fit, opened
+from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
@@ -67,37 +67,35 @@ class Export:
         return Export(text.encode("utf-8"), notices)
 
 
-def read_job(source: Fit | Cell | Robot | Path | str) -> Job:
-    """A calibration, its file, or any robot that `load_robot` takes.  Raises CalibrationError."""
-    if isinstance(source, Fit | Cell):
-        cell = source if isinstance(source, Cell) else source.cell
-        return job_of(source, cell.robot.name)
+def read_job(source: Result | Robot, rung: int | None = None) -> Job:
+    """A result, its file, or any robot that `load_robot` takes.  Raises CalibrationError."""
     if isinstance(source, Robot):
         return Job(source, source, source.name, (), np.full(source.joints, np.nan))
+    if not isinstance(source, Path | str):
+        return job_of(open_result(source, rung))
     path = Path(source)
     if path.suffix.lower() == ".json" and path.is_file():
         with suppress(NotSaved):  # load_robot says what is wrong with it
-            if "targets_mm" in saved_content(path):
-                return job_of(opened(path), str(path))
+            if {"targets_mm", "kind"} & set(saved_content(path)):
+                return job_of(open_result(path, rung))
     robot = load_robot(source)
     notices = load_urdf(source).notices if is_urdf(source) else ()
     nothing = np.full(robot.joints, np.nan)
     return Job(robot, robot, str(source), (), nothing, notices=notices)
 
 
-def job_of(fit: Fit | Cell, source: str) -> Job:
-    """Of a saved calibration, or of a cell of unknown nominal robot.  Raises OptionError."""
-    if isinstance(fit, Fit) and fit.status is Status.FAILED:
-        raise OptionError(f"{source}: {Status.FAILED}: {Status.FAILED.advice}")
-    cell = fit if isinstance(fit, Cell) else fit.cell
-    nominal = fit.nominal if isinstance(fit, Fit) else None
+def job_of(known: Opened) -> Job:
+    """Of a rung of a result; its nominal robot may be unknown.  Raises OptionError."""
+    if known.status is Status.FAILED:
+        raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
+    cell, nominal = known.cell, known.nominal
     labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
     before = nominal.robot if nominal else cell.robot
-    known = nominal is not None
-    q = fit.train.q if isinstance(fit, Fit) and fit.data.poses else None
+    q = known.train.q if known.data.poses else None
     return Job(
-        cell.robot, before, source, labels, compliance_of(cell), fitted=known, cell=cell, q=q
-    )
+        cell.robot, before, known.source, labels, compliance_of(cell),
+        fitted=nominal is not None, cell=cell, q=q,
+    )  # fmt: skip
 
 
 def compliance_of(cell: Cell) -> Array:

@@ -167,16 +167,16 @@ def write(job: Job) -> Export:
     """ARM_CALIB and JOINT_CALIB of a fit, corrections only.  Raises OptionError."""
     if not job.experimental:
         raise OptionError(
-            "--to moc: the writer is experimental: ABB documents neither frames nor signs of these "
-            "numbers; add --experimental to write the corrections all the same"
+            "moc: the writer is experimental: ABB documents neither frames nor signs of these "
+            "numbers; agree (experimental) to write the corrections all the same"
         )
     if not job.fitted:
         raise OptionError(
-            f"--to moc: {job.source} holds no nominal robot, and the format holds corrections "
+            f"moc: {job.source} holds no nominal robot, and the format holds corrections "
             "only; export a fit written by minimax-cal calibrate -o"
         )
     if job.robot.prismatic.any():
-        raise OptionError("--to moc: the format is for turning joints")
+        raise OptionError("moc: the format is for turning joints")
     arms = tuple(
         arm(i, before, after)
         for i, (before, after) in enumerate(zip(job.nominal.mdh, job.robot.mdh, strict=True))

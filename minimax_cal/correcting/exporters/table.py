@@ -31,13 +31,13 @@ EXPORTERS: dict[str, Callable[[Job], Export]] = {
 def export(job: Job, to: str) -> Export:
     """The file in a format, with notices.  Raises OptionError."""
     if to not in EXPORTERS:
-        raise OptionError(f"--to {to}: no such format; choose one of {', '.join(EXPORTERS)}")
+        raise OptionError(f"{to}: no such format; choose one of {', '.join(EXPORTERS)}")
     if job.originals and to != "urdf":
-        raise OptionError(f"--urdf goes with --to urdf, not with --to {to}")
+        raise OptionError(f"urdf goes with the format urdf, not with {to}")
     if job.model and to != "mjcf":
-        raise OptionError(f"--mjcf goes with --to mjcf, not with --to {to}")
+        raise OptionError(f"mjcf goes with the format mjcf, not with {to}")
     if job.tip and not (job.originals or job.model):
-        raise OptionError("--tip names a link of the file given with --urdf or --mjcf")
+        raise OptionError("tip names a link of the file given as urdf or mjcf")
     found = EXPORTERS[to](job)
     if not job.originals:  # a given URDF keeps its own constants
         found = replace(found, notices=(*job.notices, *found.notices))

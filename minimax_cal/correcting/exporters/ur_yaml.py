@@ -23,15 +23,15 @@ def write(job: Job) -> Export:
     """Six turning joints; a joint of sign -1 is turned over exactly.  Raises OptionError."""
     robot = job.robot
     if robot.joints != len(LINKS) or robot.prismatic.any():
-        raise OptionError("--to ur-yaml: the format is for arms with six turning joints")
+        raise OptionError("ur-yaml: the format is for arms with six turning joints")
     over = [turn(0, 0.0 if sign > 0 else np.pi) for sign in robot.sign]
     poses = origins(robot)
     for i, flip in enumerate(over):  # Rz(-q) = Rx(pi) Rz(q) Rx(pi)
         poses[i], poses[i + 1] = poses[i] @ flip, flip.T @ poses[i + 1]
     if not is_identity(poses[-1]):
         raise OptionError(
-            "--to ur-yaml: the format ends at the last joint's own frame and has no place for a, "
-            "alpha, beta (or a sign of -1) of the last link; use --to urdf or ros-yaml"
+            "ur-yaml: the format ends at the last joint's own frame and has no place for a, "
+            "alpha, beta (or a sign of -1) of the last link; use urdf or ros-yaml"
         )
     table = {
         name: dict(zip(KEYS, (float(v) + 0.0 for v in (*pose[:3, 3], *to_rpy(pose))), strict=True))

@@ -150,7 +150,7 @@ def check_count(train: RelativeData, unknowns: int, known: int) -> int:
         what = "lengths" if train.kind == "distances" else "coordinates of visits"
         raise DataError(
             f"{where}: {different + known} independent {what} in training, but {unknowns} unknown "
-            "parameters need more; measure at more poses, hold out fewer or fix parameters (--fix)"
+            "parameters need more; measure at more poses, hold out fewer or fix parameters (fix)"
         )
     return numbers + known
 

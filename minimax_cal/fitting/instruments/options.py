@@ -101,8 +101,8 @@ def check_options(data: RelativeData, options: RelativeOptions) -> None:
 
 def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:
     """(p,) False for what the user fixed, and (p,) True for what is to be given up last."""
-    fixed, wanted = names.match(options.fix, "--fix"), names.match(options.free, "--free")
+    fixed, wanted = names.match(options.fix, "fix"), names.match(options.free, "free")
     if (fixed & wanted).any():
         name = names.all[int(np.argmax(fixed & wanted))]
-        raise OptionError(f"{name} is both fixed and freed; take it out of --fix or --free")
+        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     return ~fixed, wanted

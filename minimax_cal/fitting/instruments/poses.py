@@ -69,7 +69,7 @@ def lever_of(data: RelativeData, lever: float | None) -> tuple[float, str]:
         ratio = np.nanmedian(columns["u95"] / columns["rotation_u95"])
         if np.isfinite(ratio) and ratio > 0.0:
             return float(ratio), "typical u95_mm over rotation_u95_rad"
-    return LEVER, "by default; give --lever MM, the ratio of linear and angular noise"
+    return LEVER, "by default; give the lever, the ratio of linear and angular noise"
 
 
 def tool_of(cell: Cell, spots: Array) -> Array:

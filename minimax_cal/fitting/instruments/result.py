@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from minimax_cal.fitting.fit import ACCURACIES, Parameter, Provenance, parameter_table
-from minimax_cal.fitting.fit_file import SCHEMA
+from minimax_cal.fitting.fit_file import SCHEMA, ScoresPart, TableParameter, in_si
 from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.records import Number, Part, checked
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
-KIND = "relative calibration"
 QUANTITY = {
     "distances": "length of a wire",
     "closures": "ball about its socket",
@@ -33,6 +36,46 @@ CAUTION = {
     "does not show in it. ",
     "poses": "",
 }
+
+
+class ErrorsPart(ScoresPart):
+    """Accuracy of lengths, closures or poses, in a file."""
+
+    numbers: int = 0
+    rms_mrad: Number = math.nan
+    max_mrad: Number = math.nan
+
+
+class RelativePart(Part):
+    """The file of `minimax-cal relative -o`."""
+
+    measured: Literal["distances", "closures", "poses"]
+    robot: dict[str, Any]
+    nominal_robot: dict[str, Any]
+    parts: tuple[str, ...]
+    instrument: dict[str, Any] = Field(default_factory=dict)
+    status: Status
+    iterations: int = 0
+    seconds: Number = math.nan
+    parameters: tuple[TableParameter, ...]
+    accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
+    beyond_one_reflector: tuple[str, ...] = ()
+    condition: Number = math.nan
+    position_sigma_mm: Number = math.nan
+    notices: tuple[str, ...] = ()
+    provenance: Provenance
+
+
+@dataclass(frozen=True)
+class Stated(Identification):
+    """As a file tells it, without the singular values."""
+
+    told: float
+
+    @property
+    def condition(self) -> float:
+        """As the file says."""
+        return self.told
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +109,18 @@ class RelativeCalibration:
     beyond: tuple[str, ...]
     notices: tuple[str, ...]
     provenance: Provenance
+    stated: Mapping[str, Accuracy] | None = None
 
     @cached_property
-    def accuracy(self) -> dict[str, Accuracy]:
-        """Of the errors, by their keys."""
+    def accuracy(self) -> Mapping[str, Accuracy]:
+        """Of the errors, by their keys; as a file states it where it keeps no errors."""
+        if self.stated is not None:
+            return self.stated
         return {key: accuracy(error) for key, error in self.errors.items()}
+
+    def before_and_after(self) -> tuple[Accuracy, Accuracy, str]:
+        """On held-out poses where there are any, and which poses those are."""
+        return before_and_after(self.accuracy)
 
     @property
     def identified(self) -> int:
@@ -105,12 +155,12 @@ class RelativeCalibration:
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        parts = (self.parts_table(),) if len(self.parts) > 1 else ()
+        parts = (self.parts_table(),) if len(self.parts) > 1 and self.errors else ()
         return (self.accuracy_table(), *parts, parameter_table(self.parameters))
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
-        before, after, where = before_and_after(self.accuracy)
+        before, after, where = self.before_and_after()
         text = (
             f"{QUANTITY[self.kind].capitalize()}: RMS error {before.rms_mm:.3f} mm -> "
             f"{after.rms_mm:.3f} mm, largest {before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, "
@@ -135,7 +185,7 @@ class RelativeCalibration:
             accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
         content = {
             "schema": SCHEMA,
-            "kind": KIND,
+            "kind": RELATIVE,
             "measured": self.kind,
             "robot": self.robot.to_dict(),
             "nominal_robot": self.nominal.to_dict(),
@@ -155,6 +205,36 @@ class RelativeCalibration:
             "provenance": vars(self.provenance),
         }
         return dict(plain(content))
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "result") -> RelativeCalibration:
+        """From `to_dict`, without the errors of single rows.  Raises CalibrationError."""
+        part = checked(RelativePart, content, source)
+        known = np.array([p.identifiable for p in part.parameters])
+        return RelativeCalibration(
+            kind=part.measured,
+            robot=robot_from_dict(content["robot"], f"{source}: robot"),
+            nominal=robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot"),
+            parts=part.parts,
+            status=part.status,
+            iterations=part.iterations,
+            seconds=part.seconds,
+            parameters=tuple(in_si(p) for p in part.parameters),
+            errors={},
+            numbers={key: each.numbers for key, each in part.accuracy.items()},
+            turns={
+                key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
+                for key, each in part.accuracy.items()
+                if not math.isnan(each.rms_mrad)
+            },
+            instrument=part.instrument,
+            identification=Stated(known, {}, np.zeros(0), np.zeros(0), part.condition),
+            position_sigma=1e-3 * part.position_sigma_mm,
+            beyond=part.beyond_one_reflector,
+            notices=part.notices,
+            provenance=part.provenance,
+            stated={key: each.accuracy() for key, each in part.accuracy.items()},
+        )
 
     def json(self) -> str:
         """`to_dict` as text."""

@@ -26,7 +26,7 @@ from minimax_cal.judging.iso9283.visits import (
     values_of,
     view_of,
 )
-from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.history import ordered, with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 
@@ -316,7 +316,8 @@ def iso9283(
     and "after" (calibrated).  held: (m,) True where no fit has seen the pose.  tcp: centroid (of
     the targets), a target, or a point of the last frame (3,) [m].  Raises CalibrationError.
     """
-    data = with_history(data)
+    # in the order of the file where nothing tells another: a row measured again is no new visit
+    data = with_history(data if ordered(data) else data.in_visit_order())
     chosen, told = tcp_of(data, tcp)
     commanded = {name: data.y - np.moveaxis(c.error(data), 0, 1) for name, c in cells.items()}
     stops = stops_of(data, commanded, np.asarray(held, dtype=bool))
@@ -384,7 +385,7 @@ def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list
         if not np.isfinite(part.values[next(iter(part.values))].position).any():
             out.append(
                 f"the TCP was measured at none of the {PARTS[key]} poses: choose one target for it "
-                f"(--tcp {data.target_names[0]})"
+                f"(tcp {data.target_names[0]})"
             )
     return out
 

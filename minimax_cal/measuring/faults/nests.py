@@ -12,7 +12,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import Between, between, scatter
 from minimax_cal.measuring.faults.fault import Amount, Fault
 from minimax_cal.measuring.faults.limits import ALIKE, FALSE_ALARM
-from minimax_cal.measuring.history import visits
+from minimax_cal.measuring.history import is_timed, visits
 from minimax_cal.measuring.measurements import Measurements
 
 NEAR = 8  # visits by which ranks may misplace a step
@@ -35,7 +35,12 @@ class Step:
 
 
 def target_shifts(data: Measurements) -> tuple[Fault, ...]:
-    """Nests that moved during the session, as steps of their distances over the visits."""
+    """Nests that moved during the session, as steps of their distances over the visits.
+
+    None where the file tells no order.
+    """
+    if not is_timed(data):
+        return ()
     apart = between(data)
     order = visits(data)
     off = apart.off[:, order]

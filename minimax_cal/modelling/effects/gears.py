@@ -167,8 +167,10 @@ BACKLASH = Effect(
     "dq_j = b/2 sign(last move of j)",
     lambda scene: moved_places(scene, "approach"),
     play,
-    needs=lambda scene: ("" if moved(scene, "approach") else
-                         "columns approach1 ... or the visit order, joints moving both ways"),
+    needs=lambda scene: (
+        "" if moved(scene, "approach")
+        else f"columns approach1 ... or the visit order, joints moving both ways{scene.untold}"
+    ),
     choices=lambda scene, place: [at_all(place, moved(scene, "approach"))],
     typical=1e-3,
 )  # fmt: skip
@@ -185,7 +187,9 @@ SETTLING = Effect(
     "dq_j = e (q_n - q_(n-1))",
     lambda scene: moved_places(scene, "move"),
     unsettled,
-    needs=lambda scene: "" if moved(scene, "move") else "the visit order (column order)",
+    needs=lambda scene: (
+        "" if moved(scene, "move") else "the visit order (column order)" + scene.untold
+    ),
     choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
     typical=1e-2,
 )

@@ -102,6 +102,13 @@ class Scene:
         return bool(np.ptp(values) > 0.0) if len(values) else False
 
     @property
+    def untold(self) -> str:
+        """A clause where the file tells no order of its poses, else nothing."""
+        followed = self.data.columns.get("followed")
+        timed = self.has("clock") or followed is None or bool(followed.any())
+        return "" if timed else "; the file tells no order"
+
+    @property
     def measured_torques(self) -> bool:
         """Whether the data hold measured torques."""
         columns = self.data.columns

@@ -83,7 +83,9 @@ THERMAL_GROWTH = Effect(
     lambda scene: ("all",) if courses(scene, "all") else (),
     growth,
     finer=finer,
-    needs=lambda scene: "" if courses(scene, "all") else "columns time_s, order or temperature_C",
+    needs=lambda scene: (
+        "" if courses(scene, "all") else "columns time_s, order or temperature_C" + scene.untold
+    ),
     choices=lambda scene, place: tuple(
         {**choice, "apart": apart} for choice in courses(scene, place) for apart in (0.0, 1.0)
     ),
@@ -115,7 +117,7 @@ FRAME_DRIFT = Effect(
     lambda scene: ("frame",) if scene.has("clock") else (),
     drift,
     finer=finer,
-    needs=lambda scene: "" if scene.has("clock") else "column order or time_s",
+    needs=lambda scene: "" if scene.has("clock") else "column order or time_s" + scene.untold,
     choices=lambda scene, place: tuple(c for c in courses(scene, place) if "constant" in c),
     typical=1e-2,
 )
@@ -146,7 +148,13 @@ TARGET_SHIFT = Effect(
     lambda scene: scene.data.target_names if scene.targets > 1 and scene.has("clock") else (),
     nest,
     finer=finer,
-    needs=lambda scene: "" if scene.targets > 1 else "a second target",
+    needs=lambda scene: (
+        "a second target"
+        if scene.targets < 2
+        else ""
+        if scene.has("clock")
+        else "column order or time_s" + scene.untold
+    ),
     choices=moments,
     typical=5e-3,
 )

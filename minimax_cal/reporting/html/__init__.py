@@ -7,7 +7,7 @@ put on a page (`page`); `pdf` prints it.
 from minimax_cal.reporting.html.content import Figure, Note, Report, Section, View
 from minimax_cal.reporting.html.document import Wording, compose
 from minimax_cal.reporting.html.page import render
-from minimax_cal.reporting.html.pdf import find_browser, print_pdf
+from minimax_cal.reporting.html.pdf import find_browser, picture, print_pdf
 from minimax_cal.reporting.html.sources import Sources, read_sources
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Wording",
     "compose",
     "find_browser",
+    "picture",
     "print_pdf",
     "read_sources",
     "render",

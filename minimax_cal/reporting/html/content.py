@@ -17,7 +17,7 @@ MOST_POSES = 500  # drawn one by one; more only cost time and hide each other
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence or some.  kind: text, reason, caveat, missing or warning."""
+    """A sentence or some.  kind: text, reason, caveat, missing, warning or banner."""
 
     text: str
     kind: str = "text"
@@ -64,7 +64,11 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The whole document.  facts: of the title block, label and text; digest: of the data."""
+    """The whole document.
+
+    facts: of the title block, label and text, empty where people write by hand.  sections: the
+    first is the one to sign.  digest: of the data.
+    """
 
     title: str
     robot: str

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import version
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.instruments import RelativeCalibration
+from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
+from minimax_cal.judging.tolerance import Limit
 from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
 from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
-from minimax_cal.reporting.html.fit_tables import glance_table, settings_table
+from minimax_cal.reporting.html.facts import told_facts
+from minimax_cal.reporting.html.first_page import page_blocks, signed
+from minimax_cal.reporting.html.fit_tables import settings_table
 from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.html.verdict import fit_verdict, gap_verdict
+from minimax_cal.reporting.html.verdict import gap_verdict
 
 NO_FIT = (
     "Not in this report: it was made without a calibration; give the file of `minimax-cal "
     "calibrate -o` as well."
-)
-NO_GAP = (
-    "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
-    "-o` as well."
 )
 HEX = re.compile(r"[0-9a-f]{64}")
 
@@ -35,59 +36,75 @@ def of_fit(blocks: Callable[[Fit], Blocks]) -> Callable[[Sources], Blocks]:
 
 def of_gap(blocks: Callable[[Diagnosis], Blocks]) -> Callable[[Sources], Blocks]:
     """What needs a diagnosis, or that there is none."""
-    return lambda sources: blocks(sources.gap) if sources.gap else [missing(NO_GAP)]
+    return lambda sources: blocks(sources.gap) if sources.gap else [missing(gap_sections.NO_GAP)]
 
 
 SECTIONS = (  # name, title, what it holds
     ("accuracy", "Accuracy", fit_sections.accuracy),
     ("workspace", "The errors in the workspace", fit_sections.errors_in_space),
     ("joints", "What the errors go with", fit_sections.joints),
-    ("gap", "The gap, step by step", of_gap(gap_sections.gap_steps)),
-    ("causes", "Causes, and their rivals", of_gap(gap_sections.causes)),
-    ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
-    ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
-    ("simulator", "The arm in the simulator", simulator_section.blocks),
     ("suspects", "Suspect points", fit_sections.suspect_points),
     ("parameters", "Parameters", of_fit(fit_sections.parameters)),
     ("correlations", "How the parameters hang together", of_fit(fit_sections.correlated)),
     ("iso9283", "Values by the formulas of ISO 9283", of_fit(fit_sections.iso_values)),
     ("solution", "How the fit was found", of_fit(fit_sections.solution)),
+    ("diagnosis", "Diagnosis", of_gap(gap_verdict)),
+    ("gap", "The gap, step by step", of_gap(gap_sections.gap_steps)),
+    ("causes", "Causes, and their rivals", gap_sections.causes_of),
+    ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
+    ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
+    ("simulator", "The arm in the simulator", simulator_section.blocks),
+)
+WITHOUT_COORDINATES = (
+    ("accuracy", "Accuracy", fit_sections.parts_accuracy),
+    ("parameters", "Parameters", fit_sections.parts_parameters),
 )
 
 
 @dataclass(frozen=True)
 class Wording:
-    """What the user says of a report, empty where nothing.  date: of the report, ISO 8601."""
+    """What the user says of a report, empty where nothing.
+
+    date: of the report, ISO 8601.  facts: by the keys of `facts.FACTS`.  limits: what is required,
+    which: of which claim, within or beyond.  rung: of a diagnosis.
+    """
 
     date: str
     title: str = ""
     customer: str = ""
     author: str = ""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    limits: tuple[Limit, ...] = ()
+    which: str = "within"
+    rung: int | None = None
 
 
 def compose(sources: Sources, wording: Wording) -> Report:
     """The whole report.  Raises CalibrationError for a part of a file that cannot be read."""
     told = sources.provenance
-    both = " and ".join(kind for kind, _ in named(sources)).capitalize()
-    facts = [("Robot", sources.robot)]
+    kind = named(sources)[0][0].capitalize()
+    data = sources.results[0].data if not sources.relative else None
+    facts = [("Robot", sources.robot), *told_facts(wording.facts, data)]
     facts += [("Customer", visible(wording.customer))] if wording.customer else []
-    facts += [("Author", visible(wording.author))] if wording.author else []
     facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
     facts += [("Measurements", told.data or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
+    parts = WITHOUT_COORDINATES if sources.relative else SECTIONS
     sections = (
         Section(name, title, tuple(made(sources)))
-        for name, title, made in SECTIONS
+        for name, title, made in parts
         if name != "simulator" or sources.simulator
     )
+    found = signed(sources, wording.limits, wording.which, wording.rung)
+    first = Section("verdict", "Requirement and result", page_blocks(sources, found))
     return Report(
-        title=visible(wording.title) or f"{both} of {sources.robot}",
+        title=visible(wording.title) or f"{kind} of {sources.robot}",
         robot=sources.robot,
         facts=tuple(facts),
         signatures=signers(visible(wording.author), visible(wording.customer)),
-        sections=(verdict_section(sources), *sections, provenance_section(sources)),
+        sections=(first, *sections, provenance_section(sources)),
         digest=told.data_sha256 if HEX.fullmatch(told.data_sha256) else "",
-    )  # fmt: skip
+    )
 
 
 def signers(author: str, customer: str) -> tuple[tuple[str, str], ...]:
@@ -103,25 +120,17 @@ def counted(sources: Sources) -> str:
     elif sources.gap:
         first = sources.gap.ladder[0]
         held, train = first.holdout.poses, first.train.poses
+    elif sources.relative:
+        held, train = (sources.relative.accuracy[key].poses for key in ("holdout", "train"))
     targets = len(sources.cell.target_names) if sources.cell else 0
     seen = f", {targets} target{'s' if targets > 1 else ''}" if targets else ""
     return f"{train} training, {held} held out{seen}"
 
 
-def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis]]:
+def named(sources: Sources) -> list[tuple[str, Fit | Diagnosis | RelativeCalibration]]:
     """The results with what they are."""
-    both = (("calibration", sources.fit), ("diagnosis", sources.gap))
-    return [(kind, result) for kind, result in both if result]
-
-
-def verdict_section(sources: Sources) -> Section:
-    """The result in words and in four numbers."""
-    blocks: list[Block] = [Note(notice, "warning") for notice in sources.notices]
-    blocks += fit_verdict(sources.fit) if sources.fit else ()
-    table = glance_table(sources)
-    blocks += [table] if table.rows else []
-    blocks += gap_verdict(sources.gap) if sources.gap else ()
-    return Section("verdict", "Verdict", tuple(blocks))
+    every = (("calibration", sources.fit), ("diagnosis", sources.gap), (RELATIVE, sources.relative))
+    return [(kind, result) for kind, result in every if result]
 
 
 def provenance_section(sources: Sources) -> Section:

@@ -22,12 +22,13 @@ from minimax_cal.reporting.html.fit_tables import (
     correlation_table,
     cost_table,
     distance_table,
+    glance_table,
     iteration_table,
 )
 from minimax_cal.reporting.html.more_charts import correlation_map, iterations
 from minimax_cal.reporting.html.scene import workspace
 from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.html.verdict import why_not
+from minimax_cal.reporting.html.verdict import fit_verdict, why_not
 
 SAME = 1e-6  # a file's own errors come back to this, or its effects need other columns [m]
 MOST_SUSPECTS = 50
@@ -51,11 +52,12 @@ def accuracy(sources: Sources) -> Blocks:
     """How large the errors are, before and after, held out beside training."""
     blocks: list[Block] = []
     if sources.fit:
-        blocks.append(sources.fit.accuracy_table())
+        blocks += [*fit_verdict(sources.fit), glance_table(sources), sources.fit.accuracy_table()]
         unknown = missing("95 % intervals of these numbers are not in the file.")
         blocks += filled(sources.fit.interval_table()) or (unknown,)
+        blocks += filled(sources.fit.beyond.table())
     elif sources.gap:
-        blocks.append(sources.gap.ladder_table())
+        blocks += [glance_table(sources), sources.gap.ladder_table()]
     blocks.append(
         text(
             "An error is the distance between a measured target and where the model puts it. "
@@ -69,6 +71,17 @@ def accuracy(sources: Sources) -> Blocks:
     else:
         blocks.append(missing(NO_POSES))
     return blocks
+
+
+def parts_accuracy(sources: Sources) -> Blocks:
+    """How large the errors of lengths, closures or poses are."""
+    told = sources.relative
+    return [text(told.headline()), *told.tables()[:-1]] if told else []
+
+
+def parts_parameters(sources: Sources) -> Blocks:
+    """The parameters of a calibration without coordinates."""
+    return [sources.relative.tables()[-1]] if sources.relative else []
 
 
 def errors_in_space(sources: Sources) -> Blocks:

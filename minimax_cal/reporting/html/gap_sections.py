@@ -8,9 +8,14 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.records import reading
 from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
+from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.tables import where_tables
 
 CURVES = ("residual", "order")
+NO_GAP = (
+    "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
+    "-o` as well."
+)
 
 
 def gap_steps(gap: Diagnosis) -> Blocks:
@@ -30,11 +35,19 @@ def closing(gap: Diagnosis) -> str:
     return out
 
 
-def causes(gap: Diagnosis) -> Blocks:
+def causes_of(sources: Sources) -> Blocks:
+    """As `causes`; parameters of effects that the fit holds too stand with the fit."""
+    if not sources.gap:
+        return [missing(NO_GAP)]
+    return causes(sources.gap, parameters=not (sources.fit and sources.fit.cell.effects.terms))
+
+
+def causes(gap: Diagnosis, *, parameters: bool) -> Blocks:
     """What was found, what else it could be, and what to measure next."""
     blocks: list[Block] = []
     if gap.findings:
-        blocks += [gap.effects_table(), gap.parameter_table()]
+        blocks.append(gap.effects_table())
+        blocks += [gap.parameter_table()] if parameters else []
     else:
         blocks.append(text("No effect beyond geometry was found."))
     blocks += [curve_chart(k, gap.curves[k], gap.held) for k in CURVES if k in gap.curves]

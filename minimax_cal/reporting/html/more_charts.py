@@ -65,6 +65,9 @@ def iterations(fit: Fit) -> Figure:
     return figure("iterations", "How the fit converged", f"{says}.", traces, layout, 300)
 
 
+MOST_LABELS = 24  # of a side of the map of correlations
+
+
 def correlation_map(known: Uncertainty) -> Figure:
     """Correlations of the identified parameters, as a matrix of colours."""
     told, found = correlations(known)
@@ -77,7 +80,9 @@ def correlation_map(known: Uncertainty) -> Figure:
         "hovertemplate": "%{x}, %{y}: %{z:.3f}<extra></extra>",
         "xaxis": key("x", 0), "yaxis": key("y", 0),
     }  # fmt: skip
-    tick = {"type": "category", "tickfont": {"size": 9}, "showgrid": False, "dtick": 1}
+    # more labels than these hide each other; all are told where one points
+    every = int(np.ceil(len(names) / MOST_LABELS))
+    tick = {"type": "category", "tickfont": {"size": 10}, "showgrid": False, "dtick": every}
     layout = frame(
         xaxis=axis("") | tick | {"tickangle": -90},
         yaxis=axis("") | tick | {"autorange": "reversed"},

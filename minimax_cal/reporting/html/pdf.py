@@ -1,4 +1,4 @@
-"""A report on paper: a page printed to PDF by an installed Chromium, Chrome or Edge."""
+"""A report on paper, or its first page as a picture, by an installed Chromium, Chrome or Edge."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ FLAGS = (
     "--no-first-run",
     "--no-pdf-header-footer",
 )
+SHEET = "794,1123"  # A4 in CSS pixels
 PATIENCE = 180.0  # seconds that a browser may take
 HINT = "open the HTML file in a browser and print it from there"
 
@@ -39,21 +40,37 @@ def find_browser() -> str:
     for name in BROWSERS:
         if found := shutil.which(name):
             return found
-    raise OptionError(f"--pdf needs Chromium, Chrome or Edge, and none was found; {HINT}")
+    raise OptionError(f"paper needs Chromium, Chrome or Edge, and none was found; {HINT}")
 
 
 def print_pdf(page: str, path: Path, browser: str) -> None:
     """Write a page as PDF; nothing is written where the browser fails.  Raises CalibrationError."""
-    with tempfile.TemporaryDirectory(prefix="minimax-cal-", ignore_cleanup_errors=True) as name:
-        folder = Path(name)
-        source, target = folder / "report.html", folder / "report.pdf"
+    made(page, path, browser, "report.pdf", "--print-to-pdf={}")
+
+
+def picture(page: str, path: Path, browser: str) -> None:
+    """Write the first page of a page for paper as PNG, A4.  Raises CalibrationError.
+
+    What holds for print holds for the screen then.
+    """
+    sheet = page.replace("@media print {", "@media all {").replace("<html ", "<html data-sheet ", 1)
+    flags = ("--hide-scrollbars", f"--window-size={SHEET}", "--force-device-scale-factor=2")
+    made(sheet, path, browser, "page.png", "--screenshot={}", *flags)
+
+
+def made(page: str, path: Path, browser: str, name: str, flag: str, *more: str) -> None:
+    """What a browser makes of a page, written whole.  Raises CalibrationError."""
+    with tempfile.TemporaryDirectory(prefix="minimax-cal-", ignore_cleanup_errors=True) as where:
+        folder = Path(where)
+        source, target = folder / "report.html", folder / name
         source.write_text(page, encoding="utf-8")
         command = [
             browser,
             *FLAGS,
+            *more,
             *(["--no-sandbox"] if is_root() else []),
             f"--user-data-dir={folder / 'profile'}",
-            f"--print-to-pdf={target}",
+            flag.format(target),
             source.as_uri(),
         ]
         try:

@@ -1,4 +1,4 @@
-"""What a report is made of: a calibration, a diagnosis, or both, with every text visible."""
+"""What a report is made of: a calibration, a diagnosis, or both; or a relative calibration."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
+from minimax_cal.fitting.instruments import RelativeCalibration
+from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
@@ -24,7 +26,7 @@ from minimax_cal.simulators.result import KIND, SimulatorGap
 
 AGAIN = "write it again with minimax-cal"
 
-Result = Fit | Diagnosis | SimulatorGap | Path | str
+Result = Fit | Diagnosis | RelativeCalibration | SimulatorGap | Path | str
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class File:
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """A calibration, a diagnosis, or both, and the arm in a simulator.
+    """A calibration, a diagnosis, or both, and the arm in a simulator; or a relative calibration.
 
     notices: what the reader should know of both.
     """
@@ -74,10 +76,11 @@ class Sources:
     files: tuple[File, ...] = ()
     notices: tuple[str, ...] = ()
     simulator: SimulatorGap | None = None
+    relative: RelativeCalibration | None = None
 
     @property
     def results(self) -> tuple[Fit | Diagnosis, ...]:
-        """Those that there are."""
+        """Those of measured points that there are."""
         return tuple(result for result in (self.fit, self.gap) if result)
 
     @property
@@ -85,12 +88,14 @@ class Sources:
         """Name of the robot."""
         if self.fit:
             return self.fit.robot.name
+        if self.relative:
+            return self.relative.robot.name
         return self.gap.robot if self.gap else ""
 
     @property
     def provenance(self) -> Provenance:
         """Of the calibration, or else of the diagnosis."""
-        return self.results[0].provenance
+        return (self.relative or self.results[0]).provenance
 
     @property
     def poses(self) -> Poses | None:
@@ -125,6 +130,11 @@ def read_sources(results: Sequence[Result]) -> Sources:
     for result in results:
         content, path, digest = content_of(result)
         kind = content.get("kind", "calibration" if "parameters" in content else "")
+        if kind == RELATIVE:
+            if len(results) > 1:
+                raise CalibrationError(f"{path}: is a {RELATIVE}; report it alone")
+            told = RelativeCalibration.from_dict(content, path)
+            return Sources(None, None, (File(kind, path, digest),), relative=told)
         if kind == "calibration" and "parameters" in content:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
@@ -164,10 +174,9 @@ def content_of(result: Result) -> tuple[dict[str, Any], str, str]:
         content, digest = read_json(result)
         return content, str(result), digest
     text = result.json()
-    kinds = {Fit: "calibration", Diagnosis: "diagnosis", SimulatorGap: "gap in a simulator"}
-    kind = kinds[type(result)]
+    content = clean(json.loads(text))
     digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-    return clean(json.loads(text)), f"{kind}, not saved", digest
+    return content, f"{content['kind']}, not saved", digest
 
 
 def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> tuple[str, ...]:

@@ -51,31 +51,36 @@ def changed(before: Accuracy, after: Accuracy, interval: Interval = UNKNOWN) -> 
 def fit_verdict(fit: Fit) -> tuple[Note, ...]:
     """The calibration in some sentences."""
     train, held = fit.accuracy["train"], fit.accuracy["holdout"]
-    nominal, notes = fit.accuracy["nominal"], []
-    if held.poses:
-        first = f"On {held.poses} poses that were not used for the fit, "
-        known = fit.intervals.get("holdout", (UNKNOWN, UNKNOWN))[0]
-        notes.append(text(first + changed(nominal, held, known) + "."))
-        notes.append(
-            text(
-                f"On the {train.poses} poses of the fit itself the calibrated robot misses by "
-                f"{number(train.rms_mm)} RMS, at most {number(train.max_mm)}."
-            )
-        )
-    else:
+    if not held.poses:
         first = f"On the {train.poses} poses of the fit itself, "
-        notes.append(text(first + changed(fit.accuracy["nominal_train"], train) + "."))
+        return text(first + changed(fit.accuracy["nominal_train"], train) + "."), how(fit)
+    first = f"On {held.poses} poses that were not used for the fit, "
+    known = fit.intervals.get("holdout", (UNKNOWN, UNKNOWN))[0]
+    return (
+        text(first + changed(fit.accuracy["nominal"], held, known) + "."),
+        text(
+            f"On the {train.poses} poses of the fit itself the calibrated robot misses by "
+            f"{number(train.rms_mm)} RMS, at most {number(train.max_mm)}."
+        ),
+        how(fit),
+    )
+
+
+def fit_warnings(fit: Fit) -> tuple[Note, ...]:
+    """What nobody should sign without having read it."""
+    held, notes = fit.accuracy["holdout"], []
+    if not held.poses:
         notes.append(
             caveat(
                 "No pose was held out: these numbers were reached on the poses of the fit and are "
                 "too good for new ones."
             )
         )
-    if held.poses and not held.rms_mm < nominal.rms_mm:
+    elif not held.rms_mm < fit.accuracy["nominal"].rms_mm:
         notes.append(
             Note("On poses not used for the fit, the calibration is no improvement.", "warning")
         )
-    return (*notes, how(fit), *trouble(fit.status, fit.status.advice))
+    return (*notes, *trouble(fit.status, fit.status.advice))
 
 
 def how(fit: Fit) -> Note:

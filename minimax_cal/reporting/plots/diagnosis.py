@@ -1,4 +1,4 @@
-"""The picture of a diagnosis (needs matplotlib: pip install minimax-cal[plot])."""
+"""The picture of a diagnosis (needs matplotlib)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a calibration (needs matplotlib: pip install minimax-cal[plot])."""
+"""Pictures of a calibration (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib import figure
     except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install minimax-cal[plot]") from error
+        raise OptionError("a picture needs matplotlib: pip install '.[plot]' in a clone") from error
     return figure.Figure(figsize=(width, height), layout="constrained")
 
 
@@ -88,8 +88,13 @@ def scale_bar(part: FigureBase, shown: Any, panels: Array, label: str, side: str
 
 
 def save_errors(fit: Fit, path: Path) -> None:
+    """`errors_figure` as a file."""
+    save(errors_figure(fit), path)
+
+
+def errors_figure(fit: Fit) -> Figure:
     """Errors before and after: pose by pose, and their distribution on held-out poses."""
-    figure = new_figure(10, 3.8)
+    figure = new_figure(9, 4.0)
     from matplotlib.ticker import MaxNLocator
 
     held = fit.accuracy["holdout"].poses > 0
@@ -108,10 +113,13 @@ def save_errors(fit: Fit, path: Path) -> None:
         right.step(values, share, where="post", color=colour, label=name)
     left.set(xlabel=f"pose ({where})", ylabel="position error (mm)", yscale="log")
     right.set(xlabel="position error (mm)", ylabel="points with less error (%)", xscale="log")
-    right.set_title("Cumulative distribution")
+    every = 1e3 * np.concatenate([np.linalg.norm(fit.errors[k], axis=-1).ravel() for k in keys])
+    for axis in (left.yaxis, right.xaxis):
+        plain_ticks(axis, every[every > 0.0])
     for axes in (left, right):
         axes.grid(visible=True, alpha=0.3)
-    left.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2)
+    figure.legend(*left.get_legend_handles_labels(), frameon=False, loc="outside lower center",
+                  ncols=2)  # fmt: skip
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.suptitle(f"{fit.robot.name}, objective {fit.objective}", fontweight="bold")
-    save(figure, path)
+    return figure

@@ -1,4 +1,4 @@
-"""The picture of a map of the workspace (needs matplotlib: pip install minimax-cal[plot])."""
+"""The picture of a map of the workspace (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -16,55 +16,55 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = "cividis_r"  # dark is large; even for colour-blind eyes [Nunez et al. 2018]
-HATCHES = {0.5: "///", 1e-9: "xxx"}  # of bins whose share of reached samples is below this
+COLOURS = "OrRd"  # pale is small, dark is large: one hue, for colour-blind eyes too
+NOWHERE = "#dfe3e8"  # where no joints come
+REACHED = 0.5  # share of a bin's samples among the training poses: fewer is extrapolation
 MARKS: dict[bool, dict[str, Any]] = {  # held out or not: size and rim of a point
-    False: {"s": 12, "linewidths": 0.0},
+    False: {"s": 14, "linewidths": 0.3, "edgecolors": "#777777"},
     True: {"s": 34, "linewidths": 0.9, "edgecolors": "black"},
 }
 
 
 def save_map(found: WorkspaceMap, path: Path) -> None:
     """Draw a map.  path: its suffix, one of `figures.PICTURES`, chooses the format."""
-    columns = 4 if found.predicted else 2
+    columns = 3 if found.predicted else 2
     figure = new_figure(3.9 * columns, 9.0)
     grid = np.asarray(figure.subplots(2, columns, squeeze=False, sharex="row", sharey="row"))
     if found.predicted:
-        draw_predicted(figure, grid[:, :2], found)
+        draw_predicted(figure, grid[:, :1], found)
     draw_observed(figure, grid[:, -2:], found)
     for row, part in zip(grid, found.sections, strict=True):
         row[0].set(ylabel=part.axes[1], xlim=part.x[[0, -1]], ylim=part.y[[0, -1]])
         for axes in row:
             axes.set(xlabel=part.axes[0], aspect="equal")
             axes.grid(visible=True, alpha=0.3)
+            axes.set_facecolor(NOWHERE)
     figure.suptitle(f"{found.robot}: position over the workspace, base frame", fontweight="bold")
     figure.supxlabel(legend(found), fontsize="small")
     save(figure, path)
 
 
 def legend(found: WorkspaceMap) -> str:
-    """What the rows, the hatching and the points mean."""
+    """What the rows, the line and the points mean."""
     return (
         "upper row: half-plane through axis 1, into which all poses are turned; lower row: "
         f"horizontal slab at {found.height:.2f} m, {found.slab:.2f} m thick (pale points lie "
-        "outside it).\nhatched: extrapolation, most joints (crossed: all) that come there lie "
-        "beyond the training poses; blank: no joints come there.\nlarge ringed points: held-out "
-        "poses; small points: training poses"
+        "outside it).\nline: on its far side most joints that come there lie beyond the training "
+        "poses (extrapolation); grey: no joints come there.\nlarge ringed points: held-out poses; "
+        "small points: training poses"
     )
 
 
 def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
-    """Median and worst radius in each bin."""
-    every = [1e3 * part for s in found.sections for part in (s.median, s.worst)]
-    scale = logarithmic(np.concatenate([part.reshape(-1) for part in every]), 0.02)
-    for row, part in zip(grid, found.sections, strict=True):
-        both = {"median": part.median, "worst": part.worst}
-        for axes, (name, values) in zip(row, both.items(), strict=True):
-            shown = axes.pcolormesh(
-                part.x, part.y, 1e3 * values.T, norm=scale, cmap=COLOURS, rasterized=True
-            )
-            hatch(axes, part)
-            axes.set_title(f"predicted, {name} of each bin", fontsize="medium")
+    """The worst radius in each bin."""
+    every = [1e3 * part.worst.reshape(-1) for part in found.sections]
+    scale = logarithmic(np.concatenate(every), 0.02)
+    for axes, part in zip(grid[:, 0], found.sections, strict=True):
+        shown = axes.pcolormesh(
+            part.x, part.y, 1e3 * part.worst.T, norm=scale, cmap=COLOURS, rasterized=True
+        )
+        outline(axes, part)
+        axes.set_title("predicted, the worst of each bin", fontsize="medium")
     scale_bar(figure, shown, grid, "radius that holds 95 % (mm)", "bottom")
 
 
@@ -77,9 +77,9 @@ def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     views = ((np.hypot(x, y), z, np.ones(len(x), dtype=bool)), (x, y, flat))
     for row, part, (across, along, inside) in zip(grid, found.sections, views, strict=True):
         for axes, name in zip(row, (BEFORE, AFTER), strict=True):
-            ground = np.where(part.count > 0, 0.08, np.nan)
+            ground = np.where(part.count > 0, 0.0, np.nan)
             axes.pcolormesh(part.x, part.y, ground.T, cmap="Greys", vmin=0, vmax=1, rasterized=True)
-            hatch(axes, part)
+            outline(axes, part)
             error = 1e3 * seen.error[name]
             for held, mark in MARKS.items():
                 for mask, alpha in ((~inside, 0.25), (inside, 1.0)):
@@ -93,20 +93,17 @@ def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     scale_bar(figure, shown, grid, "error of the targets' centroid (mm)", "bottom")
 
 
-def hatch(axes: Axes, part: Section) -> None:
-    """Hatch the bins whose samples lie beyond the training poses: most of them, or all."""
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Outline
+def outline(axes: Axes, part: Section) -> None:
+    """A line around the bins that the training poses reach."""
+    from matplotlib.collections import LineCollection
 
-    least = 0.0
-    for below, pattern in sorted(HATCHES.items()):
-        i, j = np.nonzero((part.reached >= least) & (part.reached < below))
-        least = below
-        if len(i):
-            ring = ((0, 0), (1, 0), (1, 1), (0, 1))
-            corners = [np.column_stack([part.x[i + a], part.y[j + b]]) for a, b in ring]
-            outline = Outline.make_compound_path_from_polys(np.stack(corners, axis=1))
-            axes.add_patch(
-                PathPatch(outline, facecolor=(1, 1, 1, 0.3), edgecolor="#666666", lw=0.0,
-                          hatch=pattern)
-            )  # fmt: skip
+    inside = np.pad(part.reached >= REACHED, 1)  # NaN, where no joints come, is no more
+    i, j = np.nonzero(inside[1:, :] != inside[:-1, :])  # across x, then across y
+    a, b = np.nonzero(inside[:, 1:] != inside[:, :-1])
+    walls = [
+        ((part.x[u], part.y[v - 1]), (part.x[u], part.y[v])) for u, v in zip(i, j, strict=True)
+    ]
+    floors = [
+        ((part.x[u - 1], part.y[v]), (part.x[u], part.y[v])) for u, v in zip(a, b, strict=True)
+    ]
+    axes.add_collection(LineCollection([*walls, *floors], colors="black", linewidths=1.0))

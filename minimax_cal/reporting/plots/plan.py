@@ -1,4 +1,4 @@
-"""The picture of a plan (needs matplotlib: pip install minimax-cal[plot])."""
+"""The picture of a plan (needs matplotlib)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, save
 
 GREY = "#bbbbbb"
+FAR = 1.0  # of the candidates' span: a tracker farther off is told by an arrow
 
 
 def save_plan(plan: Plan, path: Path) -> None:
@@ -52,14 +53,30 @@ def views(plan: Plan, side: Any, above: Any) -> None:
         side.scatter(out(points), points[:, 2], s=size, color=colour, label=name)
         above.scatter(points[:, 0], points[:, 1], s=size, color=colour)
     above.plot(chosen[:, 0], chosen[:, 1], color=AFTER, linewidth=0.6, alpha=0.7)
-    side.plot(out(eye), eye[2], "^", color=BEFORE, label="tracker")
-    above.plot(eye[0], eye[1], "^", color=BEFORE)
+    mark(side, out(everywhere), everywhere[:, 2], (float(out(eye)), float(eye[2])))
+    mark(above, everywhere[:, 0], everywhere[:, 1], (float(eye[0]), float(eye[1])))
     side.set(xlabel="flange, distance from the base's vertical (m)", ylabel="height (m)")
-    above.set(xlabel="flange, from above (m)", ylabel="(m)")
+    above.set(xlabel="flange, from above (m)", ylabel="across (m)")
     for one in (side, above):
         one.set_aspect("equal", adjustable="datalim")
         one.grid(visible=True, alpha=0.3)
     side.legend(frameon=False, fontsize="small")
+
+
+def mark(axes: Any, across: Array, along: Array, eye: tuple[float, float]) -> None:
+    """The tracker, or the way to it where it would leave a thumbnail of the arm."""
+    middle = np.array([across.mean(), along.mean()])
+    span = float(max(np.ptp(across), np.ptp(along)))
+    way = np.array(eye) - middle
+    distance = float(np.linalg.norm(way))
+    if distance <= FAR * span:
+        axes.plot(*eye, "^", color=BEFORE, label="tracker")
+        return
+    tip = middle + 0.75 * span * way / distance
+    arrow = {"arrowstyle": "-|>", "color": BEFORE, "linewidth": 1.5}
+    axes.annotate("", tip, xytext=middle + 0.55 * span * way / distance, arrowprops=arrow)
+    axes.plot([], [], "^", color=BEFORE, label=f"to the tracker, {distance:.1f} m away")
+    axes.plot(*tip, alpha=0.0)  # within the limits
 
 
 def grown(plan: Plan, axes: Any) -> None:

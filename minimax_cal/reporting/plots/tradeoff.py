@@ -15,6 +15,8 @@ def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
     path: its suffix, one of `figures.PICTURES`, chooses the format.
     """
     figure = new_figure(10, 4.2)
+    from matplotlib.patheffects import withStroke
+
     parts = {"training poses": [c.train for c in found.choices]}
     if found.choices[0].holdout.poses:
         parts["held-out poses"] = [c.holdout for c in found.choices]
@@ -24,10 +26,13 @@ def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
         for number, a in enumerate(judged):
             text = {0: "sum", len(judged) - 1: "point"}.get(number, str(number))
             spot = (a.rms_mm, a.max_mm)
-            axes.annotate(text, spot, xytext=(5, 5), textcoords="offset points")
+            axes.annotate(
+                text, spot, xytext=(7, 4), textcoords="offset points",
+                path_effects=[withStroke(linewidth=3, foreground="white")],
+            )  # fmt: skip
         axes.set(xlabel="RMS error (mm)", ylabel="largest error (mm)")
         axes.set_title(f"{judged[0].poses} {name}")
-        axes.margins(0.1)
+        axes.margins(0.15)
         axes.grid(visible=True, alpha=0.3)
     title = textwrap.fill(f"{found.robot}: RMS against the largest error", 80)
     figure.suptitle(title, fontweight="bold")

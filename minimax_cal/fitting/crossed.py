@@ -1,0 +1,98 @@
+"""The claim *within* the measured poses: by poses held out, or by cross-validation where few are.
+
+Of a few held-out poses an accuracy is known badly, and a largest error not at all.  So every pose
+is judged by a fit without it: those held out by the fit itself, the others in turn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.fitting.beyond import without
+from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval
+from minimax_cal.fitting.uncertainty import Estimator
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.parameters import State
+
+FEW = 20  # held-out poses; of fewer a share is left out in turn as well
+FOLDS = 10  # parts of the training poses: a fit without one has nearly all of them
+PLENTY = 3.0  # numbers measured per parameter; with fewer, errors on new poses are far larger
+FREE = 6  # numbers that a pose tells at most, however many targets it shows
+NOT_CROSSED = np.zeros((0, 0, 3))
+
+
+@dataclass(frozen=True)
+class Within:
+    """How the arm did on poses that its fit had not seen, and before.
+
+    poses: that count by themselves; repeats and clusters count once.  where: which, in words.
+    rms, largest: 95 % intervals [m].
+    """
+
+    before: Accuracy
+    after: Accuracy
+    where: str
+    poses: int = 0
+    rms: Interval = UNKNOWN
+    largest: Interval = UNKNOWN
+
+
+def crossed(
+    estimator: Estimator,
+    state: State,
+    held: Array,
+    group: Array,
+    error_of: Callable[[State, Array], Array],
+    seed: int,
+) -> Array:
+    """(k, m, 3) errors of every pose by a fit without it, NaN where no fit can do without [m].
+
+    As in `beyond`, a fit without a part is one step from the whole one.  held: (m,) True where the
+    fit has not seen the pose.  group: (m,) poses with one number are left out together.
+    error_of: errors (k, r, 3) of a state at some rows [m].
+    """
+    names = np.unique(group[~held])
+    drawn = np.random.default_rng(seed).permutation(len(names)) % min(FOLDS, len(names))
+    fold = np.where(held, -1, drawn[np.minimum(np.searchsorted(names, group), len(names) - 1)])
+    masks = [fold == number for number in range(int(drawn.max(initial=-1)) + 1)]
+    fits = without(estimator, state, [mask[~held] for mask in masks])
+    out = np.full_like(error_of(state, np.arange(len(held))), np.nan)
+    for mask, fit in zip([held, *masks], [state, *fits], strict=True):
+        if fit:
+            out[:, mask] = error_of(fit, mask)
+    return out
+
+
+def intervals_of(error: Array, group: Array, seed: int) -> tuple[Interval, Interval]:
+    """95 % intervals of the RMS and of the largest of errors (k, m, 3) [m].  group: (m,)."""
+    rng = np.random.default_rng(seed)
+    return rms_interval(error, group, rng=rng), max_interval(error, group, rng=rng)
+
+
+def few_poses(train: Measurements, parameters: int) -> str:
+    """A warning where the poses are too few for the parameters, else nothing.
+
+    With n numbers and p parameters the mean square on new poses is (n + p) / (n - p) times that of
+    the poses of the fit.
+    """
+    _, first = np.unique(groups(train), return_index=True)
+    each = np.minimum(3 * train.seen[first].sum(axis=1), FREE)
+    numbers = int(each.sum())
+    if numbers >= PLENTY * parameters or not parameters:
+        return ""
+    more = math.ceil(PLENTY * parameters / each.mean())
+    growth = "many"
+    if numbers > parameters:
+        growth = f"about {math.sqrt((numbers + parameters) / (numbers - parameters)):.1f}"
+    return (
+        f"too few poses: {len(first)} training poses tell {numbers} numbers for {parameters} free "
+        f"parameters, so that errors on new poses are {growth} times those of training; measure at "
+        f"{more} poses or more, fix parameters, or tell what is known of them as priors"
+    )

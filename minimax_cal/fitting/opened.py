@@ -1,0 +1,256 @@
+"""A result, or its file, as the arm that it describes: a calibration, a diagnosis, a relative one.
+
+Each is a row of rungs, from the nominal arm on.  Results of rooms below this one come as what they
+write, so that a result and its file say the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.fit_file import measured_poses
+from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.uncertainty import Uncertainty
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.records import reading
+from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
+from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.model import model_of
+from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.solvers.status import Status
+
+RELATIVE = "relative calibration"  # kind of a file
+NOMINAL, CALIBRATED, GEOMETRIC = "nominal", "calibrated", "geometric"
+NO_JOINTS = np.zeros((0, 0))
+NOWHERE = Measurements(NO_JOINTS, np.zeros((0, 0, 3)), (), np.zeros(0, dtype=bool), np.zeros(0), {})
+
+
+@runtime_checkable
+class Writes(Protocol):
+    """A result that tells all of itself."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As its file."""
+
+
+Result = Fit | Cell | Writes | Path | str
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """A state of the arm: cell None where the file does not tell it.
+
+    error: (k, m, 3) of its poses as the file tells them [m], None where it does not.
+    """
+
+    name: str
+    cell: Cell | None
+    error: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """One rung of a result, and what the result tells besides.
+
+    number: of the rung.  placed: whether base and targets are known; lengths tell neither.
+    data: its poses, none where it holds none; held: (m,) True where held out.  digest: SHA-256 of
+    the measurements.  uncertainty: of the last rung of a calibration.
+    """
+
+    source: str
+    rungs: tuple[Rung, ...]
+    number: int
+    data: Measurements = NOWHERE
+    held: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    digest: str = ""
+    uncertainty: Uncertainty | None = None
+    placed: bool = True
+    status: Status | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """The arm of the rung.  Raises CalibrationError where the file does not tell it."""
+        rung = self.rungs[self.number]
+        if rung.cell is None:
+            raise CalibrationError(
+                f"{self.source}: does not tell the arm of rung {self.number} ({rung.name}); "
+                "make the file again"
+            )
+        return rung.cell
+
+    @property
+    def nominal(self) -> Cell | None:
+        """The arm before calibration, where the result tells it."""
+        return self.rungs[0].cell if self.rungs[0].name == NOMINAL else None
+
+    @property
+    def train(self) -> Measurements:
+        """The training poses."""
+        return self.data.take(~self.held)
+
+    def placed_by(self, data: Measurements) -> tuple[Cell, Cell | None, tuple[str, ...]]:
+        """The arm and the nominal one with base and targets that fit data best; a notice.
+
+        As they are where the result knows its place.  Raises CalibrationError.
+        """
+        if self.placed:
+            return self.cell, self.nominal, ()
+        before = place(self.nominal.robot, data) if self.nominal else None
+        said = f"{self.source}: knows no base and no targets: both are fitted to {data.source}"
+        return place(self.cell.robot, data), before, (said,)
+
+
+def place(robot: Robot, data: Measurements) -> Cell:
+    """An arm where it fits all poses best.  Raises DataError."""
+    check_joints(robot, data)
+    return Cell.of(robot, fit_base(model_of(robot, data), robot.mdh).state, data.target_names)
+
+
+def open_result(source: Result | Opened, rung: int | None = None) -> Opened:
+    """A result, or its file, at one of its rungs.
+
+    source: a calibration, a diagnosis, a relative calibration, a cell, or a file of one.  rung: 0
+    nominal, 1 geometric (or calibrated), 2 ... with each effect of a diagnosis; the last unless
+    given.  Raises CalibrationError.
+    """
+    if isinstance(source, Opened):
+        found = source
+    elif isinstance(source, Fit):
+        found = of_fit(source, source.robot.name)
+    elif isinstance(source, Cell):
+        found = Opened(source.robot.name, (Rung(CALIBRATED, source),), 0)
+    elif isinstance(source, Path | str):
+        found = of_content(saved_content(source), str(source))
+    else:
+        content = source.to_dict()
+        found = of_content(content, str(content.get("kind", "result")))
+    return found if rung is None else at_rung(found, rung)
+
+
+def at_rung(found: Opened, number: int) -> Opened:
+    """The same result at another rung.  Raises OptionError."""
+    if not 0 <= number < len(found.rungs):
+        names = ", ".join(f"{i} ({rung.name})" for i, rung in enumerate(found.rungs))
+        raise OptionError(f"{found.source}: has no rung {number}; it has {names}")
+    whole = found.uncertainty if number == len(found.rungs) - 1 else None
+    return replace(found, number=number, uncertainty=whole)
+
+
+def of_content(content: Mapping[str, Any], source: str) -> Opened:
+    """From the JSON of a result, by its kind.  Raises CalibrationError."""
+    kind = content.get("kind", "calibration")
+    if kind == "diagnosis":
+        with reading(source):
+            return of_diagnosis(content, source)
+    if kind == RELATIVE:
+        return of_relative(content, source)
+    if {"parameters", "accuracy", "provenance"} <= set(content):
+        return of_fit(Fit.from_dict(content, source), source)
+    return Opened(source, (Rung(CALIBRATED, cell_from_dict(content, source)),), 0)
+
+
+def of_fit(fit: Fit, source: str) -> Opened:
+    """A calibration: nominal and calibrated."""
+    rungs = (Rung(NOMINAL, fit.nominal, fit.error_nominal), Rung(CALIBRATED, fit.cell, fit.error))
+    digest = fit.provenance.data_sha256
+    return Opened(source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty, status=fit.status)
+
+
+def of_relative(content: Mapping[str, Any], source: str) -> Opened:
+    """A calibration without coordinates: the robots alone, in the base that both share."""
+
+    def bare(key: str) -> Cell:
+        robot = robot_from_dict(content.get(key, {}), f"{source}: {key}")
+        return Cell(robot, np.eye(4), (), np.zeros((0, 3)))
+
+    rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, bare("robot")))
+    return Opened(source, rungs, 1, placed=False)
+
+
+def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
+    """A diagnosis: nominal, geometric, then with each effect."""
+    rungs = rungs_of(content, source)
+    first = next(rung.cell for rung in rungs if rung.cell)
+    data, held, (geometric, final) = measured_poses(content, source, first, "geometric")
+    told = {GEOMETRIC: geometric, rungs[-1].name: final} if data.poses else {}
+    rungs = tuple(Rung(r.name, r.cell, told.get(r.name)) for r in rungs)
+    digest = str(content["provenance"]["data_sha256"])
+    return Opened(source, rungs, len(rungs) - 1, data, held, digest)
+
+
+def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:
+    """The rungs of a diagnosis' JSON; earlier versions kept the geometric and the last alone.
+
+    Raises CalibrationError, or one of `records.FAULTS`.
+    """
+    if listed := content.get("rungs"):
+        return tuple(
+            Rung(str(each["name"]), cell_from_dict(each, f"{source}: rungs[{i}]"))
+            for i, each in enumerate(listed)
+        )
+    cells = [
+        cell_from_dict(cell, f"{source}: cells[{i}]")
+        for i, cell in enumerate(content.get("cells", ()))
+    ]
+    if not cells:
+        raise CalibrationError(f"{source}: holds no arm; write it again with this version")
+    steps = [str(step["step"]) for step in content["gap"]["ladder"]]
+    names = (NOMINAL, GEOMETRIC, *(name for name in steps if name.startswith("+ ")))
+    told = {GEOMETRIC: cells[0], names[-1]: cells[-1]}
+    return tuple(Rung(name, told.get(name)) for name in names)
+
+
+# ---- the effects of a diagnosis, for a fit -----------------------------------------------------
+
+
+def listed_effects(given: object) -> tuple[str | Term, ...]:
+    """Effects by name, as terms, or those that a diagnosis (or its file) has established.
+
+    Raises CalibrationError.
+    """
+    if isinstance(given, str):
+        given = tuple(filter(None, given.replace(" ", "").split(",")))
+    several = given if isinstance(given, Sequence) else (given,)
+    out: list[str | Term] = []
+    for each in several:
+        if isinstance(each, Term) or (isinstance(each, str) and not each.endswith(".json")):
+            out.append(each)
+        elif isinstance(each, Path | str):
+            out += established(saved_content(each), str(each))
+        elif isinstance(each, Writes):
+            out += established(each.to_dict(), "the diagnosis")
+        else:
+            raise OptionError(f"effects {each!r}: name them, or give a diagnosis")
+    return tuple(out)
+
+
+def established(content: Mapping[str, Any], source: str) -> list[Term]:
+    """The effects that a diagnosis holds for established, with the variants that it chose.
+
+    Raises CalibrationError.
+    """
+    if content.get("kind") != "diagnosis":
+        raise OptionError(f"{source}: is no diagnosis, so that it names no effects")
+    with reading(source):
+        found = [
+            (str(effect["effect"]), str(effect["place"]))
+            for effect in content["effects"]
+            if effect.get("established", True) and effect["effect"] in EFFECTS
+        ]
+        last = rungs_of(content, source)[-1].cell
+        known = last.effects.terms if last else ()
+        return [
+            term
+            for name, where in found
+            for term in [t for t in known if (t.effect, t.place) == (name, where)]
+            or [Term(name, where)]
+        ]

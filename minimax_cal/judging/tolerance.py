@@ -1,0 +1,165 @@
+"""Whether an arm keeps a tolerance: by the upper 95 % limit of what is claimed, or not stated."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from minimax_cal.fitting.beyond import Beyond
+from minimax_cal.fitting.intervals import UNKNOWN, Interval, chance_of_larger
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.measuring.accuracy import Accuracy
+
+PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"
+CLAIMS = ("within", "beyond")
+KINDS = {"rms": "RMS", "max": "largest"}  # as people write it, and as they read it
+CHANCE = 0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
+FEWEST = math.ceil(1.0 / CHANCE - 1.0)  # poses: `chance_of_larger` is then small enough
+LIMIT = re.compile(r"\s*(rms|max)\s*[:=<]?\s*([0-9.eE+-]+)\s*(mm)?\s*", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What is required.  kind: rms or max.  size_mm: of the error of a position."""
+
+    kind: str
+    size_mm: float
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A value and its upper 95 % limit, NaN where it is not known [mm]."""
+
+    value: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is claimed of poses that no fit has seen.
+
+    name: within or beyond.  before: of the nominal arm [mm], by kind.  poses: that count by
+    themselves.  where: in words.  reason: why there is no claim, if there is none.
+    """
+
+    name: str
+    rms: Bound
+    largest: Bound
+    poses: int
+    where: str
+    before: tuple[float, float] = (math.nan, math.nan)
+    reason: str = ""
+
+    def bound(self, kind: str) -> Bound:
+        """Of rms or max."""
+        return self.rms if kind == "rms" else self.largest
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One requirement against a claim.  verdict: one of the three; why: a clause."""
+
+    limit: Limit
+    bound: Bound
+    verdict: str
+    why: str
+
+    @property
+    def plain(self) -> bool:
+        """Whether the numbers alone say why."""
+        return self.verdict == PASSED or self.bound.value > self.limit.size_mm
+
+    def sentence(self) -> str:
+        """For a terminal."""
+        kind = {"rms": "RMS", "max": "Largest"}[self.limit.kind]
+        return f"{kind} error at most {self.limit.size_mm:g} mm: {self.verdict} ({self.why})"
+
+
+def limits_of(text: str) -> tuple[Limit, ...]:
+    """Requirements as ``rms 0.2, max 0.5`` in millimetres.  Raises OptionError."""
+    out = []
+    for part in filter(str.strip, text.split(",")):
+        found = LIMIT.fullmatch(part)
+        try:
+            size = float(found[2]) if found else math.nan
+        except ValueError:
+            size = math.nan
+        if not (found and 0.0 < size < math.inf):
+            raise OptionError(f"tolerance {text!r}: write it in mm as rms 0.2, max 0.5")
+        out.append(Limit(found[1].lower(), size))
+    if len({limit.kind for limit in out}) < len(out):
+        raise OptionError(f"tolerance {text!r}: names rms or max twice")
+    return tuple(out)
+
+
+def within(
+    name: str,
+    before: Accuracy,
+    after: Accuracy,
+    intervals: tuple[Interval, Interval] = (UNKNOWN, UNKNOWN),
+    poses: int | None = None,
+) -> Claim:
+    """The claim for poses between the measured ones.  name: of these poses, in words."""
+    rms, largest = intervals
+    return Claim(
+        "within",
+        Bound(after.rms_mm, 1e3 * rms.high),
+        Bound(after.max_mm, 1e3 * largest.high),
+        after.poses if poses is None else poses,
+        name,
+        (before.rms_mm, before.max_mm),
+        "" if after.poses else "no pose was held out",
+    )
+
+
+def beyond(found: Beyond) -> Claim:
+    """The claim for poses away from the measured ones, of the worst part that was left out."""
+    worst = found.worst
+    if worst is None:
+        nothing = Bound(math.nan, math.nan)
+        return Claim("beyond", nothing, nothing, 0, "", reason=found.reason)
+    largest = max(fold.max_mm for fold in found.folds)
+    return Claim(
+        "beyond",
+        Bound(worst.rms_mm, found.rms_high_mm),
+        Bound(largest, found.max_high_mm),
+        worst.poses,
+        f"beyond the measured poses, in the worst part that was left out ({worst.where}, "
+        f"{worst.poses} poses)",
+    )
+
+
+def judge(limit: Limit, claim: Claim) -> Judgement:
+    """A requirement against a claim.
+
+    What was seen above the limit is not passed, however few the poses are.
+    """
+    bound = claim.bound(limit.kind)
+
+    def told(verdict: str, why: str) -> Judgement:
+        return Judgement(limit, bound, verdict, why)
+
+    if claim.reason:
+        return told(NOT_STATED, claim.reason)
+    if bound.value > limit.size_mm:
+        return told(NOT_PASSED, f"{bound.value:.3f} mm was seen")
+    if limit.kind == "max" and chance_of_larger(claim.poses) > CHANCE:
+        return told(
+            NOT_STATED,
+            f"{claim.poses} poses are too few for a maximum: at least {FEWEST} are needed",
+        )
+    if math.isnan(bound.high):
+        return told(NOT_STATED, "no 95 % limit is known")
+    seen = f"{bound.value:.3f} mm seen, 95 % limit {bound.high:.3f} mm"
+    if bound.high < limit.size_mm:
+        return told(PASSED, seen)
+    return told(NOT_PASSED, f"{seen}: more poses may narrow it")
+
+
+def overall(judged: tuple[Judgement, ...]) -> str:
+    """Of all requirements together."""
+    verdicts = [one.verdict for one in judged]
+    if NOT_PASSED in verdicts:
+        return NOT_PASSED
+    return PASSED if verdicts and set(verdicts) == {PASSED} else NOT_STATED

@@ -1,0 +1,63 @@
+"""What the customer wants to read of a cell: serial number, tool, instrument ... from a TOML."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import read_text
+from minimax_cal.ground.words import visible
+from minimax_cal.measuring.measurements import Measurements
+
+FACTS = {  # key of the TOML: as the page calls it
+    "serial_number": "Serial number",
+    "controller": "Controller",
+    "tool": "Tool",
+    "payload": "Payload",
+    "temperature": "Temperature",
+    "instrument": "Instrument",
+    "certificate": "Certificate of the instrument",
+    "place": "Place",
+    "validity": "Valid until",
+}
+WORDS = ("title", "customer", "author", "date")  # these may stand there too
+MEASURED = {"payload": ("payload", "kg"), "temperature": ("temperature", "°C")}
+
+
+def read_facts(path: Path | str) -> dict[str, str]:
+    """The facts of a TOML file by their keys.  Raises OptionError."""
+    text = read_text(path, kind=OptionError)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise OptionError(f"{path}: is not TOML ({error})") from error
+    known = (*FACTS, *WORDS)
+    for key, value in content.items():
+        if key not in known:
+            near = get_close_matches(key, known, 1)
+            hint = f"; {near[0]} is meant?" if near else f"; choose {', '.join(known)}"
+            raise OptionError(f"{path}: the key {visible(key)!r} is not known{hint}")
+        if isinstance(value, dict | list):
+            raise OptionError(f"{path}: {key} must be a text or a number")
+    return {key: visible(str(value)) for key, value in content.items()}
+
+
+def told_facts(given: Mapping[str, str], data: Measurements | None) -> tuple[tuple[str, str], ...]:
+    """Label and text of every fact; measured ones from their columns; empty to be filled in."""
+    measured = {key: span(data, *column) for key, column in MEASURED.items()} if data else {}
+    return tuple((label, given.get(key) or measured.get(key, "")) for key, label in FACTS.items())
+
+
+def span(data: Measurements, stem: str, unit: str) -> str:
+    """The range of a column, empty where nobody measured it."""
+    column = np.asarray(data.columns.get(stem, np.zeros(0)), dtype=float)
+    known = column[np.isfinite(column)]
+    if not known.size:
+        return ""
+    low, high = f"{known.min():.3g}", f"{known.max():.3g}"
+    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"

@@ -1,0 +1,261 @@
+"""The page to sign: requirement, result, verdict, what limits it; one final number."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.diagnosing.result import Diagnosis, Finding
+from minimax_cal.fitting.beyond import Beyond
+from minimax_cal.fitting.crossed import intervals_of
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.judging.tolerance import (
+    KINDS,
+    NOT_PASSED,
+    PASSED,
+    Claim,
+    Judgement,
+    Limit,
+    beyond,
+    judge,
+    overall,
+    within,
+)
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.cell import Cell as Arm
+from minimax_cal.reporting.html.content import Block, Note, text
+from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
+
+NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
+NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
+
+
+@dataclass(frozen=True)
+class Signed:
+    """The judgement of a report.  claims: within, then beyond where there is one."""
+
+    model: str
+    claims: tuple[Claim, ...]
+    judged: tuple[Judgement, ...]
+
+    @property
+    def verdict(self) -> str:
+        """passed, not passed or not stated; empty without a requirement."""
+        return overall(self.judged) if self.judged else ""
+
+    def lines(self) -> list[str]:
+        """For a terminal."""
+        return [self.verdict, *(one.sentence() for one in self.judged)] if self.judged else []
+
+
+def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | None) -> Signed:
+    """The claims of a result, and the requirements against the one that is named.
+
+    which: within or beyond.  rung: of a diagnosis.  Raises OptionError.
+    """
+    if rung is not None and not (sources.gap and not sources.fit):
+        raise OptionError("rung: only a report of a diagnosis alone has rungs")
+    if sources.fit:
+        model, claims = model_of(sources.fit), claims_of(sources.fit)
+    elif sources.gap:
+        model, claims = claims_at(sources.gap, rung)
+    else:
+        model, claims = "calibration without coordinates", (claim_of_parts(sources),)
+    chosen = next((claim for claim in claims if claim.name == which), None)
+    if chosen is None:
+        chosen = beyond(Beyond(reason="this result makes no such claim"))
+    return Signed(model, claims, tuple(judge(limit, chosen) for limit in limits))
+
+
+def model_of(fit: Fit) -> str:
+    """What the calibration holds, in words."""
+    return with_effects(fit.cell)
+
+
+def with_effects(cell: Arm) -> str:
+    """Geometry and the kinds of effects of an arm."""
+    terms = dict.fromkeys(term.effect.replace("_", " ") for term in cell.effects.terms)
+    return f"geometry, {', '.join(terms)}" if terms else "geometry alone"
+
+
+def claims_of(fit: Fit) -> tuple[Claim, ...]:
+    """Of a calibration."""
+    seen = fit.within
+    held = fit.accuracy["holdout"].poses > 0 or bool(fit.error_crossed.size)
+    inside = within(seen.where, seen.before, seen.after, (seen.rms, seen.largest), seen.poses)
+    if not held:
+        inside = Claim("within", inside.rms, inside.largest, 0, seen.where, inside.before,
+                       "no pose was held out, and training errors are too small")  # fmt: skip
+    return inside, beyond(fit.beyond)
+
+
+def claims_at(gap: Diagnosis, rung: int | None) -> tuple[str, tuple[Claim, ...]]:
+    """Name and claim of a rung of a diagnosis.  Raises OptionError."""
+    rungs = gap.rungs()
+    last = len(rungs) - 1
+    if rung is not None and not 0 <= rung <= last:
+        names = ", ".join(f"{i} ({name})" for i, (name, _) in enumerate(rungs)) or "the last alone"
+        raise OptionError(f"the diagnosis has no rung {rung}; it has {names}")
+    at = last if rung is None else rung
+    step = gap.ladder[0] if rungs and at == 0 else gap.ladder[len(gap.ladder) - 1 - (last - at)]
+    if rungs and gap.data.poses:
+        error = rungs[at][1].error(with_history(gap.data))[:, gap.held]
+    else:
+        error = gap.errors[1][:, gap.held] if gap.data.poses else np.zeros((1, 0, 3))
+    group = clusters(gap.data)[gap.held] if error.shape[1] else np.zeros(0)
+    ends = intervals_of(error, group, 0)
+    where = f"{step.holdout.poses} poses that were not used for the fit"
+    poses = len(np.unique(group)) or step.holdout.poses
+    plain = {"nominal": "the nominal robot", "geometric": "geometry alone"}
+    model = plain.get(step.name) or with_effects(rungs[at][1] if rungs else gap.cells[-1])
+    claims = [within(where, gap.ladder[0].holdout, step.holdout, ends, poses)]
+    if at == last:
+        claims.append(beyond(gap.beyond))
+    return model, tuple(claims)
+
+
+def claim_of_parts(sources: Sources) -> Claim:
+    """Of a calibration without coordinates, whose errors are not those of positions."""
+    told = sources.relative
+    if told is None:
+        raise CalibrationError("a report needs a result")
+    before, after, where = told.before_and_after()
+    claim = within(where, before, after)
+    if told.kind == "poses":
+        return claim
+    return Claim(claim.name, claim.rms, claim.largest, claim.poses, where, claim.before,
+                 f"errors of {told.kind} are not errors of position")  # fmt: skip
+
+
+# ---- what stands on the page -------------------------------------------------------------------
+
+
+def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
+    """Verdict, table, and a few lines."""
+    kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
+    banner = found.verdict[:1].upper() + found.verdict[1:] if found.verdict else NO_LIMIT
+    lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
+    lines += [result_table(sources, found), text(basis(found))]
+    lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
+    if limiting := limits_now(sources, found):
+        lines.append(text(f"What limits it now: {limiting}"))
+    lines += [text(which) for which in which_is_which(sources, found)]
+    lines += [Note(notice, "warning") for notice in sources.notices]
+    lines += fit_warnings(sources.fit) if sources.fit else ()
+    lines += trouble(sources.gap.status, "") if sources.gap and not sources.fit else ()
+    return tuple(lines)
+
+
+def result_table(sources: Sources, found: Signed) -> Table:
+    """Before, result, its 95 % limit, what is required, verdict."""
+    named = {(one.bound, one.limit.kind): one for one in found.judged}
+    rows: list[tuple[Cell, ...]] = []
+    for claim in found.claims:
+        if claim.name == "beyond" and claim.reason:
+            continue
+        title = "within measured poses" if claim.name == "within" else "beyond, worst part"
+        for i, kind in enumerate(KINDS):
+            bound = claim.bound(kind)
+            one = named.get((bound, kind))
+            asked = one.limit.size_mm if one else math.nan
+            rows.append((f"{KINDS[kind]}, {title}", claim.before[i], bound.value, bound.high, asked,
+                         one.verdict if one else ""))  # fmt: skip
+    rows += iso_rows(sources.fit) if sources.fit else ()
+    header = ("error of position", "before mm", "result mm", "95 % limit mm", "required mm",
+              "verdict")  # fmt: skip
+    return Table(f"Model: {found.model}", header, tuple(rows), ("", *[".3f"] * 3, ".3g", ""))
+
+
+def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
+    """Mean and largest AP of held-out poses by the formulas of ISO 9283, where they can be had."""
+    from minimax_cal.judging.standard import iso9283
+
+    try:
+        values = iso9283(fit).parts["holdout"].values
+    except (CalibrationError, KeyError):
+        return []
+    sizes = [1e3 * np.linalg.norm(values[key].position, axis=1) for key in ("before", "after")]
+    if not all(np.isfinite(size).any() for size in sizes):
+        return []
+    return [
+        (f"AP of ISO 9283, {name}", *(float(take(size)) for size in sizes), math.nan,
+         math.nan, "")
+        for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
+    ]  # fmt: skip
+
+
+def basis(found: Signed) -> str:
+    """What the numbers rest on."""
+    inside = found.claims[0]
+    out = f"Within the measured poses: on {inside.where}. "
+    away = found.claims[1] if len(found.claims) > 1 else None
+    if away and not away.reason:
+        out += f"Beyond: {away.where.removeprefix('beyond the measured poses, in ')}. "
+    elif away:
+        out += f"Beyond them nothing is claimed: {away.reason}. "
+    return out + (
+        "The 95 % limits are upper ends: of the RMS over such poses, and of the largest error of "
+        "as many new ones."
+    )
+
+
+def limits_now(sources: Sources, found: Signed) -> str:
+    """The one thing that keeps the error from being smaller; empty where nobody knows."""
+    left = found.claims[0].rms.value
+    if sources.gap:
+        lacking = [f for f in established(sources.gap) if not holds(sources, f)]
+        if lacking:
+            return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
+        floor = sources.gap.floor
+        alone = f"{'' if floor.certain else 'at most '}{number(floor.value)}"
+        if left <= NEAR_NOISE * floor.value:
+            return f"the noise of the measurements, which alone leaves {alone}."
+        return f"a remainder that no known effect explains; noise alone would leave {alone}."
+    if sources.fit:
+        few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
+        if few:
+            return few[0].removeprefix("too few poses: ") + "."
+        return (
+            f"what {model_of(sources.fit)} leaves, {number(left)} RMS; a diagnosis of the same "
+            "measurements tells its cause."
+        )
+    return ""
+
+
+def established(gap: Diagnosis) -> list[Finding]:
+    """The effects that the diagnosis holds for established, the largest first."""
+    return [f for f in gap.findings if getattr(f, "established", True) and not f.rows]
+
+
+def holds(sources: Sources, finding: Finding) -> bool:
+    """Whether the model that is signed has an effect."""
+    if sources.fit is None:
+        return True
+    return finding.term.effect in {term.effect for term in sources.fit.cell.effects.terms}
+
+
+def said_of(findings: list[Finding]) -> str:
+    """Causes in words, at most three."""
+    named = [f"{f.cause} ({f.term.effect.replace('_', ' ')} {f.at})" for f in findings[:3]]
+    more = f" and {len(findings) - 3} more" if len(findings) > 3 else ""
+    return ", ".join(named) + more
+
+
+def which_is_which(sources: Sources, found: Signed) -> list[str]:
+    """Where fit and diagnosis hold different models: which one is signed."""
+    if not (sources.fit and sources.gap):
+        return []
+    last, _ = claims_at(sources.gap, None)
+    if all(holds(sources, f) for f in established(sources.gap)):
+        return []
+    final = sources.gap.ladder[-1].holdout.rms_mm
+    return [
+        f"Signed is the calibration ({found.model}). The diagnosis in the appendix ends with "
+        f"another model ({last}), of {number(final)} RMS on its held-out poses."
+    ]

@@ -1,0 +1,85 @@
+"""Stages with count and time left; a line now and then without a terminal; files by ending."""
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from minimax_cal.cli import progress
+from minimax_cal.cli.progress import Stages, clock, stages
+
+
+class Hands:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.at = 100.0
+
+    def __call__(self) -> float:
+        return self.at
+
+
+def test_time_left_is_that_of_the_steps_so_far() -> None:
+    now = Hands()
+    told = Stages(now)
+    assert told.line("geometry") == "geometry (0 s)"
+    now.at += 60.0
+    assert told.line("replicate 1 of 10") == "replicate 1 of 10 (1 min 0 s)"
+    now.at += 4.0  # two steps took four seconds, eight are left
+    assert told.line("replicate 3 of 10") == "replicate 3 of 10 (1 min 4 s, 16 s left)"
+    now.at += 10.0
+    assert (
+        told.line("part 1 of 3 left out: joint 2") == "part 1 of 3 left out: joint 2 (1 min 14 s)"
+    )
+    assert clock(125.4) == "2 min 5 s"
+
+
+def test_a_line_after_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = Hands()
+    monkeypatch.setattr(progress.time, "monotonic", now)
+    monkeypatch.setattr(Stages.__init__, "__defaults__", (now,))
+    with stages(quiet=False) as show:
+        for text in ("start", "geometry", "effects", "ladder"):
+            now.at += 6.0
+            show(text)
+    assert capsys.readouterr().err.splitlines() == [
+        "progress: geometry (12 s)",
+        "progress: ladder (24 s)",
+    ]
+    with stages(quiet=True) as show:
+        now.at += 60.0
+        show("start")
+    assert capsys.readouterr().err == ""
+
+
+def test_files_by_their_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = mc.load_robot("ur10")
+    mc.write_measurements(tmp_path / "poses.csv", mc.simulate(robot, 60, 3, seed=1).data)
+    command = ("calibrate", "ur10", tmp_path / "poses.csv", "--objective", "sum")
+    assert run(*command, "-o", tmp_path / "errors.svg") == 0
+    assert f"written: {tmp_path / 'errors.svg'}" in capsys.readouterr().err
+    assert b"<svg" in (tmp_path / "errors.svg").read_bytes()
+    assert run(*command, "-o", tmp_path / "fit.json", "-q") == 0
+    assert "written" not in capsys.readouterr().err
+    for name, start in (("map.json", "{"), ("map.svg", "<?xml")):
+        assert run("map", tmp_path / "fit.json", "--bins", 8, "-o", tmp_path / name) == 0
+        assert (tmp_path / name).read_text().startswith(start)
+    assert json.loads((tmp_path / "map.json").read_text())
+    capsys.readouterr()
+    assert run("evaluate", tmp_path / "fit.json", tmp_path / "poses.csv", "-o",
+               tmp_path / "a.png") == 2  # fmt: skip
+    assert "this command draws no picture; write a .json" in capsys.readouterr().err
+
+
+def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("calibrate", "--help") == 0
+    out = capsys.readouterr().out
+    titles = ("What is fitted:", "How it is solved:", "What is held out:",
+              "Points that stand out:", "Measurements and result:")  # fmt: skip
+    places = [out.index(title) for title in titles]
+    assert places == sorted(places)
+    assert out.index("--cv") > out.index("What is held out:")

@@ -1,0 +1,148 @@
+"""The page to sign: which number, which verdict, what limits it; facts from a TOML."""
+
+from pathlib import Path
+
+import pytest
+from conftest import run
+from test_report import WORDING, Seen, results
+
+import minimax_cal as mc
+from minimax_cal.judging.tolerance import limits_of
+from minimax_cal.reporting.html import compose, page, read_sources
+from minimax_cal.reporting.html.document import Wording
+from minimax_cal.reporting.html.facts import FACTS
+
+__all__ = ["results"]  # the fixture
+
+
+@pytest.fixture(scope="module")
+def whole(results: Path) -> Path:
+    """The calibration with the effects of the diagnosis."""
+    path = results / "whole.json"
+    mc.calibrate("ur10", results / "poses.csv", effects=results / "gap.json").save(path)
+    return path
+
+
+def rendered(wording: Wording, *paths: Path) -> Seen:
+    return Seen(page.render(compose(read_sources(paths), wording)))
+
+
+def rows(seen: Seen) -> dict[str, list[str]]:
+    """The table of the result by its first cells."""
+    return {row[0]: row[1:] for title, found in seen.tables.items() if title.startswith("Model: ")
+            for row in found}  # fmt: skip
+
+
+def test_requirement_result_and_verdict(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit, out = mc.load_fit(whole), tmp_path / "report.html"
+    high = 1e3 * fit.within.rms.high
+    for size, verdict in ((1.1 * high, "passed"), (0.5 * fit.within.after.rms_mm, "not passed")):
+        told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out)
+        assert run(*told) == 0
+        stdout, stderr = capsys.readouterr()
+        assert stdout.splitlines()[0] == verdict
+        assert f"written: {out}" in stderr
+        seen = Seen(out.read_text())
+        before, after, limit, asked, said = rows(seen)["RMS, within measured poses"]
+        assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
+                                   f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
+        assert (limit, asked, said) == (f"{high:.3f}", f"{size:.3g}", verdict)
+        assert verdict.capitalize() in seen.text["verdict"]
+
+
+def test_beyond_is_asked_of_the_worst_part(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit = mc.load_fit(whole)
+    out = tmp_path / "report.html"
+    size = 0.5 * (fit.within.rms.high * 1e3 + fit.beyond.rms_high_mm)
+    assert 1e3 * fit.within.rms.high < size < fit.beyond.rms_high_mm
+    told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out, "-q")
+    assert run(*told) == 0
+    assert capsys.readouterr().out.startswith("passed")
+    assert run(*told, "--tolerance-for", "beyond") == 0
+    assert capsys.readouterr().out.startswith("not passed")
+    assert rows(Seen(out.read_text()))["RMS, beyond, worst part"][-1] == "not passed"
+    assert run(*told, "--tolerance-for", "above") == 2
+    assert "choose within or beyond" in capsys.readouterr().err
+
+
+def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None:
+    plain = rendered(WORDING, results / "fit.json", results / "gap.json")
+    assert any(title == "Model: geometry alone" for title in plain.tables)
+    text = plain.text["verdict"]
+    assert "Signed is the calibration (geometry alone)" in text
+    assert "What limits it now: gearboxes wind up under gravity" in text
+    both = rendered(WORDING, whole, results / "gap.json")
+    assert any(title == "Model: geometry, joint compliance" for title in both.tables)
+    assert "Signed is the calibration" not in both.text["verdict"]
+    assert "What limits it now: the noise of the measurements" in both.text["verdict"]
+    # parameters of effects stand once: with the fit if it has them
+    assert "parameters of the effects" in plain.tables
+    assert "parameters of the effects" not in both.tables
+    assert "effects beyond geometry" in both.tables
+
+
+def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
+    gap = mc.Diagnosis.from_dict(mc.diagnose("ur10", results / "poses.csv").to_dict())
+    for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
+        wording = Wording("2026-11-21", rung=number)
+        found = rows(rendered(wording, results / "gap.json"))["RMS, within measured poses"]
+        assert found[1] == f"{step.holdout.rms_mm:.3f}"
+    with pytest.raises(mc.OptionError, match="no rung 7"):
+        mc.report(gap, tmp_path / "a.html", rung=7)
+    with pytest.raises(mc.OptionError, match="only a report of a diagnosis alone has rungs"):
+        mc.report(results / "fit.json", tmp_path / "a.html", rung=1)
+
+
+def test_too_few_poses_leave_a_maximum_open(robot: mc.Robot, tmp_path: Path) -> None:
+    """Nine held-out poses, and none in turn: the file of an earlier version."""
+    fit = mc.calibrate(robot, mc.simulate(robot, 45, 3, seed=2).data, "sum")
+    content = fit.to_dict()
+    del content["arrays"], content["accuracy"]["cv"]
+    mc.Fit.from_dict(content).save(tmp_path / "old.json")
+    wording = Wording("2026-11-21", limits=limits_of("max 5"))
+    text = rendered(wording, tmp_path / "old.json").text["verdict"]
+    assert "Not stated" in text
+    assert "9 poses are too few for a maximum: at least 19 are needed" in text
+
+
+def test_facts_are_of_the_file_or_to_be_filled_in(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toml, out = tmp_path / "cell.toml", tmp_path / "report.html"
+    toml.write_text('serial_number = "26-104711"\npayload = 12\ncustomer = "<b>Example</b>"\n')
+    assert run("report", results / "fit.json", "--facts", toml, "-o", out) == 0
+    text = out.read_text()
+    assert "<dd>26-104711</dd>" in text
+    assert "<dd>12</dd>" in text
+    assert "&lt;b&gt;Example&lt;/b&gt;" in text
+    assert text.count('class="blank"') == len(FACTS) - 2
+    for content, words in (
+        ('serial = "1"', "the key 'serial' is not known"),
+        ("serial_number = ", "is not TOML"),
+        ("[tool]\na = 1", "tool must be a text or a number"),
+    ):
+        toml.write_text(content)
+        assert run("report", results / "fit.json", "--facts", toml, "-o", out) == 2
+        assert words in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def browser() -> None:
+    from minimax_cal.ground.errors import CalibrationError
+    from minimax_cal.reporting.html import find_browser
+
+    try:
+        find_browser()
+    except CalibrationError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.usefixtures("browser")
+def test_paper_and_picture_by_the_ending(results: Path, tmp_path: Path) -> None:
+    for name, start in (("page.pdf", b"%PDF"), ("page.png", b"\x89PNG")):
+        assert run("report", results / "fit.json", "-o", tmp_path / name) == 0
+        assert (tmp_path / name).read_bytes().startswith(start)
