@@ -349,7 +349,7 @@ def test_a_deserted_cluster_is_not_waited_for(
     jobs = [Job(seed, str(log), 0.3) for seed in range(100)]
 
     def end() -> None:
-        wait_for(log.exists)
+        wait_for(lambda: any(tmp_path.glob("deserted/*.part")))
         running[dead == "worker"].kill()
 
     with ThreadPoolExecutor(1) as other:

@@ -38,14 +38,6 @@ def save(figure: Figure, path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.text import Text
 
-    for words in figure.findobj(Text):
-        words.set_parse_math(False)  # a name may hold a dollar sign
-    figure.draw_without_rendering()  # makes the ticks, which hold powers
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            for tick in (*axis.majorTicks, *axis.minorTicks):
-                tick.label1.set_parse_math(True)
-                tick.label2.set_parse_math(True)
     kind = path.suffix.lower().lstrip(".")
     stream = io.BytesIO()
     stamp = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": None}[kind]
@@ -55,6 +47,14 @@ def save(figure: Figure, path: Path) -> None:
     ):
         # labels of huge numbers leave no room for the axes: nothing that a user could mend
         filterwarnings("ignore", "constrained_layout not applied", UserWarning)
+        for words in figure.findobj(Text):
+            words.set_parse_math(False)  # a name may hold a dollar sign
+        figure.draw_without_rendering()  # makes the ticks, which hold powers
+        for axes in figure.axes:
+            for axis in (axes.xaxis, axes.yaxis):
+                for tick in (*axis.majorTicks, *axis.minorTicks):
+                    tick.label1.set_parse_math(True)
+                    tick.label2.set_parse_math(True)
         figure.savefig(stream, format=kind, dpi=150, metadata=stamp)
     write_whole(path, stream.getvalue())
 
