@@ -358,6 +358,7 @@ def assembled(
     after: Array,
 ) -> Fit:
     """The fit from what was read.  Raises one of FAULTS."""
+    check_settings(part.provenance.settings)
     known = uncertainty_of(content, source, cell, arrays)
     parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
     train = data.take(~held)
@@ -393,6 +394,15 @@ def assembled(
         stated=intervals_of(part, arrays),
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
     )
+
+
+def check_settings(settings: Mapping[str, object]) -> None:
+    """Raise ValueError for settings that later work rests on and cannot."""
+    seed, by = settings.get("seed", 0), settings.get("holdout_by")
+    if not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"provenance.settings.seed: {seed!r} is no seed")
+    if not isinstance(by, str | None):
+        raise ValueError(f"provenance.settings.holdout_by: {by!r} is no column")
 
 
 def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:

@@ -42,7 +42,7 @@ def test_cells_of_a_diagnosis_are_of_one_arm(
     """The page drew the last one at the joints of the first."""
 
     def shorter(content: Any) -> None:
-        del content["cells"][-1]["robot"]["joints"][2]
+        del content["rungs"][-1]["robot"]["joints"][2]
 
     path = broken(tmp_path, "diagnosis.json", shorter)
     assert "its cells are not of one arm" in refused(capsys, "report", path)

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.job import job_of, origins
+from minimax_cal.fitting.opened import open_result
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.robots.gravity import tubes
@@ -76,7 +77,7 @@ def cell_with(robot: mc.Robot, *texts: str, size: float = 2e-6, **values: list[f
 
 
 def model_of(cell: Cell) -> Any:
-    text = write(job_of(cell, "fit")).content.decode()
+    text = write(job_of(open_result(cell))).content.decode()
     return mujoco.MjModel.from_xml_string(text)
 
 
@@ -215,7 +216,7 @@ def test_what_changes_with_time_is_named() -> None:
     data = replace(data, columns={**data.columns, "clock": np.linspace(0.0, 1.0, data.poses)})
     drift = terms(cell.scene(data), ["frame_drift:frame:constant=0.5"])
     cell = replace(cell, effects=Fitted(drift, (np.full(6, 1e-4),)))
-    made = write(job_of(cell, "fit"))
+    made = write(job_of(open_result(cell)))
     assert any("frame_drift" in text and "time" in text for text in made.notices)
     assert not made.beside
 
