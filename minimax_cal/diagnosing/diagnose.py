@@ -23,6 +23,7 @@ from minimax_cal.diagnosing.gap import (
     valued,
     with_shares,
 )
+from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
@@ -42,7 +43,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
-from minimax_cal.measuring.floor import floor_of
+from minimax_cal.measuring.floor import Floor, floor_of
 from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -138,12 +139,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     progress("gap ladder")
     ladder = climbed(study, [finding.terms for finding in causes.effects])
     steps = steps_of(asked, study, judges, causes, ladder)
-    floor = floor_of(
-        clean.data,
-        ladder.last.cell.error(clean.data),
-        robot.repeatability,
-        min(noise_mm(study.rows, noise), ladder.last.train.rms_mm),
-    )
+    floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
     effects = valued(causes.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
@@ -187,6 +183,12 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
     )
+
+
+def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:
+    """What noise alone would leave beneath the last rung.  noise: as the fit tells it [mm]."""
+    most = min(noise, last.train.rms_mm)
+    return floor_of(data, last.cell.error(data), robot.repeatability, most)
 
 
 def steps_of(

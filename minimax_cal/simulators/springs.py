@@ -8,7 +8,7 @@ What geometry, base and targets can take over does not count; they change with t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -83,15 +83,10 @@ def springs_of(
     fields = 1e3 * np.array([per_moment(scene, *kind) for kind in kinds])
     fields = fields.reshape(len(kinds), 4 * scene.joints, wanted.size)[..., seen]
     right = 1e3 * (wanted + left).reshape(-1)[seen]
-    columns = 1e3 * geometry.reshape(wanted.size, -1)[seen]
-    count = columns.shape[1]
-    for term in firm:
-        more = np.moveaxis(term.columns(scene).displacement(scene), 0, -1)
-        columns = np.hstack([columns, 1e3 * more.reshape(wanted.size, -1)[seen]])
-    tool = columns.shape[1]
-    if any(term.effect == "tool_flex" for term in laws.terms):
-        more = tool_columns(scene).reshape(wanted.size, -1)
-        columns = np.hstack([columns, 1e3 * more[seen]])
+    parts = [1e3 * part.reshape(wanted.size, -1)[seen]
+             for part in beside(scene, laws, geometry, firm)]  # fmt: skip
+    columns, count = np.hstack(parts), parts[0].shape[1]
+    tool = count + sum(part.shape[1] for part in parts[1 : 1 + len(firm)])
     u, size, back = np.linalg.svd(columns, full_matrices=False)
     kept = size > RESOLVED * size[0]
     u, inverse = u[:, kept], (back[kept].T / size[kept]) @ u[:, kept].T
@@ -124,6 +119,15 @@ def springs_of(
         firm=change[count:tool],
         remainder=1e-3 * float(np.sqrt((rest**2).sum() / points)),
     )
+
+
+def beside(scene: Scene, laws: Fitted, geometry: Array, firm: Sequence[Term]) -> Iterator[Array]:
+    """Motions (k, 3, m, d) of what is fitted with the springs: geometry, firm effects, the tool."""
+    yield geometry
+    for term in firm:
+        yield np.moveaxis(term.columns(scene).displacement(scene), 0, -1)
+    if any(term.effect == "tool_flex" for term in laws.terms):
+        yield tool_columns(scene)
 
 
 def places_of(scene: Scene, laws: Fitted) -> list[tuple[str, int]]:
