@@ -70,7 +70,9 @@ def test_wheel_and_sdist_are_whole(built: list[Path]) -> None:
     assert done.returncode == 0, done.stdout
     wheel = zipfile.ZipFile(next(path for path in built if path.suffix == ".whl")).namelist()
     for folder in ("minimax_cal", "qp_backends"):
-        here = [path for path in (ROOT / folder).rglob("*") if path.is_file()]
+        here = [
+            p for p in (ROOT / folder).rglob("*") if p.is_file() and "__pycache__" not in p.parts
+        ]
         wanted = {str(p.relative_to(ROOT)) for p in here if p.suffix not in (".pyc", ".md")}
         assert wanted <= set(wheel)
     assert not [name for name in wheel if name.startswith(("tests", "experiments", "docs"))]
@@ -98,12 +100,15 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("backends")
     run("--version")
     for command, extra in (
-        (("calibrate", "irb120", "poses.csv", "--figure", "a.png"), "minimax-cal[plot]"),
-        (("map", "fit.json", "-o", "a.png"), "minimax-cal[plot]"),
-        (("report", "fit.json", "-o", "a.html"), "minimax-cal[report]"),
+        (("calibrate", "irb120", "poses.csv", "--figure", "a.png"), "[plot]"),
+        (("map", "fit.json", "-o", "a.png"), "[plot]"),
+        (("report", "fit.json", "-o", "a.html"), "[report]"),
+        (("export", "fit.json", "--to", "mjcf", "-o", "arm.xml"), "[mujoco]"),
     ):
         ended = run(*command, code=2)
-        (line,) = ended.stderr.splitlines()
-        assert f"pip install {extra}" in line
+        line = ended.stderr.strip()
+        assert "\n" not in line, ended.stderr
+        assert "pip install" in line
+        assert extra in line
     missing = run("calibrate", "irb120", "poses.csv", "--qp", "piqp").stderr
     assert "pip install minimax-cal[piqp]; daqp is used" in missing

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
+from importlib.util import find_spec
 from inspect import signature
 from math import inf, isnan
 from pathlib import Path
@@ -311,9 +312,11 @@ def writable(*paths: Path | None) -> None:
 def drawable(path: Path | None) -> None:
     """Raise an error, before any work, for a picture that cannot be drawn."""
     if path:
-        from minimax_cal.reporting.plots.figures import PICTURES
+        from minimax_cal.reporting.plots.figures import NEEDED, PICTURES
 
         check_writable(path, PICTURES)
+        if find_spec("matplotlib") is None:
+            raise OptionError(NEEDED)
 
 
 def exit_code(status: Status) -> int:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PICTURES = (".png", ".svg", ".pdf")
 BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Okabe and Ito 2008]
+NEEDED = "a picture needs matplotlib: pip install '.[plot]' in a clone"
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -29,7 +30,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib import figure
     except ModuleNotFoundError as error:
-        raise OptionError("a picture needs matplotlib: pip install '.[plot]' in a clone") from error
+        raise OptionError(NEEDED) from error
     return figure.Figure(figsize=(width, height), layout="constrained")
 
 
