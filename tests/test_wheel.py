@@ -95,6 +95,7 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("tradeoff", "irb120", "poses.csv", "--steps", 1)
     run("plan", "irb120", "--poses", 8, "--candidates", 60, "-o", "next.csv")
     run("export", "fit.json", "--to", "urdf", "-o", "arm.urdf")
+    run("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
     run("effects")
     run("effects", "irb120", "poses.csv")
     run("backends")
@@ -103,7 +104,7 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
         (("calibrate", "irb120", "poses.csv", "--figure", "a.png"), "[plot]"),
         (("map", "fit.json", "-o", "a.png"), "[plot]"),
         (("report", "fit.json", "-o", "a.html"), "[report]"),
-        (("export", "fit.json", "--to", "mjcf", "-o", "arm.xml"), "[mujoco]"),
+        (("gap", "arm.xml", "poses.csv"), "mujoco"),
     ):
         ended = run(*command, code=2)
         line = ended.stderr.strip()
