@@ -249,7 +249,13 @@ def test_simulators_load_every_urdf(name: str) -> None:
         theirs.update_cfg(row)
         assert_allclose(theirs.get_transform("flange"), robot.pose(row), **EXACT)
     pinocchio = pytest.importorskip("pinocchio")
-    assert pinocchio.buildModelFromXML(text).nv == robot.joints
+    arm = pinocchio.buildModelFromXML(text)
+    assert arm.nv == robot.joints
+    held, tip = arm.createData(), arm.getFrameId("flange")
+    for row in q:  # a joint without limits is a unit circle there
+        place = pinocchio.integrate(arm, pinocchio.neutral(arm), row)
+        pinocchio.framesForwardKinematics(arm, held, place)
+        assert_allclose(held.oMf[tip].homogeneous, robot.pose(row), **EXACT)
 
 
 def fixed_tip(robot: mc.Robot) -> np.ndarray:
