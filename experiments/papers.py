@@ -16,6 +16,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
 import click
 
@@ -45,25 +47,24 @@ def own(study: Study, name: str) -> Study:
     return replace(study, name=name, out=study.out / name, json=None)
 
 
+def made_by(
+    module: ModuleType, judged: Callable[[Any], list[Verdict]]
+) -> Callable[[Study], list[Verdict]]:
+    """A study that finds (`study_of`) and saves, and the verdicts on what it found."""
+
+    def make(study: Study) -> list[Verdict]:
+        found = module.study_of(study)
+        module.save(study, found)
+        return judged(found)
+
+    return make
+
+
 def from_convergence(study: Study) -> list[Verdict]:
     """Paper S, Table 2 and Fig. 3."""
     rows, setting = convergence.study_of(study)
     convergence.save(study, rows, setting)
     return verdicts_s.table_2(rows)
-
-
-def from_courses(study: Study) -> list[Verdict]:
-    """Paper S, Fig. 4-7."""
-    found = courses.study_of(study)
-    courses.save(study, found)
-    return verdicts_s.courses(found)
-
-
-def from_any_base(study: Study) -> list[Verdict]:
-    """Paper S, with the tracker anywhere."""
-    found = any_base.study_of(study)
-    any_base.save(study, found)
-    return verdicts_s.anywhere(found)
 
 
 def from_conditions(study: Study) -> list[Verdict]:
@@ -89,20 +90,6 @@ def from_methods(study: Study) -> list[Verdict]:
     return verdicts_m.tables_1_4(found)
 
 
-def from_splits(study: Study) -> list[Verdict]:
-    """Paper M, minimax against the sum on many splits."""
-    found = splits.study_of(study)
-    splits.save(study, found)
-    return verdicts_m.many_splits(found)
-
-
-def from_measuring_loop(study: Study) -> list[Verdict]:
-    """Both papers' cells."""
-    found = measuring_loop.study_of(study)
-    measuring_loop.save(study, found)
-    return verdicts_m.measuring(found)
-
-
 def from_errata(study: Study) -> list[Verdict]:
     """Both papers as printed."""
     study.save([errata.table()], {})
@@ -118,12 +105,12 @@ def from_errata(study: Study) -> list[Verdict]:
 
 STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
     "convergence": from_convergence,
-    "courses": from_courses,
-    "any_base": from_any_base,
+    "courses": made_by(courses, verdicts_s.courses),
+    "any_base": made_by(any_base, verdicts_s.anywhere),
     "conditions": from_conditions,
     "methods": from_methods,
-    "splits": from_splits,
-    "measuring_loop": from_measuring_loop,
+    "splits": made_by(splits, verdicts_m.many_splits),
+    "measuring_loop": made_by(measuring_loop, verdicts_m.measuring),
     "errata": from_errata,
 }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,24 +16,10 @@ from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
-from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State
 
 
-@dataclass(frozen=True, eq=False)
-class Fold:
-    """What was found without some of the poses."""
-
-    effects: tuple[tuple[Term, ...], ...]
-    ladder: Ladder
-
-    @property
-    def taken(self) -> tuple[tuple[Term, ...], ...]:
-        """The effects that its ladder took."""
-        return tuple(self.effects[number] for number in self.ladder.taken)
-
-
-def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: bool) -> Fold:
+def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: bool) -> Ladder:
     """Effects sought and fitted on some rows only.
 
     library: of all rows, whose products serve every fold.  rows: (m,) True for those used.  state:
@@ -41,8 +27,7 @@ def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: b
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = select(library.only(rows), ripple=ripple)
-    effects = tuple(effects_of(choice))
-    return Fold(effects, climbed(small, effects))
+    return climbed(small, effects_of(choice))
 
 
 def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:
@@ -59,7 +44,7 @@ def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) 
         if state is None:
             continue
         progress(f"part {number + 1} of {len(found)} left out: {part.name}")
-        fold = fold_of(study, causes.library, ~mask, state, causes.ripple)
-        rows, fits = data.take(part.rows), fold.ladder.fits
+        fits = fold_of(study, causes.library, ~mask, state, causes.ripple).fits
+        rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
     return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.fitting.beyond import moved, needed
+from minimax_cal.fitting.beyond import moved, needed, step_without
 from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
@@ -28,7 +28,6 @@ from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Term, names_of
 from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers.least_squares import solve_normal
 
 PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
 SETTLED = 1e-4  # relative change of the weighed square that ends them
@@ -95,8 +94,7 @@ class Joint:
 
     def spared(self, folds: Sequence[Array]) -> list[Array]:
         """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
-        poses = self.poses
-        return [f for f in folds if not needed(poses.bread, poses.gram[f].sum(axis=0))]
+        return [fold for fold in folds if not needed(self.poses, fold)]
 
     def cross_validated(self, folds: Sequence[Array]) -> float:
         """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
@@ -104,8 +102,7 @@ class Joint:
         if len(self.spared(folds)) < len(folds):
             return float("inf")
         for mine in folds:
-            pull = poses.score[~mine].sum(axis=0)
-            step = solve_normal(poses.bread - poses.gram[mine].sum(axis=0), pull[:, None])[:, 0]
+            step = step_without(poses, mine)
             left = poses.error[mine] - np.einsum("mrp,p->mr", poses.jacobian[mine], step)
             total += float((left**2).sum())
         return total

@@ -158,15 +158,22 @@ def pooled(every: Sequence[Accuracy]) -> float:
     return math.sqrt(total / count) if count else math.nan
 
 
-def needed(gram: Array, part: Array) -> bool:
-    """Whether a fit with Gram matrix (p, p) loses parameters, or much sureness, without a part."""
+def needed(poses: Poses, part: Array) -> bool:
+    """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,)."""
+    gram = poses.bread
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     whole, rest = (
         np.sqrt(np.maximum(np.linalg.eigvalsh(one / np.outer(scale, scale)), 0.0))
-        for one in (gram, gram - part)
+        for one in (gram, gram - poses.gram[part].sum(axis=0))
     )
     condition = whole[-1] / max(whole[0], 1e-300)
     return bool(rest[0] <= RANK * rest[-1] or rest[-1] > WORSE * condition * rest[0])
+
+
+def step_without(poses: Poses, part: Array) -> Array:
+    """(p,) the step of the free parameters once some poses are left out.  part: mask (m,)."""
+    pull = poses.score[~part].sum(axis=0) + poses.prior * poses.off
+    return solve_normal(poses.bread - poses.gram[part].sum(axis=0), pull[:, None])[:, 0]
 
 
 def without(estimator: Estimator, state: State, parts: Sequence[Array]) -> list[State | None]:
@@ -177,19 +184,15 @@ def without(estimator: Estimator, state: State, parts: Sequence[Array]) -> list[
     were.  parts: masks (m,) of the fit's poses.
     """
     poses = Poses.of(estimator, state)
-    score, gram = poses.score, poses.gram
-    prior = poses.prior * poses.off
     out: list[State | None] = []
     for part in parts:
         if not part.any():
             out.append(state)
             continue
-        lost = gram[part].sum(axis=0)
-        if needed(poses.bread, lost):
+        if needed(poses, part):
             out.append(None)
             continue
-        step = solve_normal(poses.bread - lost, (score[~part].sum(axis=0) + prior)[:, None])[:, 0]
-        out.append(moved(estimator, state, step))
+        out.append(moved(estimator, state, step_without(poses, part)))
     return out
 
 

@@ -39,7 +39,7 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
-from minimax_cal.fitting.stations import jumps, pose_of, stationed, unplaced
+from minimax_cal.fitting.stations import jumps, stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
@@ -349,7 +349,7 @@ def parameter_table(robot: Robot, solved: Solved) -> Parameters:
     def values(x: State, frames: Frames) -> Array:
         turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
         parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
-        stood = jumps(frames, pose_of(x))
+        stood = jumps(frames, x.base)
         effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))
         return np.concatenate([*parts, stood, effects])
 

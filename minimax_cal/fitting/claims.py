@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -16,7 +15,7 @@ from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.floor import floor_of
+from minimax_cal.measuring.floor import known_floor
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Sessions
@@ -67,11 +66,11 @@ def contradiction(
     error: (k, m, 3) of all poses [m].  held: (m,).
     """
     rest = aside(error, data, suspects)
-    floor = floor_of(data, rest, robot.repeatability, math.inf)
+    floor = known_floor(data, rest, robot.repeatability)
     limit, what = 1e3 * GROSS * robot.reach(), f"{100 * GROSS:g} % of the arm's reach"
-    most = FLOORS * max(floor.value, LEAST_FLOOR)
-    if floor.certain and most < limit:
-        limit, what = most, f"{FLOORS:g} times the noise floor ({floor.source})"
+    if floor and FLOORS * max(floor[0], LEAST_FLOOR) < limit:
+        limit = FLOORS * max(floor[0], LEAST_FLOOR)
+        what = f"{FLOORS:g} times the noise floor ({floor[1]})"
     for name, rows in (("training", ~held), ("held-out", held)):
         whole, left = accuracy(error[:, rows]), accuracy(rest[:, rows])
         few = sum(left.counts) < LEFT * sum(whole.counts)

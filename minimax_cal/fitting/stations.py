@@ -76,7 +76,7 @@ def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Arra
         own = data.take(label == name)
         if poses >= ALONE:
             mine = fit_base(model_of(robot, own), robot.mdh).state
-            frames[name] = pose_of(state) @ np.linalg.inv(pose_of(mine))
+            frames[name] = state.base @ np.linalg.inv(mine.base)
         else:
             frames[name] = fitting(own, robot, state)
     for _ in range(ROUNDS):
@@ -102,19 +102,12 @@ def fitting(data: Measurements, robot: Robot, state: State) -> Array:
     return pose
 
 
-def pose_of(state: State) -> Array:
-    """(4, 4) pose of the base in the measurement frame."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = state.rotation, state.origin
-    return pose
-
-
 def turned_in(frames: Frames, state: State) -> tuple[Frames, State]:
     """Frames with the steps that a state holds for them, first of its effects, and it without."""
     if not len(state.effects):
         return frames, state
     steps = state.effects[: steps_of(frames)].reshape(-1, 6)
-    base, out = pose_of(state), dict(frames)
+    base, out = state.base, dict(frames)
     for name, step in zip(list(frames)[1:], steps, strict=True):
         jump = np.eye(4)
         jump[:3, :3], jump[:3, 3] = kinematics.rotation(step[3:]), step[:3]

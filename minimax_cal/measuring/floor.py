@@ -14,6 +14,7 @@ from minimax_cal.measuring.measurements import Measurements
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
 FEWEST = 5  # repeated visits that tell
 RESAMPLES = 500
+USUAL = float(stats.chi2.median(3)) / 3.0  # median square of a Gaussian over its mean, in space
 SIGMAS = 1.959964  # of a coordinate that a u95 holds
 # ISO 9283: repeatability is the mean distance from the middle plus three of its standard
 # deviations; of a Gaussian, alike in all directions, the RMS distance is this share of it.
@@ -61,10 +62,9 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     error: (k, m, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
     most: RMS distance that the fit takes for noise [mm].
     """
-    again = [revisits(data, points) for points in (error, np.moveaxis(data.y, 1, 0))]
-    known = [one for one in again if one]
-    if known:  # moves between visits are in the points, noise of joints read back in the errors
-        return min(known, key=lambda one: one.value)
+    again = least_scatter(data, error)
+    if again:
+        return between(*again)
     told = declared(data, repeatability)
     if told is None:
         return Floor(most, 0.0, most, AT_MOST)
@@ -86,23 +86,51 @@ def declared(data: Measurements, repeatability: float) -> tuple[float, float] | 
     return None if np.isnan(instrument) and np.isnan(arm) else (instrument, arm)
 
 
+def known_floor(data: Measurements, error: Array, repeatability: float) -> tuple[float, str] | None:
+    """The floor [mm] and how it is known, where it is by more than a fit.  As `floor_of`."""
+    again = least_scatter(data, error)
+    if again:
+        return rms_mm(again[0]), REPEATS
+    told = declared(data, repeatability)
+    both = float(np.hypot(*told)) if told else np.nan
+    return (both, DECLARED) if np.isfinite(both) else None
+
+
+def least_scatter(data: Measurements, error: Array) -> tuple[Array, Array] | None:
+    """Deviations among visits to one pose: of the errors, or of the points if these are less.
+
+    Moves between visits are in the points, noise of joints that were read back in the errors.
+    """
+    both = (visited(data, part) for part in (error, np.moveaxis(data.y, 1, 0)))
+    return min((one for one in both if one), key=lambda one: rms_mm(one[0]), default=None)
+
+
+def visited(data: Measurements, error: Array) -> tuple[Array, Array] | None:
+    """As `deviations`, None where too few poses were visited again.  error: or points [m]."""
+    square, group = deviations(error, groups(data))
+    return None if len(np.unique(group)) < FEWEST else (square, group)
+
+
+def rms_mm(square: Array) -> float:
+    """RMS distance [mm] by the median of squared ones [m^2], as of a Gaussian: few wrong points do
+    not set it.
+    """
+    return 1e3 * float(np.sqrt(np.median(square) / USUAL))
+
+
 def revisits(data: Measurements, error: Array) -> Floor | None:
     """By the scatter of errors among visits to one pose; None where they are too few.
 
-    A median, so that a few wrong points do not set it: of squared distances from the middle of the
-    visits, over that of a Gaussian.  error: (k, m, 3), or points as measured [m].
+    error: (k, m, 3), or points as measured [m].
     """
-    square, group = deviations(error, groups(data))
-    names = np.unique(group)
-    if len(names) < FEWEST:
-        return None
-    rng = np.random.default_rng(0)
+    found = visited(data, error)
+    return between(*found) if found else None
+
+
+def between(square: Array, group: Array) -> Floor:
+    """The floor with its ends, poses drawn anew.  square, group: as `deviations`."""
+    names, rng = np.unique(group), np.random.default_rng(0)
     member = [np.flatnonzero(group == name) for name in names]
-    usual = stats.chi2.median(3) / 3.0
-
-    def rms_mm(of: Array) -> float:
-        return 1e3 * float(np.sqrt(np.median(of) / usual))
-
     drawn = [
         rms_mm(square[np.concatenate([member[i] for i in rng.integers(0, len(names), len(names))])])
         for _ in range(RESAMPLES)

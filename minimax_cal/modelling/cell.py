@@ -55,10 +55,8 @@ class Cell:
         sessions: Sessions = ALONE,
     ) -> Cell:
         """The cell that a state of the parameters describes."""
-        base = np.eye(4)
-        base[:3, :3], base[:3, 3] = state.rotation, state.origin
         robot = robot.with_mdh(state.mdh)
-        return Cell(robot, base, targets, state.target_positions, effects, sessions)
+        return Cell(robot, state.base, targets, state.target_positions, effects, sessions)
 
     @property
     def state(self) -> State:

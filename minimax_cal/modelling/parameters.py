@@ -52,6 +52,13 @@ class State:
         )
 
     @property
+    def base(self) -> Array:
+        """(4, 4) pose of the base in the measurement frame, of a single state."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.rotation, self.origin
+        return pose
+
+    @property
     def geometry(self) -> tuple[Array, Array, Array, Array]:
         """All but the effects, in the order of the fields."""
         return self.mdh, self.rotation, self.origin, self.target_positions
