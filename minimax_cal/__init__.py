@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
     from minimax_cal.judging.tradeoff import tradeoff
+    from minimax_cal.judging.watching.comparison import compare
+    from minimax_cal.judging.watching.health import check
     from minimax_cal.measuring import datasets
     from minimax_cal.measuring.importers import import_files
     from minimax_cal.measuring.measurements import (
@@ -67,6 +69,8 @@ __all__ = [
     "bootstrap",
     "builtin_robots",
     "calibrate",
+    "check",
+    "compare",
     "compensate",
     "datasets",
     "diagnose",
@@ -121,6 +125,8 @@ MODULES = {  # name: where it is defined
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",
+    "check": "judging.watching.health",
+    "compare": "judging.watching.comparison",
     "iso9283": "judging.standard",
     "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",
