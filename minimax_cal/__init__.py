@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
     from minimax_cal.planning.plan import plan
+    from minimax_cal.reporting.fleet.overview import fleet
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
     from minimax_cal.simulators.commands import load_commands
@@ -76,6 +77,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "export",
+    "fleet",
     "import_files",
     "iso9283",
     "load_cell",
@@ -138,6 +140,7 @@ MODULES = {  # name: where it is defined
     "SimulatorGap": "simulators.result",
     "load_commands": "simulators.commands",
     "simulator_gap": "simulators.ladder",
+    "fleet": "reporting.fleet.overview",
     "report": "reporting.report",
 }
 

@@ -94,17 +94,21 @@ class Comparison:
     same: float
     notices: tuple[str, ...]
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """That changed, as J3."""
+        return tuple(dict.fromkeys(joint_of(c.parameter) for c in self.changed))
+
     def headline(self) -> str:
         """The result in a sentence or two."""
         a, b = self.names
         if not self.changed:
             return f"{self.robot}: no joint differs between {a} and {b} by more than chance allows."
-        joints = ", ".join(dict.fromkeys(joint_of(c.parameter) for c in self.changed))
         told = ", ".join(
             f"{c.parameter} by {1e3 * c.by:+.3f} {'mm' if c.unit == 'm' else 'mrad'}"
             for c in self.changed
         )
-        return f"{self.robot}: {joints} changed from {a} to {b} ({told})."
+        return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
 
     def tables(self) -> tuple[Table, ...]:
         """Which joints changed, accuracy on common poses, every parameter."""

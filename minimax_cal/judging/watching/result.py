@@ -16,6 +16,7 @@ from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.solvers.status import Status
 
 VALID, NOT_VALID, NOT_DECIDED = "valid", "not valid", "not decided"
+WORDS = {True: VALID, False: NOT_VALID, None: NOT_DECIDED}
 SHIFT = 2e-4  # of a zero position, whose discovery is asked of the poses [rad]
 
 
@@ -75,6 +76,11 @@ class Health:
         return False if False in found else None if None in found else True
 
     @property
+    def word(self) -> str:
+        """The verdict in words."""
+        return WORDS[self.valid]
+
+    @property
     def confidence(self) -> float:
         """In the verdict."""
         every = [v.confidence for v in self.verdicts if v.valid == self.valid]
@@ -87,8 +93,7 @@ class Health:
 
     def headline(self) -> str:
         """The result in a few sentences."""
-        word = {True: VALID, False: NOT_VALID, None: NOT_DECIDED}[self.valid]
-        said = [f"The calibration of {self.robot} is {word}", *(v.why for v in self.verdicts)]
+        said = [f"The calibration of {self.robot} is {self.word}", *(v.why for v in self.verdicts)]
         text = f"{said[0]} ({'; '.join(said[1:])}; confidence {100 * self.confidence:.1f} %). "
         if self.moved:
             joints = ", ".join(dict.fromkeys(m.joint for m in self.moved))
@@ -107,7 +112,7 @@ class Health:
             ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
             tuple(
                 (KINDS[v.limit.kind], v.limit.size_mm, v.value_mm, v.low_mm, v.high_mm,
-                 {True: VALID, False: NOT_VALID, None: NOT_DECIDED}[v.valid], 100 * v.confidence)
+                 WORDS[v.valid], 100 * v.confidence)
                 for v in self.verdicts
             ),
             ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
