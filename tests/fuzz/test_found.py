@@ -13,7 +13,8 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
-from minimax_cal.ground.records import Packed, unpacked
+from minimax_cal.ground.files import json_of
+from minimax_cal.ground.records import Packed, packed, unpacked
 from minimax_cal.reporting.plots.figures import new_figure, save
 
 from .material import material
@@ -131,3 +132,25 @@ def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> No
     axes.set_title("t\n" * 40)
     save(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_numbers_that_no_result_has_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The charts of a diagnosis drew them with warnings of overflow."""
+    for value in (1e308, -1e160, 10**300):
+
+        def huge(content: Any, value: Any = value) -> None:
+            content["curves"]["order"]["views"][0]["values"][0] = value
+
+        path = broken(tmp_path, "diagnosis.json", huge)
+        assert "cannot be; at most 1e+100" in refused(capsys, "report", path)
+    assert json_of("[1e99, -3, 0, 2.5e-320, true]") == [1e99, -3, 0, 2.5e-320, True]
+    assert [type(value) for value in json_of("[1, 1.0, -0]")] == [int, float, int]
+    for text in ("1e400", "-" + "9" * 5000):
+        with pytest.raises(ValueError, match="at most"):
+            json_of(text)
+    far = np.array([1e99, np.inf, np.nan])
+    np.testing.assert_array_equal(unpacked(Packed.model_validate(packed(far))), far)
+    with pytest.raises(ValueError, match="beyond 1e"):
+        unpacked(Packed.model_validate(packed(11.0 * far)))
