@@ -97,9 +97,20 @@ def test_the_name_of_an_output_moves_no_cursor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("data.csv").write_bytes(material()["data.csv"])
-    assert run("import", "data.csv", "-o", "\x1b]0;owned\x07") == 0
-    assert "\x1b" not in capsys.readouterr().out
+    odd = "\x1b]0;owned\x07"
+    for name in ("data.csv", "truth.json"):
+        Path(name).write_bytes(material()[name])
+    for command in (
+        ("import", "data.csv"),
+        ("evaluate", "truth.json", "data.csv"),
+        ("export", "truth.json", "--to", "json"),
+        ("simulate", "irb120", "--poses", 9),
+    ):
+        assert run(*command, "-o", odd) == 0
+    out, err = capsys.readouterr()
+    assert err.count("written: ") == 3
+    assert out.count("wrote ") == 1
+    assert "\x1b" not in out + err
 
 
 def test_a_lever_that_cannot_be_is_refused(
@@ -154,3 +165,28 @@ def test_numbers_that_no_result_has_are_refused(
     np.testing.assert_array_equal(unpacked(Packed.model_validate(packed(far))), far)
     with pytest.raises(ValueError, match="beyond 1e"):
         unpacked(Packed.model_validate(packed(11.0 * far)))
+
+
+def test_two_outputs_are_two_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second result replaced the first."""
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to("a.csv")
+    for other in ("a.csv", "./a.csv", "link"):
+        arguments = ("simulate", "irb120", "--poses", 9, "-o", "a.csv", "--truth", other)
+        assert "is to hold two results" in refused(capsys, *arguments)
+    assert not Path("a.csv").exists()
+    same = ("-o", "/dev/null", "--truth", "/dev/null")
+    assert run("simulate", "irb120", "--poses", 9, *same) == 0
+
+
+def test_a_file_whose_link_is_named_is_an_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robot.urdf").write_bytes(material()["robot.urdf"])
+    for named in ("robot.urdf", "robot.urdf#tool0"):
+        arguments = ("export", named, "--to", "urdf", "-o", "robot.urdf")
+        assert "is an input of this command" in refused(capsys, *arguments)
+    assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
