@@ -17,6 +17,7 @@ from minimax_cal.solvers.least_squares import (
     examine,
     nielsen,
     solve,
+    solve_normal,
     tried,
 )
 from minimax_cal.solvers.status import Status
@@ -113,6 +114,19 @@ def expected(v: Array, method: Method, damping: float) -> tuple[Array, Array, Ar
     return e, J, np.linalg.lstsq(tall, np.concatenate([e, 0.0 * scale]), rcond=None)[0]
 
 
+def test_the_methods_are_those_of_the_paper() -> None:
+    """Two switches, and Kaufman's form of the two that eliminate the lengths."""
+    assert {
+        name: (m.separable, m.damped, m.full) for name, m in METHODS.items() if m.separable
+    } == {
+        "snlgn": (True, False, True),
+        "snllm": (True, True, True),
+        "snlgn-kaufman": (True, False, False),
+        "snllm-kaufman": (True, True, False),
+    }
+    assert (METHODS["nlgn"].damped, METHODS["nllm"].damped, len(METHODS)) == (False, True, 6)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_a_step_is_that_of_dense_algebra(name: str) -> None:
     method, problem = METHODS[name], Decay(LINEAR)
@@ -183,6 +197,24 @@ def test_a_slope_that_lies_stalls_where_it_began() -> None:
     assert_array_equal(found.trace, found.trace[:1] * np.ones_like(found.trace))
     # 1e-2 grows by 2, 4, 8 ...: 2^(k (k + 1) / 2) first passes 1e14 at k = 10
     assert found.iterations[0] == 10
+
+
+@pytest.mark.parametrize("most", [0, 3])
+def test_a_limit_is_the_number_of_steps(most: int) -> None:
+    limits = Limits(iterations=most)
+    found = solve(Decay(LINEAR), Points(BEGIN[:1]), 1, 25.0, METHODS["nllm"], limits)
+    assert found.status == (Status.ITERATION_LIMIT,)
+    assert (found.iterations[0], len(found.trace)) == (most, most + 1)
+    assert np.array_equal(found.x.value, BEGIN[:1]) == (most == 0)
+
+
+def test_what_is_singular_to_rounding_has_the_least_solution() -> None:
+    """Two columns that agree to fifteen digits, and a right side that does not."""
+    near = np.array([[1.0, 1.0 - 2e-15], [1.0 - 2e-15, 1.0]])
+    for scale in (np.ones(2), np.array([1e-6, 1e6])):
+        matrix, right = near * np.outer(scale, scale), scale * [2.0, 2.0 - 2e-9]
+        found = solve_normal(matrix, right[:, None])[:, 0]
+        assert_allclose(found * scale, 1.0, rtol=0, atol=1e-8)
 
 
 def test_damping_goes_by_nielsens_rule() -> None:
