@@ -197,7 +197,7 @@ class Output:
         """Say on stderr which files were written."""
         for path in paths:
             if path and not self.quiet:
-                click.echo(f"written: {path}", err=True)
+                say_written(path)
 
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
@@ -290,6 +290,11 @@ def terminal() -> Console:
     """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
+def say_written(path: Path) -> None:
+    """Say on stderr that a file was written, whatever its name."""
+    click.echo(f"written: {one_line(str(path))}", err=True)
 
 
 def show(*tables: Table, headline: str = "") -> None:
