@@ -138,7 +138,7 @@ def test_unbounded_problem_does_not_claim_success() -> None:
     ("options", "say"),
     [
         ({"jac": "exact"}, "jac 'exact'"),
-        ({"x0": [1.0, np.nan]}, "x0"),
+        ({"x0": [1.0, np.nan]}, "x0 holds"),
         ({"fun": lambda x: x * np.nan}, "finite"),
         ({"constraints": [{"type": "ineq"}]}, "not dict"),
         ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
@@ -282,5 +282,6 @@ def test_the_way_down_from_a_flat_point_is_the_steepest() -> None:
         lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
         lambda x: np.array([1.0 + x[0]]),  # a slope: the search itself goes down
         lambda x: np.array([1.0 - 1e-9 * x[0] ** 2]),  # less than rounding can tell
+        lambda x: np.array([-1e-7 * x[0] ** 2]),
     ):
         assert below(scaled(flat, nowhere), nowhere) is None
