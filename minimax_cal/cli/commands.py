@@ -106,6 +106,13 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "measurements.",
         ),
     },
+    "Work on a page": {
+        "serve": (
+            "serve",
+            "A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, "
+            "plan.",
+        ),
+    },
     "Look up": {
         "robots": ("robots", "The robots that come with the package."),
         "effects": (

@@ -27,6 +27,7 @@ TEMPLATES = (
     "evaluate truth.json data.csv --json",
     "evaluate effects.json data.csv -o out.json",
     "import data.csv -o out.csv",
+    "import data.csv --leave-out 3:smr1,5 -o out.csv",
     "import tracker.csv -o out.csv --json",
     "import tracker.csv -o out.csv --safe-cells",
     "compensate fit.json targets.csv -o out.csv",
