@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     InGroups,
     Output,
     options_from,
+    plain_option,
     result_options,
 )
 from minimax_cal.fitting.calibrate import calibrate
@@ -30,7 +31,8 @@ from minimax_cal.reporting.plots.figures import save_errors
 @DATA
 @options_from(Options)
 @ROWS
-@click.option(
+@plain_option(
+    "What is known",
     "--bootstrap",
     "replicates",
     type=int,

@@ -78,7 +78,7 @@ def written(made: Export, path: Path | None) -> None:
     """Write a file and those beside it.  Raises OptionError where these have no place."""
     if path is None and made.beside:
         raise OptionError(
-            f"the file needs another beside it (*{', *'.join(made.beside)}); name it with -o"
+            f"the file needs another beside it (*{', *'.join(made.beside)}); name where to write it"
         )
     if path is not None:
         for ending, content in made.beside.items():

@@ -134,6 +134,7 @@ class Options:
         "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
         "the noise floor.",
         metavar="10um+2.5um/m",
+        group="What is known",
     )
     priors: Mapping[str, float] = option(
         dict,

@@ -401,7 +401,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     """From the JSON of a calibration: its key `covariance`.  Raises CalibrationError."""
     if "covariance" not in content:
         raise CalibrationError(
-            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate -o"
+            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate"
         )
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)

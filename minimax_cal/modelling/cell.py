@@ -200,7 +200,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: is not a saved calibration (robot, base, targets_mm: {said(error)}); "
-            "write one with minimax-cal calibrate -o"
+            "write one with minimax-cal calibrate"
         ) from error
     if not np.abs(spots).max(initial=0.0) <= FARTHEST:
         raise CalibrationError(f"{source}: targets are not plausible numbers")
