@@ -20,6 +20,7 @@ FOLDERS = (
     "correcting",
     "simulators",
     "reporting",
+    "serving",
     "cli",
 )
 MODULES = sorted((ROOT / "minimax_cal").rglob("*.py"))

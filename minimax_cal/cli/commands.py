@@ -37,6 +37,19 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "evaluate",
             "Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.",
         ),
+        "check": (
+            "check",
+            "Whether the calibration FIT is still valid, and what moved, by a few new poses in "
+            "DATA.",
+        ),
+        "compare": (
+            "compare",
+            "What differs between two results A and B: before and after a repair, or two months.",
+        ),
+        "fleet": (
+            "fleet",
+            "Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.",
+        ),
         "iso9283": (
             "iso9283",
             "Pose and distance accuracy of FIT by the formulas of ISO 9283, before and after.",
@@ -91,6 +104,13 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "report",
             "A page to sign of RESULTS: a calibration, a diagnosis, or both of the same "
             "measurements.",
+        ),
+    },
+    "Work on a page": {
+        "serve": (
+            "serve",
+            "A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, "
+            "plan.",
         ),
     },
     "Look up": {

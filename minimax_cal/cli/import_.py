@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import click
 
 from minimax_cal.cli.options import JSON, PATH, QUIET, SAFE_CELLS, Output, output, show, with_output
 from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.options import names_of
 from minimax_cal.ground.words import visible
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
+from minimax_cal.measuring.left_out import left_out
 from minimax_cal.measuring.measurements import read_measurements
 
 
@@ -37,6 +40,13 @@ from minimax_cal.measuring.measurements import read_measurements
     help="Of a file with several points a pose: which of them follow each other.",
 )
 @click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@click.option(
+    "--leave-out",
+    default="",
+    metavar="POINTS",
+    help="Points as if nobody had measured them: 12:smr2 is that of line 12, 12 all of its pose; "
+    "several with commas.",
+)
 @SAFE_CELLS
 @JSON
 @QUIET
@@ -47,6 +57,7 @@ def import_command(
     joints: Path | None,
     layout: str | None,
     decimal: str | None,
+    leave_out: str,
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -56,6 +67,7 @@ def import_command(
     Without -o nothing is written.
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
+    found = replace(found, data=left_out(found.data, names_of([leave_out])))
     if to.path:
         write_whole(to.path, to.cells(csv_of(found), safe_cells))
         read_measurements(to.path)  # what was written can be read
