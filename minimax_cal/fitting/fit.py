@@ -420,6 +420,14 @@ class Fit:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def inverse(self, pose: Array, near: Array | None = None) -> Array:
+        """Joints (..., n) that bring the flange to poses in the base, effects counted.
+
+        pose: (..., 4, 4) [m].  near: joints to start from, (n,) or (..., n), which choose among the
+        ways of the arm [rad, m].  More: `Cell.inverse`; without effects: `Robot.inverse`.
+        """
+        return self.cell.inverse(pose, near)
+
     def plot(self) -> Any:
         """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""
         # reporting stands below; what it needs is imported when a picture is asked for

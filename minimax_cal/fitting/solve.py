@@ -14,7 +14,7 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
-from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
+from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
@@ -274,6 +274,10 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
     names = model.names
     allowed = ~names.match(options.fix, "fix")
+    if options.only == OFFSETS:
+        n, zeros = robot.joints, np.zeros(names.count, dtype=bool)
+        zeros[np.arange(n) + np.where(robot.prismatic, n, 2 * n)] = True
+        allowed &= zeros | ~names.links
     order = identify.drop_order(robot, names)
     kept = names.match(options.free, "free")
     if (kept & ~allowed).any():

@@ -17,14 +17,13 @@ from minimax_cal.cli.compensate import compensate_command
 from minimax_cal.correcting.compensate import (
     FRAMES,
     Compensation,
-    arm_of,
     compensate,
     path_of,
 )
-from minimax_cal.correcting.reach import Outcome, Reach, examine, motion
 from minimax_cal.correcting.target_file import ADDED, read_targets
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.modelling.reach import Outcome, Reach, arm_of, motion
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate
 
 Move = Callable[[Array], Array]
@@ -146,10 +145,10 @@ def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Ge
     data = path_of(q, robot, 0.0)
     reach = Reach(arm_of(cell_of(robot)), data, robot.pose(q), 0.3, 1e-5, 0.1)
     still = np.zeros_like(q)
-    _, jacobian = examine(reach, q, reach.goal, still)
+    _, jacobian = reach.missing(q, reach.goal, still)
     for j, step in enumerate(1e-6 * np.eye(robot.joints)):
-        ahead, _ = examine(reach, q + step, reach.goal, still)
-        behind, _ = examine(reach, q - step, reach.goal, still)
+        ahead, _ = reach.missing(q + step, reach.goal, still)
+        behind, _ = reach.missing(q - step, reach.goal, still)
         assert_allclose((behind - ahead) / 2e-6, jacobian[:, :, j], rtol=0, atol=1e-8)
 
 
@@ -223,7 +222,7 @@ def test_a_redundant_arm_changes_least(rng: np.random.Generator) -> None:
     found = compensate(cell_of(real), q, seven, frame="own")
     assert set(found.outcome) == {Outcome.REACHED}
     reach = Reach(arm_of(cell_of(real)), path_of(q, real, 0.0), seven.pose(q), 0.1, 1e-5, 0.1)
-    residual, jacobian = examine(reach, q, reach.goal, np.zeros_like(q))
+    residual, jacobian = reach.missing(q, reach.goal, np.zeros_like(q))
     least = (np.linalg.pinv(jacobian) @ residual[..., None])[..., 0]
     assert_allclose(found.q - q, least, rtol=0, atol=0.02 * np.abs(least).max())
 

@@ -44,6 +44,7 @@ TEMPLATES = (
     "map fit.json data.csv --samples 500 -o out.png",
     "export fit.json --to urdf -o out.urdf",
     "export fit.json --to dh-csv -o out.csv",
+    "export fit.json --to ros2-control -o out.xml",
     "export ROBOT --to json -o out.json",
     "export effects.json --to ur-yaml -o out.yaml",
     "export fit.json --to urdf --urdf robot.urdf -o out.urdf",
