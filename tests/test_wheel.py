@@ -105,6 +105,7 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
         (("map", "fit.json", "-o", "a.png"), "[plot]"),
         (("report", "fit.json", "-o", "a.html"), "[report]"),
         (("gap", "arm.xml", "poses.csv"), "mujoco"),
+        (("serve", "--no-browser"), "[app]"),
     ):
         ended = run(*command, code=2)
         line = ended.stderr.strip()

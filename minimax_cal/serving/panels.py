@@ -170,7 +170,7 @@ def understood(file: dict[str, Any]) -> tuple[str, Table]:
     line += f"decimal {file['decimal']}, {file['encoding']}"
     columns = file["columns"]
     header = tuple(columns[0]) if columns else ("column",)
-    rows = tuple(tuple(map(str, column.values())) for column in columns)
+    rows = tuple(tuple(visible(str(v)) for v in column.values()) for column in columns)
     return visible(line), Table(str(file["file"]), header, rows)
 
 

@@ -5,7 +5,7 @@
   const home = `/s/${encodeURIComponent(body.dataset.session)}`;
   const WORKING = 400, IDLE = 2000; // milliseconds between two questions
   const FOREVER = 12; // seconds that a message stays
-  const CLOSER = 0.85; // than in the report, which has more room
+  const CLOSER = 0.75; // than in the report, which has more room
   const BADGES = { waiting: "", ready: "", working: "at work", done: "done", failed: "failed",
     old: "of earlier choices: do it again" };
   const MADE_BY = { fit: "fit", accuracy: "fit", points: "fit", ladder: "diagnose", verdict: "judge",
@@ -132,6 +132,7 @@
   function told_of(name, step) {
     badge(name, step.state);
     const place = document.querySelector(`[data-said="${name}"]`);
+    place.dataset.state = step.state;
     const parts = [];
     if (step.error) parts.push(made("p", step.error, "problem"));
     if (step.waits) parts.push(made("p", step.waits, "waits"));

@@ -118,6 +118,21 @@ def test_an_error_is_the_line_of_the_command(server: Served) -> None:
     assert not (folder_of(server, home) / "understood.json").exists()
 
 
+def test_names_from_files_are_only_text(server: Served, poses: bytes) -> None:
+    """Of a file and of its columns, wherever they are shown."""
+    home = server.begin(robot="irb120")
+    header, _, rows = poses.partition(b"\n")
+    lines = [line + b",1" for line in rows.splitlines()]
+    server.put(home, "a(b).csv", b"\n".join([header + b",<img src=x onerror=alert(1)>", *lines]))
+    server.choose(home, measured=["a(b).csv"])
+    state = server.run(home, "read")
+    assert state["steps"]["read"]["state"] == "done"
+    shown = "".join(state["panels"].values())
+    assert "&lt;img src=x" in shown
+    assert "<img" not in shown
+
+
+@pytest.mark.slow
 def test_a_requirement_is_judged_by_the_report(server: Served, fitted: str) -> None:
     server.choose(fitted, rms=50.0)
     state = server.run(fitted, "judge")
@@ -208,6 +223,7 @@ def test_steps_that_are_none_or_cannot_be_done(server: Served) -> None:
 # ---- two at once, cancel, killed -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_sessions_work_at_once_and_one_waits_for_itself(
     server: Served, fitted: str, poses: bytes
 ) -> None:
