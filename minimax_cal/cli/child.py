@@ -1,4 +1,4 @@
-"""A command of the page's in a process of its own: it tells every stage, and ends with the page."""
+"""A command of the page in a process of its own: it tells every stage, and ends with the page."""
 
 import os
 import sys
@@ -23,4 +23,5 @@ def end_with_parent() -> None:
 if __name__ == "__main__":
     progress.EVERY = 0.0
     threading.Thread(target=end_with_parent, daemon=True).start()
-    main(sys.argv[1:])
+    os.chdir(sys.argv[1])  # the session's folder, once all is imported from where the page is
+    main(sys.argv[2:])

@@ -19,14 +19,19 @@ from minimax_cal.reporting.html.more_charts import waterfall
 from minimax_cal.reporting.html.page import figure_data, needed, part
 from minimax_cal.robots.robot import builtin_robots, load_robot
 from minimax_cal.serving.cell import Point, points_of
-from minimax_cal.serving.sessions import GIVEN, Choices, Session, mark
+from minimax_cal.serving.sessions import GIVEN, SCRIPT, Choices, Session, mark
 from minimax_cal.serving.steps import (
+    CORRECTED,
     DIAGNOSIS,
     FIT,
+    MJCF,
     NEXT,
     POSES,
+    REPORT,
     STEPS,
     UNDERSTOOD,
+    URDF,
+    USED,
     Command,
 )
 from minimax_cal.serving.work import Job, Record, record_of
@@ -34,6 +39,19 @@ from minimax_cal.serving.work import Job, Record, record_of
 MOST_POINTS = 300  # rows of the table; the worst come first
 MOST_ROWS = 60
 KEPT = 16  # results in memory
+WHAT = {
+    SCRIPT: "all that was done here, as command lines",
+    POSES: "the measurements, as they were understood",
+    USED: "the measurements without the points that were left out",
+    UNDERSTOOD: "what was understood of the files",
+    FIT: "the calibration",
+    DIAGNOSIS: "the diagnosis",
+    REPORT: "the report to sign",
+    NEXT: "the poses to measure next",
+    URDF: "the calibrated robot",
+    MJCF: "the calibrated robot for MuJoCo",
+    CORRECTED: "the joint targets, corrected",
+}
 Panel = dict[str, Any]
 Tile = tuple[str, str, str]  # name, before, after
 
@@ -152,7 +170,7 @@ def understood(file: dict[str, Any]) -> tuple[str, Table]:
     line += f"decimal {file['decimal']}, {file['encoding']}"
     columns = file["columns"]
     header = tuple(columns[0]) if columns else ("column",)
-    rows = tuple(tuple(map(str, column.values())) for column in columns)
+    rows = tuple(tuple(visible(str(v)) for v in column.values()) for column in columns)
     return visible(line), Table(str(file["file"]), header, rows)
 
 
@@ -227,7 +245,8 @@ def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None
     if not record or record.code:
         return None
     lines = record.told.splitlines()
-    return {"verdict": lines[0] if lines else "", "lines": lines[1:]}
+    verdict = lines[0] if lines else ""
+    return {"verdict": verdict, "lines": lines[1:], "base": base(at)}
 
 
 def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
@@ -255,8 +274,13 @@ def told_panel(step: str) -> Callable[[Session, Choices, Job | None], Panel | No
 
 def downloads_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
     """Every file that the commands wrote."""
-    sizes = [(path.name, path.stat().st_size) for path in at.files()]
-    return {"files": sizes, "base": f"/s/{at.name}/file"}
+    files = [(p.name, p.stat().st_size, WHAT.get(p.name, "")) for p in at.files()]
+    return {"files": files, "base": base(at)}
+
+
+def base(at: Session) -> str:
+    """Where the files of a session are."""
+    return f"/s/{at.name}/file"
 
 
 PANELS: dict[str, Callable[[Session, Choices, Job | None], Panel | None]] = {

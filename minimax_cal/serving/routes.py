@@ -57,8 +57,8 @@ def application(root: Path) -> Starlette:
 
 
 def said(error: CalibrationError, status: int = 400) -> Response:
-    """What is wrong, in a line."""
-    return JSONResponse({"error": str(error)}, status)
+    """What is wrong, in a line; nothing more is read of what comes with the request."""
+    return JSONResponse({"error": str(error)}, status, {"Connection": "close"})
 
 
 def asked(answer: Answer) -> Answer:

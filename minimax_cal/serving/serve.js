@@ -5,9 +5,12 @@
   const home = `/s/${encodeURIComponent(body.dataset.session)}`;
   const WORKING = 400, IDLE = 2000; // milliseconds between two questions
   const FOREVER = 12; // seconds that a message stays
-  const CLOSER = 0.85; // than in the report, which has more room
+  const CLOSER = 0.75; // than in the report, which has more room
   const BADGES = { waiting: "", ready: "", working: "at work", done: "done", failed: "failed",
     old: "of earlier choices: do it again" };
+  const MADE_BY = { fit: "fit", accuracy: "fit", points: "fit", ladder: "diagnose", verdict: "judge",
+    plan: "plan", told: "correct", understood: "read" }; // panel: its step
+  const NARROW = 500; // pixels in which a chart has no room for buttons
   const { coloured, palette, put, triples, arrows, GAP } = drawing;
   const byId = (id) => document.getElementById(id);
   const all = (selector) => [...document.querySelectorAll(selector)];
@@ -79,6 +82,9 @@
     robots(told.robots);
     for (const field of all("input[name], select[name]")) settle(field, told.choices);
     for (const [name, step] of Object.entries(told.steps)) told_of(name, step);
+    for (const [panel, step] of Object.entries(MADE_BY)) {
+      document.querySelector(`[data-panel="${panel}"]`).classList.toggle("old", told.steps[step].state === "old");
+    }
     badge("robot", told.choices.robot ? "done" : "ready");
     byId("all-back").disabled = !told.choices.left_out.length;
     byId("targets-told").textContent = told.choices.targets ? `given/${told.choices.targets}` : "";
@@ -126,6 +132,7 @@
   function told_of(name, step) {
     badge(name, step.state);
     const place = document.querySelector(`[data-said="${name}"]`);
+    place.dataset.state = step.state;
     const parts = [];
     if (step.error) parts.push(made("p", step.error, "problem"));
     if (step.waits) parts.push(made("p", step.waits, "waits"));
@@ -305,7 +312,8 @@
     const place = byId("chart-workspace");
     const layout = drawing.layoutOf(cell, colours, { height: place.clientHeight, autosize: true });
     Plotly.react(place, coloured(content, colours), layout,
-      { ...drawing.CONFIG, ...drawing.SPACE_BUTTONS, scrollZoom: true });
+      { ...drawing.CONFIG, ...drawing.SPACE_BUTTONS, scrollZoom: true,
+        displayModeBar: place.clientWidth > NARROW });
     if (!place.dataset.drawn) place.on("plotly_click", picked);
     place.dataset.drawn = "yes";
     byId("times-told").textContent = `× ${arms.steps[Number(byId("times").value)]}`;

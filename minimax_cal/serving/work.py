@@ -23,7 +23,6 @@ from minimax_cal.ground.words import one_line
 from minimax_cal.serving.sessions import LOG, SCRIPT, Session
 from minimax_cal.serving.steps import Command
 
-CHILD = (sys.executable, "-P", "-m", "minimax_cal.cli.child")  # -P: the folder holds no modules
 PATIENCE = 5.0  # seconds from asking a process to end to ending it
 MOST_TOLD = 20_000  # letters of stdout that are kept
 MOST_LINES = 400
@@ -147,7 +146,7 @@ class Work:
         """Run a command line; its exit code and what it printed."""
         pipe = asyncio.subprocess.PIPE
         job.process = process = await asyncio.create_subprocess_exec(
-            *CHILD, *command.words, cwd=job.at.folder, stdin=pipe, stdout=pipe, stderr=pipe,
+            *child(), str(job.at.folder), *command.words, stdin=pipe, stdout=pipe, stderr=pipe,
             limit=MOST_LINE, env={**os.environ, "PYTHONUTF8": "1"},
         )  # fmt: skip
         out, told = (cast(asyncio.StreamReader, s) for s in (process.stdout, process.stderr))
@@ -179,6 +178,12 @@ class Work:
     async def close(self) -> None:
         """End all work."""
         await asyncio.gather(*(self.cancel(name) for name in list(self.jobs)))
+
+
+def child() -> list[str]:
+    """What starts a process that imports what this one does, and nothing from its folder."""
+    safe = [] if os.getcwd() in sys.path else ["-P"]
+    return [sys.executable, *safe, "-m", "minimax_cal.cli.child"]
 
 
 async def listen(job: Job, stream: asyncio.StreamReader) -> None:
