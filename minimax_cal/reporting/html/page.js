@@ -5,6 +5,7 @@
   const paper = "paper" in root.dataset;
   const PAPER_WIDTH = 680; // pixels between the margins of A4
   const PAPER_HEIGHT = 0.8; // of the height on a screen
+  const NARROW = window.matchMedia("(max-width: 40rem)"); // no room for buttons beside the legend
   const SCREEN_BUTTONS = { modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] };
   const SPACE_BUTTONS = { modeBarButtons: [["toImage", "resetCameraDefault3d"]] };
   const CONFIG = { responsive: true, displaylogo: false, showLink: false, showSendToCloud: false,
@@ -67,7 +68,7 @@
     figure.element.querySelector(".waiting")?.remove();
     figure.element.style.height = `${heightOf(figure)}px`;
     return Plotly.react(figure.element, coloured(traces, colours), layoutOf(figure, colours),
-      { ...CONFIG, ...buttons });
+      { ...CONFIG, ...buttons, displayModeBar: NARROW.matches ? false : "hover" });
   }
 
   function drawAll() {
@@ -79,8 +80,7 @@
   const triples = (flat) => Array.from({ length: flat.length / 3 },
     (_, i) => flat.slice(3 * i, 3 * i + 3));
   const put = (trace, points) => ({ ...trace,
-    x: points.map((p) => p[0] / 1e3), y: points.map((p) => p[1] / 1e3),
-    z: points.map((p) => p[2] / 1e3) });
+    x: points.map((p) => p[0]), y: points.map((p) => p[1]), z: points.map((p) => p[2]) });
   const GAP = [NaN, NaN, NaN];
 
   // Lines with heads; a head lies in the plane of its arrow and the vertical.
