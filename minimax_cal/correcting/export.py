@@ -34,10 +34,9 @@ def export(
     name of one.  to: urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.  path:
     written to as well, where given.  urdf: a file whose joint origins are corrected, all else left
     as it is; mjcf: one whose bodies, gains and springs are.  tip: last link of the chain in that
-    file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of a
-    diagnosis, the last unless given.  notify: called
-    with what the format cannot hold and other notices.  Lengths and angles are in the units of the
-    format.  Raises CalibrationError for wrong input.
+    file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of
+    a diagnosis, the last unless given.  notify: called with what the format cannot hold and other
+    notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong input.
 
     >>> text = mc.export(fit, to="urdf", path="arm.urdf")
     """

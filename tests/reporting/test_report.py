@@ -273,9 +273,9 @@ def test_what_later_files_tell_is_shown(
     assert [row[0], *row[2:4], *row[5:]] == ["calibrated", "0.1110", "0.2220", "0.2220", "-"]
     assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["accuracy"]
     assert seen.tables["Strongest correlations"][1] == ["a1", "theta2", "+0.500"]
-    assert seen.tables["points that stand out (may be real effects: run minimax-cal diagnose)"][1][
-        :4
-    ] == ["7", "smr2", "1.5000", "9.2"]
+    assert seen.tables[
+        "points that stand out, 1 % of such a list by chance; they may be real effects"
+    ][1][:4] == ["7", "smr2", "1.5000", "9.2"]
 
 
 @pytest.mark.parametrize(("given", "lacking"), [("fit.json", "gap"), ("gap.json", "parameters")])
