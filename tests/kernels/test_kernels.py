@@ -125,17 +125,22 @@ def test_polish(fast: ModuleType, rng: np.random.Generator) -> None:
 
 
 def test_choice(monkeypatch: pytest.MonkeyPatch, fast: ModuleType) -> None:
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.setenv(choice.SWITCH, "plain")
     assert choice.kernels() is plain
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.delenv(choice.SWITCH)
+    assert choice.kernels() is fast
+    with choice.work(brief=True):
+        assert choice.kernels() is plain
+        with choice.work(brief=False):
+            assert choice.kernels() is fast
     assert choice.kernels() is fast
 
 
 def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.delenv(choice.SWITCH, raising=False)
     monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
     assert choice.kernels() is plain
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
