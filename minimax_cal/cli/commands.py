@@ -123,6 +123,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
     },
 }
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write")  # parameters that name outputs
+LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 
 
@@ -152,6 +153,19 @@ def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
     return kept
 
 
+def paced(command: Callable[..., Any] | None, *, brief: bool) -> Callable[..., Any]:
+    """The command, with the kernels that suit its work."""
+
+    @wraps(command)  # type: ignore[arg-type]
+    def at_pace(*given: Any, **named: Any) -> Any:
+        from minimax_cal.kernels.choice import work  # NumPy comes with it
+
+        with work(brief=brief):
+            return command(*given, **named)  # type: ignore[misc]
+
+    return at_pace
+
+
 def is_same(one: Path, other: Path) -> bool:
     """Whether two paths lead to one file that is there."""
     try:
@@ -176,7 +190,7 @@ class Commands(UserDict[str, Any]):
             return found
         module = import_module(f"minimax_cal.cli.{found[0]}")
         command: click.Command = getattr(module, f"{name}_command")
-        command.callback = keeping_inputs(command.callback)
+        command.callback = keeping_inputs(paced(command.callback, brief=name not in LONG))
         self.data[name] = command
         return command
 

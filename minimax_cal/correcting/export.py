@@ -36,7 +36,8 @@ def export(
     as it is; mjcf: one whose bodies, gains and springs are.  tip: last link of the chain in that
     file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of
     a diagnosis, the last unless given.  notify: called with what the format cannot hold and other
-    notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong input.
+    notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong
+    input.
 
     >>> text = mc.export(fit, to="urdf", path="arm.urdf")
     """

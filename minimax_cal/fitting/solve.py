@@ -204,13 +204,18 @@ class Stage:
 
 
 def fit_cell(
-    robot: Robot, data: Measurements, options: Options, progress: Progress = silent
+    robot: Robot,
+    data: Measurements,
+    options: Options,
+    progress: Progress = silent,
+    near: Array = start.EVERYWHERE,
 ) -> Solved:
     """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError.
 
-    data: with the points of all sessions in one frame (`stations.stationed`).
+    data: with the points of all sessions in one frame (`stations.stationed`).  near: (3, 3) the
+    base's rotation where it is known already, as in `start.fit_base`.
     """
-    task, begun = prepared(robot, data, options), data.frames
+    task, begun = prepared(robot, data, options, near), data.frames
     mix = NO_MIX
     if options.objective == "pose":
         check_poses(data)
@@ -253,7 +258,9 @@ def fit_cell(
     )
 
 
-def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
+def prepared(
+    robot: Robot, data: Measurements, options: Options, near: Array = start.EVERYWHERE
+) -> Task:
     """The task, with poses enough for its unknowns.  Raises OptionError, DataError."""
     base, k = model_of(robot, data), len(data.target_names)
     allowed, order, sigma = wanted(robot, base, options)
@@ -266,7 +273,7 @@ def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
     free = steps_of(data.frames)
     checks.check_count(telling, poses, unknowns - following + free, known)
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
-    frame = start.fit_base(base, robot.mdh)
+    frame = start.fit_base(base, robot.mdh, near)
     return Task(robot, data, options, base, frame, reference, share, allowed, order, sigma)
 
 

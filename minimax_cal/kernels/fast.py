@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels.plain import PIVOT, RISE
+from minimax_cal.kernels.plain import FIRST, PIVOT, RISE, ROUNDS, STILL, STUCK, TRUST
 
 BLOCK = 128  # poses: the Jacobian of one target then fits the second-level cache
 
@@ -390,3 +390,61 @@ def descend(
             costs[i + 1] = costs[i] - gain
             return mdh, rotation, origin, targets, effects, costs[: i + 2], True
     return mdh, rotation, origin, targets, effects, costs[:most], False
+
+
+@compiled
+def misfit(matrix: Array, right: Array, sign: float, S: Array, error: Array) -> float:
+    """The cost of `polish` at a rotation; writes the residuals (r,)."""
+    cost = 0.0
+    for r in range(len(right)):
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                total += matrix[r, 3 * a + b] * S[a, b]
+        error[r] = sign * total - right[r]
+        cost += error[r] * error[r]
+    return cost
+
+
+@compiled
+def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull: Array) -> None:
+    """Write gram (3, 3) and slope (3,) of the cost of `polish` for turns about S's own axes."""
+    gram[:], pull[:] = 0.0, 0.0
+    row = np.empty(3)
+    for r in range(len(error)):
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            row[i] = 0.0
+            for a in range(3):
+                row[i] += sign * (matrix[r, 3 * a + j] * S[a, k] - matrix[r, 3 * a + k] * S[a, j])
+        for i in range(3):
+            pull[i] -= row[i] * error[r]
+            for j in range(3):
+                gram[i, j] += row[i] * row[j]
+
+
+@compiled
+def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Array, Array]:
+    """See `plain.polish`."""
+    turns, costs = starts.copy(), np.empty(len(starts))
+    error, gram, pull = np.empty(len(right)), np.empty((3, 3)), np.empty(3)
+    for s in range(len(starts)):
+        at, sign, damping = turns[s], signs[s], FIRST
+        cost = misfit(matrix, right, sign, at, error)
+        for _ in range(ROUNDS):
+            slopes(matrix, sign, at, error, gram, pull)
+            more = damping * (gram[0, 0] + gram[1, 1] + gram[2, 2] + 1e-300)
+            for i in range(3):
+                gram[i, i] += more
+            step, _ = solved(gram, pull)
+            trial = at @ turned(step)
+            new = misfit(matrix, right, sign, trial, error)
+            if new < cost or np.sum(pull * step) <= TRUST * cost:
+                at[:], cost, damping = trial, new, 0.1 * damping
+            else:
+                damping *= 4.0
+                misfit(matrix, right, sign, at, error)
+            if np.sum(step * step) <= STILL**2 or damping > STUCK:
+                break
+        costs[s] = cost
+    return turns, costs

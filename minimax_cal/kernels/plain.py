@@ -19,6 +19,11 @@ A, D, THETA, ALPHA, BETA = range(5)  # columns of an MDH table
 BLOCK = 768  # points of a target in all robots: its Jacobian then fits the second-level cache
 CYCLE = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 RISE = 1e-12  # relative: a cost that grows by more did not come from rounding
+FIRST, STUCK = 1e-3, 1e6  # damping of `polish`, relative: the first, and where it gives up
+ROUNDS, STILL = 100, 1e-12  # at most so many steps; a turn that ends them [rad]
+TRUST = 1e-13  # of the cost: a predicted gain below it is not seen through rounding
+HATS: Array = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
+                        [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], dtype=float)  # fmt: skip
 PIVOT = 1e-12  # of a scaled Gram matrix: below it a parameter is not told
 
 
@@ -336,3 +341,36 @@ def turned(w: Array) -> Array:
     second = (1.0 - np.cos(angle)) / square if square > 1e-8 else 0.5 - square / 24.0
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
+
+
+def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Array, Array]:
+    """Rotations S that minimise |sign matrix vec(S) - right|^2, by damped steps from each start.
+
+    matrix: (r, 9).  right: (r,).  starts: (s, 3, 3).  signs: (s,) 1 or -1.  Returns the rotations
+    and the costs (s,).
+    """
+    turn = starts.copy()
+    damping = np.full(len(starts), FIRST)
+    error = signs[:, None] * (turn.reshape(-1, 9) @ matrix.T) - right
+    cost = (error**2).sum(-1)
+    alive = np.arange(len(starts))
+    for _ in range(ROUNDS):
+        if not len(alive):
+            break
+        at, old, sign = turn[alive], cost[alive], signs[alive, None]
+        slopes = sign[..., None] * ((at[:, None] @ HATS).reshape(-1, 3, 9) @ matrix.T)
+        gram = slopes @ np.swapaxes(slopes, -1, -2)
+        size = np.trace(gram, axis1=-2, axis2=-1) + 1e-300
+        pull = -(slopes @ error[alive][..., None])
+        damped = gram + (damping[alive] * size)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(damped, pull)[..., 0]
+        trial = at @ np.stack([turned(w) for w in step])
+        after = sign * (trial.reshape(-1, 9) @ matrix.T) - right
+        new = (after**2).sum(-1)
+        gain = (step * pull[..., 0]).sum(-1)
+        better = (new < old) | (gain <= TRUST * old)
+        turn[alive[better]], error[alive[better]] = trial[better], after[better]
+        cost[alive[better]] = new[better]
+        damping[alive] *= np.where(better, 0.1, 4.0)
+        alive = alive[((step**2).sum(-1) > STILL**2) & (damping[alive] <= STUCK)]
+    return turn, cost

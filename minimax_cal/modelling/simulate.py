@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -101,7 +101,7 @@ def simulate(
     errors = rng.normal(size=(n, 5)) * ([truth.length] * 2 + [truth.angle] * 3)
     real = robot.with_mdh(robot.mdh + errors)
     base = np.eye(4)
-    base[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    base[:3, :3] = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
     aside = rng.normal(size=3)
     base[:3, 3] = truth.distance * aside / np.linalg.norm(aside)
     angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets

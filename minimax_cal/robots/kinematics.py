@@ -113,3 +113,24 @@ def rotation(w: Array) -> Array:
     second = np.where(small, 0.5 - squared / 24.0, (1.0 - np.cos(angle)) / angle**2)
     k = hat(w)
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
+
+
+def rotation_vector(turn: Array) -> Array:
+    """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of `rotation`.
+
+    By the quaternion, from its largest entry [Shepperd 1978].
+    """
+    square = np.append(np.diag(turn), np.trace(turn))  # 4 x^2 ... 4 w^2, alike up to a constant
+    largest = int(np.argmax(square))
+    if largest == 3:
+        w = 1.0 + np.trace(turn)
+        v = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        v = np.empty(3)
+        v[i] = 1.0 + turn[i, i] - turn[j, j] - turn[k, k]
+        v[j], v[k] = turn[j, i] + turn[i, j], turn[k, i] + turn[i, k]
+        w = turn[k, j] - turn[j, k]
+    v, w = (-v, -w) if w < 0.0 else (v, w)
+    sine = float(np.linalg.norm(v))
+    return np.asarray(v * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))

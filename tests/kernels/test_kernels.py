@@ -6,6 +6,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.kernels import choice, plain
@@ -108,18 +109,38 @@ def test_plain_steps_end_alike(
     near(ends[0][:-1], ends[1][:-1], alike=1e-10)  # systems of a condition of 1e4
 
 
+def test_polish(fast: ModuleType, rng: np.random.Generator) -> None:
+    truth = Rotation.random(rng=rng).as_matrix()
+    matrix = rng.normal(size=(10, 9))
+    right = matrix @ truth.reshape(9) + 1e-3 * rng.normal(size=10)
+    starts = np.stack([truth @ plain.turned(0.5 * rng.normal(size=3)) for _ in range(8)])
+    signs = np.repeat([1.0, -1.0], 4)
+    for sign in (1.0, -1.0):
+        ends = [module.polish(sign * matrix, right, starts, signs) for module in (fast, plain)]
+        assert ends[0][1][signs == sign].min() < 1e-5
+        near(ends[0], ends[1], alike=1e-9)
+        best = ends[1][0][np.argmin(np.where(signs == sign, ends[1][1], np.inf))]
+        assert_allclose(best @ best.T, np.eye(3), rtol=0, atol=1e-14)
+        assert_allclose(best, truth, rtol=0, atol=5e-3)
+
+
 def test_choice(monkeypatch: pytest.MonkeyPatch, fast: ModuleType) -> None:
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.setenv(choice.SWITCH, "plain")
     assert choice.kernels() is plain
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.delenv(choice.SWITCH)
+    assert choice.kernels() is fast
+    with choice.work(brief=True):
+        assert choice.kernels() is plain
+        with choice.work(brief=False):
+            assert choice.kernels() is fast
     assert choice.kernels() is fast
 
 
 def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
     monkeypatch.delenv(choice.SWITCH, raising=False)
     monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
     assert choice.kernels() is plain
-    choice.kernels.cache_clear()
+    choice.best.cache_clear()
