@@ -10,6 +10,7 @@ from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import DATA, FIT, Output, options_of, result_options, show
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
+from minimax_cal.ground.words import one_line
 from minimax_cal.judging.watching.health import check
 
 
@@ -44,4 +45,6 @@ def check_command(
         click.echo(json_text(found.to_dict()), nl=False)
     else:
         show(*found.tables(), headline=found.headline())
+    if not found.valid:
+        click.echo(f"error: {one_line(found.headline())}", err=True)
     return 0 if found.valid else FAILED

@@ -183,7 +183,10 @@ def test_the_command_says_what_the_function_says(
     kept = json.loads((tmp_path / "refit.json").read_text())
     assert kept["check"]["moved"] == kept["moved"] == told["moved"]
     assert run(*words, "rms 0.05") == 1
-    assert "not valid" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "not valid" in out
+    (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert "not valid" in line
     assert run("evaluate", tmp_path / "refit.json", tmp_path / "new.csv") == 0
 
 
