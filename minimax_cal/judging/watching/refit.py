@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -89,7 +90,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         prior=np.zeros(names.count),
         widening=1.0,
         provenance=Provenance.of(drawn, data, settings),
-        beyond=Beyond(reason="few poses after a check: nothing is left out"),
+        claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
     )
