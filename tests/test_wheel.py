@@ -120,8 +120,6 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
         (("map", "fit.json", "-o", "a.png"), "[plot]"),
         (("report", "fit.json", "-o", "a.html"), "[report]"),
         (("gap", "arm.xml", "poses.csv"), "mujoco"),
-        (("fleet", "cells.toml", "--page", "a.html"), "[fleet]"),
-        (("fleet", "cells.toml"), "[fleet]"),
         (("serve", "--no-browser"), "[app]"),
     ):
         ended = run(*command, code=2)
