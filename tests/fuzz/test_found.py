@@ -190,3 +190,10 @@ def test_a_file_whose_link_is_named_is_an_input(
         arguments = ("export", named, "--to", "urdf", "-o", "robot.urdf")
         assert "is an input of this command" in refused(capsys, *arguments)
     assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
+
+
+def test_a_fleet_has_no_more_processes_than_cells_can_use(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for jobs in ("0", "-2", "9" * 20):
+        assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)
