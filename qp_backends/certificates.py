@@ -6,8 +6,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import linprog
+import scipy
 
 from .problem import EMPTY, Status
 
@@ -49,9 +48,9 @@ def _program(
         options["time_limit"] = max(limit, 1e-3)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        result = linprog(
+        result = scipy.optimize.linprog(
             cost,
-            sparse.vstack([rows[above], -rows[below]]),
+            scipy.sparse.vstack([rows[above], -rows[below]]),
             np.concatenate([upper[above], -lower[below]]),
             rows[same],
             upper[same],
@@ -65,15 +64,15 @@ def _program(
 
 def _farkas(problem: Problem, limit: float) -> Array:
     """Multipliers that prove the rows contradictory, or nothing."""
-    A: Any = sparse.csr_array(problem.A)
+    A: Any = scipy.sparse.csr_array(problem.A)
     norm = problem.row_norm
-    A = sparse.diags_array(1.0 / norm) @ A
+    A = scipy.sparse.diags_array(1.0 / norm) @ A
     u, l = problem.u / norm, problem.l / norm  # noqa: E741
     up, low = np.flatnonzero(u < np.inf), np.flatnonzero(l > -np.inf)
     if not up.size + low.size:
         return EMPTY
     cost = np.concatenate([u[up], -l[low]])
-    columns = sparse.vstack([A[up], -A[low]]).T.tocsr()
+    columns = scipy.sparse.vstack([A[up], -A[low]]).T.tocsr()
     zero = np.zeros(problem.q.size)
     z = _program(cost, columns, zero, zero, (0.0, 1.0), limit)
     if not z.size:
@@ -90,19 +89,19 @@ def _farkas(problem: Problem, limit: float) -> Array:
 
 def _ray(problem: Problem, limit: float) -> Array:
     """A direction in which the objective falls for ever, or nothing."""
-    P: Any = sparse.csr_array(problem.P)
-    A: Any = sparse.csr_array(problem.A)
+    P: Any = scipy.sparse.csr_array(problem.P)
+    A: Any = scipy.sparse.csr_array(problem.A)
     size, slope = float(abs(P).max()) if P.nnz else 0.0, float(np.abs(problem.q).max(initial=0.0))
     if slope == 0.0:
         return EMPTY
     P = P / size if size > 0 else P[:0]
-    A = sparse.diags_array(1.0 / problem.row_norm) @ A
+    A = scipy.sparse.diags_array(1.0 / problem.row_norm) @ A
     zero = np.zeros(P.shape[0])
     low = np.where(problem.l > -np.inf, 0.0, -np.inf)
     high = np.where(problem.u < np.inf, 0.0, np.inf)
     d = _program(
         problem.q / slope,
-        sparse.vstack([P, A]).tocsr(),
+        scipy.sparse.vstack([P, A]).tocsr(),
         np.concatenate([zero, low]),
         np.concatenate([zero, high]),
         (-1.0, 1.0),

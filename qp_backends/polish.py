@@ -6,9 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import lu_factor, lu_solve
-from scipy.sparse.linalg import splu
+import scipy
 
 from .accuracy import accuracy
 from .problem import dense
@@ -121,10 +119,10 @@ def _factor(P: Matrix, E: Matrix, norm: Array) -> Callable[[Array], Array]:
     if n + k <= LARGEST_DENSE:
         F = dense(E) / norm[:, None]
         full = np.block([[dense(P) + delta * np.eye(n), F.T], [F, -delta * np.eye(k)]])
-        factors = lu_factor(full, check_finite=False)
-        return lambda right: np.asarray(lu_solve(factors, right, check_finite=False))
-    S: Any = sparse.diags_array(1.0 / norm) @ sparse.csc_array(E)
-    shift = sparse.diags_array(np.concatenate([np.full(n, delta), np.full(k, -delta)]))
-    kkt: Any = sparse.block_array([[sparse.csc_array(P), S.T], [S, None]]) if k else P
-    lu: Any = splu(sparse.csc_matrix(kkt + shift))
+        factors = scipy.linalg.lu_factor(full, check_finite=False)
+        return lambda right: np.asarray(scipy.linalg.lu_solve(factors, right, check_finite=False))
+    S: Any = scipy.sparse.diags_array(1.0 / norm) @ scipy.sparse.csc_array(E)
+    shift = scipy.sparse.diags_array(np.concatenate([np.full(n, delta), np.full(k, -delta)]))
+    kkt: Any = scipy.sparse.block_array([[scipy.sparse.csc_array(P), S.T], [S, None]]) if k else P
+    lu: Any = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(kkt + shift))
     return lambda right: np.asarray(lu.solve(right))

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 Array: TypeAlias = NDArray[np.float64]
 Matrix: TypeAlias = Any  # a dense Array or a csc_array; both know @, .T and .shape
@@ -46,7 +46,7 @@ class Status(Enum):
 
 def is_sparse(matrix: Any) -> bool:
     """Whether a matrix is one of SciPy's sparse ones."""
-    return bool(sparse.issparse(matrix))
+    return not isinstance(matrix, np.ndarray) and bool(scipy.sparse.issparse(matrix))
 
 
 def dense(matrix: Matrix) -> Array:
@@ -56,9 +56,9 @@ def dense(matrix: Matrix) -> Array:
 
 
 def _matrix(value: Any, name: str) -> Matrix:
-    """A float64 dense array, or a CSC array when the value is sparse."""
+    """A float64 dense array, or a CSC array when the value is scipy.sparse."""
     if is_sparse(value):
-        matrix: Any = sparse.csc_array(value, dtype=np.float64)
+        matrix: Any = scipy.sparse.csc_array(value, dtype=np.float64)
         entries = matrix.data
     else:
         matrix = entries = _array(value)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from .problem import EMPTY, is_sparse
 
@@ -73,14 +73,14 @@ def split(problem: Problem, boxed: bool = False) -> Rows:
     if not below.size:
         return Rows(top, u[above], E, b, above, below, equal, box)
     both = [top, -A[below]]
-    G: Matrix = sparse.vstack(both, format="csc") if is_sparse(A) else np.concatenate(both)
+    G: Matrix = scipy.sparse.vstack(both, format="csc") if is_sparse(A) else np.concatenate(both)
     return Rows(G, np.concatenate([u[above], -l[below]]), E, b, above, below, equal, box)
 
 
 def _box(problem: Problem) -> tuple[tuple[Box, ...], Array, Array]:
     """The rows that are bounds, if they are many, and l and u with these rows opened."""
     n, m = problem.q.size, problem.l.size
-    by_row = sparse.csr_array(problem.A)
+    by_row = scipy.sparse.csr_array(problem.A)
     by_row.eliminate_zeros()
     single = np.diff(by_row.indptr) == 1
     if 2 * np.count_nonzero(single) < n:

@@ -13,7 +13,6 @@ import time
 import daqp
 import numpy as np
 
-from . import via_qpsolvers
 from .problem import COLD, Problem, Solution, Status
 from .traits import settings
 
@@ -35,6 +34,8 @@ def solve(
 ) -> Solution:
     """The answer of DAQP [Arnstrom 2022], not yet judged."""
     if problem.has_sparse:
+        from . import via_qpsolvers  # it loads every solver that is installed
+
         return via_qpsolvers.solve(
             problem,
             method="daqp",

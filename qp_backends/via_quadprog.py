@@ -12,7 +12,6 @@ import time
 
 import quadprog
 
-from . import via_qpsolvers
 from .problem import COLD, Problem, Solution, Status
 from .traits import TRAITS
 
@@ -40,6 +39,8 @@ def solve(
             y[below] -= lower
             seconds = time.perf_counter() - start
             return Solution(x, y, Status.SOLVED, seconds, iterations=int(steps[0]))
+    from . import via_qpsolvers  # it loads every solver that is installed
+
     return via_qpsolvers.solve(
         problem,
         method=method,

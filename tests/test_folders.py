@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
+    "kernels",
     "solvers",
     "robots",
     "measuring",

@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     InGroups,
     Output,
     options_from,
+    plain_option,
     result_options,
 )
 from minimax_cal.fitting.calibrate import calibrate
@@ -22,7 +23,10 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
+from minimax_cal.kernels.choice import work
 from minimax_cal.reporting.plots.figures import save_errors
+
+BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
 @click.command(name="calibrate", cls=InGroups)
@@ -30,7 +34,8 @@ from minimax_cal.reporting.plots.figures import save_errors
 @DATA
 @options_from(Options)
 @ROWS
-@click.option(
+@plain_option(
+    "What is known",
     "--bootstrap",
     "replicates",
     type=int,
@@ -42,8 +47,10 @@ def calibrate_command(
     robot: str, data: Path, replicates: int | None, in_rows: bool, to: Output, **chosen: Any
 ) -> int:
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
-    with to.stages() as progress:
-        fit = calibrate(robot, options.measured(data, in_rows), progress=progress, **chosen)
+    measured = options.measured(data, in_rows)
+    brief = replicates is None and measured.poses <= BRIEF
+    with work(brief=brief), to.stages() as progress:
+        fit = calibrate(robot, measured, progress=progress, **chosen)
         more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
     if to.deliver(lambda: text_of(fit, *more), fit.status):

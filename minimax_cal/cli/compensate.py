@@ -15,36 +15,48 @@ from minimax_cal.cli.options import (
     RUNG,
     SAFE_CELLS,
     WIDTH,
+    InGroups,
     Output,
     options_of,
+    plain_option,
     result_options,
 )
 from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.target_file import read_targets
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import visible
 from minimax_cal.robots.robot import load_robot
 
+HOW = "How targets are corrected"
 
-@click.command(name="compensate")
+
+@click.command(name="compensate", cls=InGroups)
 @FIT
 @click.argument("targets", type=PATH)
-@click.option(
-    "--robot", help="Nominal robot of the controller, file or name [default: that of the fit]."
+@plain_option(
+    HOW,
+    "--robot",
+    help="The nominal robot of the controller, file or name [default: that of the fit].",
 )
 @options_of(
     compensate,
     frame=Option(
         "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
-        "them), flange (the base so, the flange as drawn), own (on the calibrated base)."
+        "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
+        group=HOW,
     ),
-    tolerance=Option("What may remain of a target that counts as reached.", "mm"),
+    tolerance=Option("What may remain of a target that counts as reached.", "mm", group=HOW),
     most_change=Option(
-        "Most that a joint may change (a slide 8.7 mm per degree).", "deg", flag="--max-change"
+        "The most that a joint may change (a slide 8.7 mm per degree).",
+        "deg",
+        flag="--max-change",
+        group=HOW,
     ),
-    lever=Option("What a radian counts as [default: the targets' own].", "mm"),
-    clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
+    lever=Option("What a radian counts as [default: the targets' own].", "mm", group=HOW),
+    clock=Option(
+        "Take effects of time as at this moment of the calibration's session, 0 to 1.", group=HOW
+    ),
 )
 @SAFE_CELLS
 @RUNG
@@ -62,9 +74,7 @@ def compensate_command(
     found = compensate(fit, given.data, nominal, **chosen)
     to.notice(*found.notices)
     text = to.cells(given.corrected(found), safe_cells)
-    if to.path:
-        write_whole(to.path, text)
-        to.wrote(to.path)
+    to.write_rows(lambda: text, lambda: json_text(found.to_dict()))
     if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
     elif to.path:

@@ -25,7 +25,6 @@ from minimax_cal.diagnosing.gap import (
 )
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.result import Diagnosis, Step
-from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
 from minimax_cal.diagnosing.where import Where, where
@@ -157,7 +156,6 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=reasons(verdict, steps, floor, findings, share, interval, structure_left, beyond),
         findings=tuple(findings),
         ladder=tuple(steps),
         floor=floor,

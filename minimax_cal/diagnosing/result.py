@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
+from minimax_cal.evidence.alternatives import BAND, ENOUGH
+from minimax_cal.evidence.selection import LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.arrays import Array
@@ -34,7 +36,12 @@ FAULTS = {
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
 }
+PEOPLES = {  # how people read a unit of the file
+    "rad": (1e3, "mrad"),
+    "rad/(N m)": (1e3, "mrad/(N m)"),
+}
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
+NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -53,6 +60,11 @@ class Alternative:
     power: float
     loss: float
     separate_with: str = ""
+
+    @property
+    def helps(self) -> bool:
+        """Whether a measurement was found that is worth its while."""
+        return bool(self.separate_with) and not self.separate_with.startswith(NONE_HELPS)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -101,21 +113,16 @@ class Finding:
     @property
     def at(self) -> str:
         """Where, in words."""
-        place = self.term.place
-        if place == "all":
-            return "of the whole arm"
-        return {"J": f"at joint {place[1:]}", "L": f"at link {place[1:]}"}.get(
-            place[0] if place[1:].isdigit() else "", f"at {place}"
-        )
+        return in_words(self.term.place)
 
     @property
-    def place(self) -> str:
-        """Where, and the lines of the file that a fault of the data concerns."""
+    def lines(self) -> str:
+        """The lines of the file that a fault of the data concerns."""
         if not self.rows:
-            return self.at
+            return ""
         more = len(self.rows) - SHOWN_LINES
         named = ", ".join(map(str, self.rows[:SHOWN_LINES]))
-        return f"{self.at} (line {named}{f' and {more} more' if more > 0 else ''})"
+        return f" (line {named}{f' and {more} more' if more > 0 else ''})"
 
     @property
     def chance(self) -> str:
@@ -178,8 +185,7 @@ class Step:
 class Diagnosis:
     """What is still wrong with a calibrated robot.
 
-    status: of the geometric fit.  verdict: one of VERDICTS.  reasons: one sentence each, why.
-    findings: by share of the gap.
+    status: of the geometric fit.  verdict: one of VERDICTS.  findings: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     sought anew without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, with its interval.
@@ -193,7 +199,6 @@ class Diagnosis:
     robot: str
     status: Status
     verdict: str
-    reasons: tuple[str, ...]
     findings: tuple[Finding, ...]
     ladder: tuple[Step, ...]
     floor: Floor
@@ -223,6 +228,21 @@ class Diagnosis:
         """For a notebook."""
         tables = "\n".join(table.html() for table in self.tables())
         return f"<p>{escape(self.headline())}</p>\n{tables}"
+
+    @cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """The verdict and why, in sentences."""
+        from minimax_cal.diagnosing.sentences import reasons
+
+        return reasons(self)
+
+    @property
+    def by_rung(self) -> list[Finding]:
+        """The findings in the order of the ladder, faults of the data first."""
+        rungs = [step.name for step in self.ladder]
+        names = [f"+ {f.term.effect} {f.term.place}" for f in self.findings]
+        at = [rungs.index(name) if name in rungs else 0 for name in names]
+        return [self.findings[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
@@ -342,30 +362,31 @@ class Diagnosis:
         )
 
     def effects_table(self) -> Table:
-        """The effects found, with what each does for held-out poses."""
-        rows = tuple(
-            (f.term.effect, f.place, f.cause, 100.0 * f.share + 0.0, f.before, f.after, f.chance)
-            for f in self.findings
-        )
-        header = (
-            "effect",
-            "place",
-            "cause",
-            "share of gap %",
-            "before mm",
-            "after mm",
-            "by chance",
-        )
-        return Table("effects found, the largest first; held-out RMS before and after", header,
-                     rows, ("", "", "", ".0f", ".4f", ".4f", ""))  # fmt: skip
+        """The effects found, with what each does for held-out poses; tentative ones last."""
+        found = sorted(self.by_rung, key=lambda f: not established(f))
+        rows: list[tuple[TableCell, ...]] = [
+            (f"{f.term.effect} {f.term.place}{f.lines}",
+             "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
+             100.0 * f.share + 0.0, f.before, f.after, f.chance,
+             "established" if established(f) else "tentative")
+            for i, f in enumerate(found)
+        ]  # fmt: skip
+        title = f"effects found, rung by rung; by chance, {LEVEL:g} is rare enough"
+        header = ("effect", "cause", "share of gap %", "before mm", "after mm", "by chance",
+                  "evidence")  # fmt: skip
+        formats = ("", "", ".0f", ".4f", ".4f", "", "")
+        shown = len(header) - all(map(established, found))  # without the column that says one thing
+        return Table(title, header[:shown], tuple(row[:shown] for row in rows), formats[:shown])
 
     def parameter_table(self) -> Table:
-        """The parameters of every effect found."""
+        """The parameters of every effect found: millimetres and milliradians."""
         rows = tuple(
-            (f.term.effect, f.term.place, p["name"], p["value"], number(p["sigma"]), p["unit"])
-            for f in self.findings
+            (f.term.effect, f.term.place, p["name"], scale * p["value"],
+             scale * number(p["sigma"]), unit)
+            for f in self.by_rung
             for p in f.parameters()
-        )
+            for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
+        )  # fmt: skip
         header = ("effect", "place", "parameter", "value", "sigma", "unit")
         return Table("parameters of the effects", header, rows, ("", "", "", ".4g", ".2g", ""))
 
@@ -374,12 +395,16 @@ class Diagnosis:
         rows = tuple(
             (f"{f.term.effect} {f.term.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
              a.separate_with or "no measurement considered would")
-            for f in self.findings
+            for f in self.by_rung
             for a in f.alternatives
         )  # fmt: skip
         header = ("named", "or rather", "likeness", "power", "fits worse by",
                   "what to measure next")  # fmt: skip
-        return Table("rivals that these data do not rule out", header, rows,
+        title = (
+            f"rivals that these data do not rule out; likeness 1 is the same motion, power "
+            f"{ENOUGH:.0f} tells apart, worse by {BAND:.0f} is much"
+        )
+        return Table(title, header, rows,
                      ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
 
     def untestable_table(self) -> Table:
@@ -399,6 +424,19 @@ class Diagnosis:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+
+def established(finding: Finding) -> bool:
+    """Whether the evidence suffices; so it does for every effect of a file that tells nothing."""
+    return bool(getattr(finding, "established", True))
+
+
+def in_words(place: str) -> str:
+    """A place, as at joint 2."""
+    if place == "all":
+        return "of the whole arm"
+    kind = {"J": "joint", "L": "link"}.get(place[:1]) if place[1:].isdigit() else None
+    return f"at {kind} {place[1:]}" if kind else f"at {place}"
 
 
 def load_diagnosis(path: Path | str) -> Diagnosis:

@@ -152,7 +152,6 @@ class DiagnosisPart(Part):
     robot: str
     status: Status
     verdict: Literal["none", "named", "one_of", "unknown", "not_repeatable"]
-    reasons: tuple[str, ...]
     effects: tuple[FindingPart, ...]
     gap: GapPart
     noise: NoisePart = NoisePart()
@@ -173,14 +172,14 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
             "minimax-cal"
         )
     if content.get("kind") != "diagnosis":
-        raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose -o")
+        raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose")
     part = checked(DiagnosisPart, content, source)
     key = "rungs" if content.get("rungs") else "cells"  # an earlier version kept two of them
     cells = tuple(
         cell_from_dict(cell, f"{source}: {key}[{i}]") for i, cell in enumerate(content.get(key, ()))
     )
     if len({(cell.robot.joints, cell.target_names) for cell in cells}) > 1:
-        raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose -o")
+        raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose")
     if key == "cells":
         return assembled(content, source, part, cells)
     return replace(assembled(content, source, part, cells[1:]), nominal=cells[0])
@@ -196,7 +195,6 @@ def assembled(
         robot=part.robot,
         status=part.status,
         verdict=part.verdict,
-        reasons=part.reasons,
         findings=tuple(finding.finding(fitted) for finding in part.effects),
         ladder=tuple(rung.rung() for rung in part.gap.ladder),
         floor=Floor(

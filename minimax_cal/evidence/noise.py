@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.scalar import least_between
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
 FREE = 3  # degrees of freedom below which no noise is told from another
@@ -175,10 +175,7 @@ def likeliest(
     if best:
         low, high = np.log(RATIOS[max(best - 1, 1)]), np.log(RATIOS[min(best + 1, len(RATIOS) - 1)])
         if high > low:
-            found = minimize_scalar(
-                lambda x: float(parts(np.exp([x]))[0][0]), bounds=(low, high), method="bounded",
-                options={"xatol": 0.05},
-            )  # fmt: skip
-            ratio = float(np.exp(found.x))
+            found, _ = least_between(lambda x: float(parts(np.exp([x]))[0][0]), low, high, 0.05)
+            ratio = float(np.exp(found))
     variance = float(parts(np.array([ratio]))[1][0]) / dof
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.checks import POOR_FIT, check_plausible
@@ -39,6 +39,7 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
+from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps, stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
@@ -51,7 +52,9 @@ from minimax_cal.measuring.measurements import Measurements, measurements, read_
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
@@ -64,12 +67,16 @@ ACTIVE = 1e-6  # a function equals the largest, relative
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Measurements as they are used: all poses, those of the fit, those held out; remarks."""
+    """Measurements as they are used: all poses, those of the fit, those held out; remarks.
+
+    near: (3, 3) rotation of the base that fits all poses best, where it was looked for.
+    """
 
     data: Measurements
     train: Measurements
     held: Measurements
     notices: tuple[str, ...]
+    near: Array = field(default_factory=lambda: EVERYWHERE)
 
 
 def calibrate(
@@ -85,8 +92,9 @@ def calibrate(
     instrument: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
+    only: str = "",
     priors: Mapping[str, float | str] | None = None,
-    method: str = "snllm",
+    method: str = AUTO,
     lever: float | None = None,
     hessian: str = "gauss-newton",
     distance: str = "two-sided",
@@ -106,7 +114,8 @@ def calibrate(
     ...) or region, whose poses are held out together.  instrument: u95 of a coordinate, as
     10um+2.5um/m, where the data do not say.  cv: judge every pose by a fit without it, which is
     done anyway where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list
-    or a text with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad],
+    or a text with commas.  only: offsets, for the joints' zero positions alone.
+    priors: sigma of a parameter's deviation from nominal, by name [m, rad],
     or a text as 0.5mm.  method: of the least squares.  lever: what a radian counts as in the pose
     objective [m], the targets' own unless given.  hessian: gauss-newton or bfgs.  distance: form of
     the distance constraints, two-sided, squared or off; distance_tolerance: theirs [m], as measured
@@ -129,6 +138,7 @@ def calibrate(
         instrument=instrument,
         fix=listed(fix),
         free=listed(free),
+        only=only,
         priors=sigmas_of(priors or {}),
         method=method,
         lever=lever,
@@ -146,7 +156,7 @@ def calibrate(
     poses = parted(robot, data, options)
     progress("start")
     options = with_jump(robot, poses, options, progress)
-    solved = fit_cell(robot, poses.train, options, progress)
+    solved = fit_cell(robot, poses.train, options, progress, poses.near)
     fit = judged(robot, options, poses, solved, began)
     for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
         warnings.warn(doubt, CalibrationWarning, stacklevel=2)
@@ -205,9 +215,10 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         notices += (f"left out: {names}, measured at fewer than {LEAST_POSES} training poses",)
         data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
         objective_of(options.objective, data)
+    near = EVERYWHERE
     if len(np.unique(groups(train))) >= LEAST_POSES:
-        check_plausible(robot, data)
-    return Parts(data, train, held, notices)
+        near = check_plausible(robot, data).state.rotation
+    return Parts(data, train, held, notices, near)
 
 
 def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) -> Options:
@@ -278,7 +289,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         prior=solved.estimator.model.prior.weight,
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
-        beyond=beyond_of(robot, options, data, held, solved, suspects),
+        claim=partial(beyond_of, robot, options, data, held, solved, suspects),
         error_crossed=crossed_of(robot, options, data, held, solved),
     )
 
@@ -347,7 +358,7 @@ def parameter_table(robot: Robot, solved: Solved) -> Parameters:
     axes, more = solved.nominal.rotation, len(solved.units)
 
     def values(x: State, frames: Frames) -> Array:
-        turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
+        turn = rotation_vector(axes.T @ x.rotation)
         parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
         stood = jumps(frames, x.base)
         effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))

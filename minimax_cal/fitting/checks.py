@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
@@ -35,8 +35,8 @@ def measured_and_predicted(model: Model, state: State) -> tuple[Array, Array]:
     return in_base(state, model.y), kinematics.points(links, state.target_positions)
 
 
-def check_plausible(robot: Robot, data: Measurements) -> None:
-    """Raise DataError for slips that show once base and targets are fitted: names, units, signs.
+def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
+    """The fit of base and targets; DataError for slips that show then: names, units, signs.
 
     All rows are looked at, those held out too: they judge the fit.
     """
@@ -44,7 +44,7 @@ def check_plausible(robot: Robot, data: Measurements) -> None:
     check_names(robot, data, given)
     limit = POOR_FIT * robot.reach()
     if np.sqrt(given.mean_square) <= limit:
-        return
+        return given
     trials = [("the measurement frame looks left-handed; reverse one of its axes", given.mirrored)]
     few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
     for text, mended in suspicions(robot, data.take(few)):
@@ -57,6 +57,7 @@ def check_plausible(robot: Robot, data: Measurements) -> None:
             f"{data.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(given.mean_square):.3g} mm)"
         )
+    return given
 
 
 def check_names(robot: Robot, data: Measurements, given: BaseFit) -> None:
@@ -122,7 +123,7 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     off = measured[:, :, None, bad] - predicted[:, :, bad, None]  # of points b at pose a
     both = model.seen[:, None, bad] & model.seen[:, bad, None]
     distance = np.sqrt((off**2).sum(axis=1) * both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
-    pose, points = linear_sum_assignment(distance)
+    pose, points = scipy.optimize.linear_sum_assignment(distance)
     fits = distance[pose, points] < max(CLOSE * typical, LEAST * robot.reach() / 4.0)
     return bad, bad[np.where(fits, points, pose)]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from html import escape
 from importlib import import_module
 from importlib.metadata import version
@@ -199,9 +199,13 @@ class Provenance:
     @staticmethod
     def of(robot: Robot, data: Measurements, settings: Mapping[str, object]) -> Provenance:
         """Of this run, on this machine."""
-        versions = {name: version(name) for name in PACKAGES}
-        versions["python"] = platform.python_version()
-        return Provenance(robot.name, data.source, data.digest, dict(settings), versions)
+        return Provenance(robot.name, data.source, data.digest, dict(settings), versions())
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Of the packages that a result depends on: asked once, for it takes as long as a fit."""
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 @dataclass(frozen=True)
@@ -249,7 +253,7 @@ class Fit:
     cell: the calibrated robot with base and targets.  nominal: the nominal robot with its best
     base and targets, None where an old file does not tell it.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
-    poses.  beyond: on whole parts that were left out.
+    poses.  claim: looks for `beyond`.
     uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
     minimax: what the worst rests on, if it was the objective.  certificate: how far the worst point
     is from its optimum.  trace: cost at each iterate of the least squares [m^2].
@@ -289,7 +293,7 @@ class Fit:
     prior: Array
     widening: float
     provenance: Provenance
-    beyond: Beyond
+    claim: Callable[[], Beyond]
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
 
@@ -314,6 +318,11 @@ class Fit:
     def train(self) -> Measurements:
         """The training poses."""
         return self.data.take(~self.held)
+
+    @cached_property
+    def beyond(self) -> Beyond:
+        """On whole parts that were left out; looked for when it is first asked for."""
+        return self.claim()
 
     @property
     def errors(self) -> Mapping[str, Array]:
@@ -419,6 +428,14 @@ class Fit:
     def predict(self, q: Array) -> Array:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
+
+    def inverse(self, pose: Array, near: Array | None = None) -> Array:
+        """Joints (..., n) that bring the flange to poses in the base, effects counted.
+
+        pose: (..., 4, 4) [m].  near: joints to start from, (n,) or (..., n), which choose among the
+        ways of the arm [rad, m].  More: `Cell.inverse`; without effects: `Robot.inverse`.
+        """
+        return self.cell.inverse(pose, near)
 
     def plot(self) -> Any:
         """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""

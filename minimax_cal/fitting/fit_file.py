@@ -390,7 +390,7 @@ def assembled(
         prior=arrays.get("prior", np.zeros(names.count)),
         widening=part.widening,
         provenance=part.provenance,
-        beyond=part.accuracy.beyond.beyond(),
+        claim=part.accuracy.beyond.beyond,
         stated=intervals_of(part, arrays),
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
     )

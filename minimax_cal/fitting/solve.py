@@ -14,7 +14,7 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
-from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
+from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
@@ -38,10 +38,11 @@ from minimax_cal.modelling.model import (
     pose_weights,
     with_poses,
 )
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares, minimax
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 
@@ -155,18 +156,16 @@ class Task:
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
+        if not np.isfinite(self.sigma).any():
+            return model, nearby(model, begin, self.options.method)
         sigma = np.pad(self.sigma, (0, len(model.fields)), constant_values=np.inf)
         points = float(model.counts.sum())
-        method = METHODS[self.options.method]
         mean_square = self.frame.mean_square / 3.0
-        for _ in range(PRIOR_ROUNDS if np.isfinite(sigma).any() else 1):
+        for _ in range(PRIOR_ROUNDS):
             model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
-            problem = SumOfSquares(model)
-            found = least_squares.solve(
-                problem, begin.batch(), 1, points, method, least_squares.NEAR
-            )
+            found = nearby(model, begin, self.options.method)
             state = found.x.take(np.array(0))
-            _, _, gram = problem.normal(state)
+            _, _, gram = SumOfSquares(model).normal(state)
             weight = np.diag(model.prior.weight[model.active])
             paid = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
             previous = mean_square
@@ -205,13 +204,18 @@ class Stage:
 
 
 def fit_cell(
-    robot: Robot, data: Measurements, options: Options, progress: Progress = silent
+    robot: Robot,
+    data: Measurements,
+    options: Options,
+    progress: Progress = silent,
+    near: Array = start.EVERYWHERE,
 ) -> Solved:
     """Fit the chosen objective to all poses of the data.  Raises OptionError, DataError.
 
-    data: with the points of all sessions in one frame (`stations.stationed`).
+    data: with the points of all sessions in one frame (`stations.stationed`).  near: (3, 3) the
+    base's rotation where it is known already, as in `start.fit_base`.
     """
-    task, begun = prepared(robot, data, options), data.frames
+    task, begun = prepared(robot, data, options, near), data.frames
     mix = NO_MIX
     if options.objective == "pose":
         check_poses(data)
@@ -254,7 +258,9 @@ def fit_cell(
     )
 
 
-def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
+def prepared(
+    robot: Robot, data: Measurements, options: Options, near: Array = start.EVERYWHERE
+) -> Task:
     """The task, with poses enough for its unknowns.  Raises OptionError, DataError."""
     base, k = model_of(robot, data), len(data.target_names)
     allowed, order, sigma = wanted(robot, base, options)
@@ -267,7 +273,7 @@ def prepared(robot: Robot, data: Measurements, options: Options) -> Task:
     free = steps_of(data.frames)
     checks.check_count(telling, poses, unknowns - following + free, known)
     share = np.ones(k) if only < 0 else np.where(np.arange(k) == only, 1.0, ASIDE)
-    frame = start.fit_base(base, robot.mdh)
+    frame = start.fit_base(base, robot.mdh, near)
     return Task(robot, data, options, base, frame, reference, share, allowed, order, sigma)
 
 
@@ -275,6 +281,10 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
     names = model.names
     allowed = ~names.match(options.fix, "fix")
+    if options.only == OFFSETS:
+        n, zeros = robot.joints, np.zeros(names.count, dtype=bool)
+        zeros[np.arange(n) + np.where(robot.prismatic, n, 2 * n)] = True
+        allowed &= zeros | ~names.links
     order = identify.drop_order(robot, names)
     kept = names.match(options.free, "free")
     if (kept & ~allowed).any():
@@ -380,7 +390,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
 
     The turn that fits the errors best vanishes for half a turn too: start near the answer.
     """
-    points, method = float(model.counts.sum()), METHODS[task.options.method]
+    points, method = float(model.counts.sum()), method_of(task.options.method)
     problem = SumOfSquares(model)
     return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
 

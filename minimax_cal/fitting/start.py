@@ -6,12 +6,13 @@ over base rotations finds the basin of the global minimum.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.kernels.choice import kernels, ready
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
@@ -20,7 +21,20 @@ from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
 SCREEN, KEEP, ROUNDS = 15, 6, 8  # steps of the first look, starts that go on, further rounds
 ENOUGH = 60  # poses that tell one basin from another
-OCTAHEDRAL = Rotation.create_group("O").as_matrix()  # the 24 turns of a cube
+EVERYWHERE: Array = np.zeros((0, 3))  # where to look for a base of which nothing is known
+
+
+def turns_of_a_cube() -> Array:
+    """(24, 3, 3) the rotations that bring a cube onto itself."""
+    signed = (
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    )
+    return np.stack([turn for turn in signed if np.linalg.det(turn) > 0.0])
+
+
+CUBE = turns_of_a_cube()
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,33 +50,36 @@ class BaseFit:
     mirrored: float
 
 
-def fit_base(model: Model, mdh: Array) -> BaseFit:
+def fit_base(model: Model, mdh: Array, near: Array = EVERYWHERE) -> BaseFit:
     """The global best base and targets for a given geometry.
 
     With S = R_b' the residual S y - c - R_n t - o_n is linear in (S, c, t).  Eliminating c and t
     leaves a quadratic in the nine entries of S; over the rotations it is minimised from its
     unconstrained minimum projected by SVD, and from the 24 turns of a cube, all at once.
+    near: (3, 3) rotation of a base that is known to be close, from which alone it then is.
     """
     centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
     plain, turned, known = np.split(linear_rows(model, mdh, centre), (-10, -1), axis=1)
     # one QR eliminates c and t and condenses the rest to ten columns
-    plain_q, _ = np.linalg.qr(plain)
+    plain_q, plain_r = np.linalg.qr(plain)
     rest = np.concatenate([turned, known], axis=1)
-    _, condensed = np.linalg.qr(rest - plain_q @ (plain_q.T @ rest))
-    matrix, right = condensed[:, :9], condensed[:, 9]
-    guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
-    starts = np.concatenate([project(guess[None]), OCTAHEDRAL])
-
-    def best(handed: float) -> tuple[Array, float]:
-        found, cost = polish(handed * matrix, right, starts)
-        winner = int(np.argmin(cost))
-        return handed * found[winner], float(cost[winner]) / np.count_nonzero(model.seen)
-
-    turn, mean_square = best(1.0)
-    _, mirrored = best(-1.0)
+    inside = plain_q.T @ rest
+    condensed = np.asarray(np.linalg.qr(rest - plain_q @ inside, mode="r"))
+    matrix, right = np.ascontiguousarray(condensed[:, :9]), condensed[:, 9].copy()
+    if len(near):
+        starts, signs = near.T[None], np.ones(1)
+    else:
+        guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
+        starts = np.concatenate([project(g) for g in (guess[None], -guess[None])] + 2 * [CUBE])
+        signs = np.repeat([1.0, -1.0, 1.0, -1.0], [1, 1, len(CUBE), len(CUBE)])
+    found, cost = kernels().polish(matrix, right, *ready(starts), signs)
+    points = np.count_nonzero(model.seen)
+    winner = int(np.argmin(np.where(signs > 0.0, cost, np.inf)))
+    turn, mean_square = found[winner], float(cost[winner]) / points
+    mirrored = float(cost[signs < 0.0].min(initial=np.inf)) / points
     # an ill-conditioned set of poses leaves some of c, t open: the least solution then
-    remaining = turned @ turn.reshape(9) - known[:, 0]
-    lengths = np.linalg.lstsq(plain, remaining, rcond=1e-10)[0]
+    remaining = inside[:, :9] @ turn.reshape(9) - inside[:, 9]
+    lengths = np.linalg.lstsq(plain_r, remaining, rcond=1e-10)[0]
     shift, targets = lengths[:3], lengths[3:].reshape(-1, 3)
     state = State(mdh, turn.T, centre + turn.T @ shift, targets)
     return BaseFit(state, mean_square, mirrored)
@@ -96,39 +113,6 @@ def project(matrix: Array) -> Array:
     return np.asarray((u * flip[..., None, :]) @ vt)
 
 
-def polish(matrix: Array, right: Array, starts: Array) -> tuple[Array, Array]:
-    """Minimise |matrix vec(S) - right|^2 over rotations S from each start (B, 3, 3)."""
-    turn = starts
-    axes = kinematics.hat(np.eye(3))
-    damping = np.full(len(starts), 1e-3)
-
-    def residual(s: Array) -> Array:
-        return np.asarray(s.reshape(-1, 9) @ matrix.T - right)
-
-    error = residual(turn)
-    cost = (error**2).sum(-1)
-    for _ in range(100):
-        jacobians = (turn[:, None] @ axes).reshape(
-            -1, 3, 9
-        ) @ matrix.T  # S exp(hat(w)), (B, 3, rows)
-        gram = jacobians @ np.swapaxes(jacobians, -1, -2)
-        scale = np.trace(gram, axis1=-2, axis2=-1)[:, None, None] + 1e-300
-        pull = -(jacobians @ error[..., None])
-        step = np.linalg.solve(gram + damping[:, None, None] * scale * np.eye(3), pull)[..., 0]
-        trial = turn @ kinematics.rotation(step)
-        after_error = residual(trial)
-        after = (after_error**2).sum(-1)
-        better = after < cost
-        turn = np.where(better[:, None, None], trial, turn)
-        error = np.where(better[:, None], after_error, error)
-        small = np.abs(cost - after) <= 1e-15 * cost
-        cost = np.where(better, after, cost)
-        damping = np.where(better, damping / 10.0, damping * 4.0)
-        if np.all(small | (damping > 1e6)):
-            break
-    return turn, cost
-
-
 def search(
     model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = ROUNDS
 ) -> LeastSquares[State]:
@@ -139,12 +123,14 @@ def search(
     in each start: what is far off is mostly one or two zero positions.  Returns the best fits on
     all poses, best first.
     """
+    from scipy.spatial.transform import Rotation
+
     rng = np.random.default_rng(0)  # the same data give the same answer
-    found = descend(model, starts_at(model, np.repeat(mdh[None], 24, axis=0), OCTAHEDRAL), points)
+    found = descend(model, starts_at(model, np.repeat(mdh[None], 24, axis=0), CUBE), points)
     for _ in range(rounds if good > 0.0 else 0):
         if np.sqrt(found.cost[0] / points) <= good:
             break
-        turns = OCTAHEDRAL @ Rotation.random(rng=rng).as_matrix()
+        turns = CUBE @ Rotation.random(rng=rng).as_matrix()
         links = np.repeat(mdh[None], 24, axis=0)
         for link in links:
             spots = [(rng.integers(len(mdh)), rng.integers(2, 4)) for _ in range(2)]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.start import fit_base, project
 from minimax_cal.ground.arrays import Array
@@ -21,6 +20,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot
 
 LEAST = 3  # points that give a frame
@@ -130,5 +130,5 @@ def jumps(frames: Frames, base: Array) -> Array:
     for frame in list(frames.values())[1:]:
         jump = np.linalg.inv(base) @ np.linalg.inv(frame) @ base
         turn = jump[:3, :3]
-        out += [turn.T @ jump[:3, 3], Rotation.from_matrix(turn).as_rotvec()]
+        out += [turn.T @ jump[:3, 3], rotation_vector(turn)]
     return np.concatenate([np.zeros(0), *out])

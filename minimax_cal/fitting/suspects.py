@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from scipy import stats
-from scipy.optimize import minimize_scalar
-from scipy.special import betaln, fdtr
+from scipy.special import betaln, fdtr, fdtrc, fdtri
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Table
@@ -21,6 +20,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
+from minimax_cal.solvers.scalar import least_between
 
 LEVEL = 0.01  # share of a list that is expected to be ordinary points
 FOLLOWED = 0.01  # a fit that leaves less of a direction's variance hides what is wrong there
@@ -101,7 +101,7 @@ class Spread:
         judged = found.directions > 0
         directions = np.maximum(found.directions, 1)
         ratio = found.square / directions / self.scale**2
-        return np.where(judged, stats.f.sf(ratio, directions, self.dof), 1.0)
+        return np.where(judged, fdtrc(directions, self.dof, ratio), 1.0)
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
@@ -125,7 +125,7 @@ def spread_of(found: Scores, dof: float) -> Spread:
     mean_square = found.square[judged] / directions
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
-    middle = np.median(mean_square / stats.f.ppf(0.5, directions, dof))
+    middle = np.median(mean_square / fdtri(directions, dof, 0.5))
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(ROUNDS):
@@ -161,12 +161,10 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
     middle = np.log(usual)
     best: list[tuple[float, Spread]] = []
     for tail in (dof, *(tail for tail in TAILS if tail < dof)):
-        found = minimize_scalar(
-            loss, bounds=(middle - 2.0, middle + 2.0), args=(tail,), method="bounded"
-        )
+        at, value = least_between(partial(loss, tail=tail), middle - 2.0, middle + 2.0)
         doubt = CLEARLY if tail < dof else 0.0
-        spread = Spread(max(float(np.exp(found.x)), LEAST_SCALE), float(tail))
-        best.append((float(found.fun) + doubt, spread))
+        spread = Spread(max(float(np.exp(at)), LEAST_SCALE), float(tail))
+        best.append((value + doubt, spread))
     return min(best, key=lambda trial: trial[0])[1]
 
 
@@ -269,8 +267,8 @@ def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Arra
 def table_of(suspects: Sequence[Suspect]) -> Table:
     """The list for people."""
     return Table(
-        "points that stand out (may be real effects: run minimax-cal diagnose)",
-        ("line", "target", "distance mm", "score", "chance", "pose", "of the pose"),
+        "points that stand out, 1 % of such a list by chance; they may be real effects",
+        ("line", "target", "distance mm", "score", "by chance", "pose", "of the pose"),
         tuple(
             (s.line, s.target, 1e3 * s.distance, s.score, s.p_value,
              "held out" if s.held else "training", "all targets" if s.together else "")

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import gammaincinv, stdtrit
 
 from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
 from minimax_cal.ground.arrays import Array
@@ -245,7 +245,7 @@ class Uncertainty:
 
 def quantile(level: float, dof: float) -> float:
     """Student's two-sided quantile.  dof: degrees of freedom, at least one counts."""
-    return float(stats.t.ppf(0.5 + 0.5 * level, max(dof, 1.0)))
+    return float(stdtrit(max(dof, 1.0), 0.5 + 0.5 * level))
 
 
 def scales(units: tuple[str, ...]) -> Array:
@@ -284,9 +284,7 @@ def by_poses(poses: Poses, group: Array) -> Array:
     """
     _, member = np.unique(group, return_inverse=True)
     count, p = int(member.max()) + 1, poses.jacobian.shape[-1]
-    gram, score = np.zeros((count, p, p)), np.zeros((count, p))
-    np.add.at(gram, member, poses.gram)
-    np.add.at(score, member, poses.score)
+    gram, score = summed(poses.gram, member, count), summed(poses.score, member, count)
     try:
         np.linalg.cholesky((1.0 - ALONE) * poses.bread - gram)
     except np.linalg.LinAlgError:
@@ -294,6 +292,16 @@ def by_poses(poses: Poses, group: Array) -> Array:
     change = solve_normal(poses.bread - gram, score[..., None])[..., 0]
     prior = sandwich(poses, np.zeros((p, p)))
     return np.asarray((count - 1) / count * change.T @ change + prior)
+
+
+def summed(values: Array, member: Array, count: int) -> Array:
+    """(count, ...) sums over the rows (m, ...) with the same number.  member: (m,)."""
+    out = np.zeros((count, *values.shape[1:]))
+    if count == len(member):  # each alone
+        out[member] = values
+    else:
+        np.add.at(out, member, values)
+    return out
 
 
 def sandwich(poses: Poses, meat: Array) -> Array:
@@ -391,7 +399,7 @@ def holding_radius(covariance: Array, level: float = 0.95) -> Array:
     square = np.einsum("...ij,...ij->...", covariance, covariance)
     spread = np.where(mean > 0.0, square / np.where(mean > 0.0, mean, 1.0), 0.0)
     dof = np.where(square > 0.0, mean**2 / np.where(square > 0.0, square, 1.0), 1.0)
-    return np.asarray(np.sqrt(spread * stats.chi2.ppf(level, dof)))
+    return np.asarray(np.sqrt(spread * 2.0 * gammaincinv(0.5 * dof, level)))
 
 
 # ---- saved fits ------------------------------------------------------------------------------
@@ -401,7 +409,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     """From the JSON of a calibration: its key `covariance`.  Raises CalibrationError."""
     if "covariance" not in content:
         raise CalibrationError(
-            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate -o"
+            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate"
         )
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)

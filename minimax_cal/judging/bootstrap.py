@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.intervals import Interval
@@ -25,6 +24,7 @@ from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
 from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.minimax import Sqp
@@ -273,7 +273,7 @@ def determined(draws: Draws, gram: Array, prior: Array) -> Array:
 
 def between(start: State, end: State) -> Array:
     """(p,) the step that takes one state to another."""
-    turn = Rotation.from_matrix(start.rotation.T @ end.rotation).as_rotvec()
+    turn = rotation_vector(start.rotation.T @ end.rotation)
     return np.concatenate(
         [
             links_of(end.mdh - start.mdh),

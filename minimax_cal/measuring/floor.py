@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
@@ -14,12 +15,12 @@ from minimax_cal.measuring.measurements import Measurements
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
 FEWEST = 5  # repeated visits that tell
 RESAMPLES = 500
-USUAL = float(stats.chi2.median(3)) / 3.0  # median square of a Gaussian over its mean, in space
+USUAL = float(chdtri(3.0, 0.5)) / 3.0  # median square of a Gaussian over its mean, in space
 SIGMAS = 1.959964  # of a coordinate that a u95 holds
 # ISO 9283: repeatability is the mean distance from the middle plus three of its standard
 # deviations; of a Gaussian, alike in all directions, the RMS distance is this share of it.
 RMS_OF_REPEATABILITY = float(
-    stats.chi(3).moment(2) ** 0.5 / (stats.chi(3).mean() + 3.0 * stats.chi(3).std())
+    math.sqrt(3.0) / (math.sqrt(8.0 / math.pi) + 3.0 * math.sqrt(3.0 - 8.0 / math.pi))
 )
 
 

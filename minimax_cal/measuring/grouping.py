@@ -9,13 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.cluster.vq import kmeans2
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
@@ -27,6 +24,7 @@ from minimax_cal.measuring.measurements import Measurements
 REPEAT = 5e-4
 APART = 3.0  # the distance between clusters over those inside them
 FEWEST_CLUSTERS = 8  # fewer are regions of the workspace: `parts` leaves each out in its turn
+SORTED = 2000  # poses among which pairs are found by sorting, without a tree
 MOST = 3000  # poses among which clusters are looked for
 MOVES = 0.01  # a joint with less range does not move [rad, m]
 REGIONS = 5  # clusters of joint values that are left out in their turn
@@ -38,8 +36,19 @@ FEWEST = 3  # poses of a part
 
 def groups(data: Measurements) -> Array:
     """(m,) a number for each pose: rows at the same joints, or of the same `pose`, share it."""
-    near = KDTree(data.q).query_pairs(REPEAT, output_type="ndarray")
-    group = joined(near, data.poses)
+    if data not in FOUND:
+        FOUND[data] = repeats(data)
+    return FOUND[data].copy()
+
+
+# one calibration asks a dozen times; measurements are never changed in place
+FOUND: WeakKeyDictionary[Measurements, Array] = WeakKeyDictionary()
+
+
+def repeats(data: Measurements) -> Array:
+    """`groups`, looked for."""
+    near = close_pairs(data.q, REPEAT)
+    group = joined(near, data.poses) if len(near) else np.arange(data.poses)
     for label in np.unique(group[near[:, 0]]) if len(near) else ():
         rows = np.flatnonzero(group == label)
         if np.ptp(data.q[rows], axis=0).max() > 2.0 * REPEAT:  # a path, not a pose
@@ -50,6 +59,38 @@ def groups(data: Measurements) -> Array:
             same = np.isin(group, group[labels == label])
             group[same] = group[same].min()
     return numbered_by_joints(group, data.q)
+
+
+def close_pairs(q: Array, within: float) -> Array:
+    """(e, 2) rows of q (m, n) that lie so near each other."""
+    if len(q) > SORTED:
+        return scipy.spatial.KDTree(q).query_pairs(within, output_type="ndarray")
+    widest = q[:, np.argmax(np.ptp(q, axis=0))] if len(q) else q[:, 0]
+    order = np.argsort(widest, kind="stable")
+    found = [np.zeros((0, 2), dtype=int)]
+    for apart in range(1, len(q)):
+        first, second = order[:-apart], order[apart:]
+        near = np.flatnonzero(widest[second] - widest[first] <= within)
+        if not len(near):
+            break
+        pairs = np.stack([first[near], second[near]], axis=1)
+        found.append(pairs[np.linalg.norm(q[pairs[:, 0]] - q[pairs[:, 1]], axis=1) <= within])
+    return np.concatenate(found)
+
+
+def shortest_tree(q: Array) -> Array:
+    """(m - 1,) edges of the shortest tree that joins all rows of q (m, n) [Prim 1957].
+
+    They are the heights at which single linkage joins.
+    """
+    distance, outside = np.full(len(q), np.inf), np.ones(len(q), dtype=bool)
+    edges, at = [], 0
+    for _ in range(len(q) - 1):
+        outside[at] = False
+        distance = np.minimum(distance, np.linalg.norm(q - q[at], axis=1))
+        at = int(np.argmin(np.where(outside, distance, np.inf)))
+        edges.append(float(distance[at]))
+    return np.array(edges)
 
 
 def numbered_by_joints(group: Array, q: Array) -> Array:
@@ -67,8 +108,8 @@ def numbered_by_joints(group: Array, q: Array) -> Array:
 def joined(pairs: Array, count: int) -> Array:
     """(count,) number of the connected set of each member.  pairs: (e, 2)."""
     ones = np.ones(len(pairs), dtype=bool)
-    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    graph = scipy.sparse.coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1])
 
 
 def leaders(q: Array) -> Array:
@@ -94,6 +135,10 @@ def clusters(data: Measurements) -> Array:
     _, first = np.unique(group, return_index=True)
     if not 2 * FEWEST_CLUSTERS <= len(first) <= MOST:
         return group
+    steps = np.maximum(np.sort(shortest_tree(data.q[first])), REPEAT)
+    if (steps[1:] < APART * steps[:-1]).all():
+        return group
+    fcluster, linkage = scipy.cluster.hierarchy.fcluster, scipy.cluster.hierarchy.linkage
     tree = linkage(data.q[first], "single")
     height = np.maximum(tree[:, 2], REPEAT)
     for at in np.argsort(-(height[1:] / height[:-1])):
@@ -258,7 +303,9 @@ def regions(data: Measurements) -> Array:
     """(m,) number of the cluster of joint values that a pose is in, out of about `REGIONS`."""
     count = min(REGIONS, len(np.unique(groups(data))))
     seeded = np.random.default_rng(0)
-    return np.asarray(kmeans2(data.q, count, minit="++", seed=seeded, missing="warn")[1])
+    return np.asarray(
+        scipy.cluster.vq.kmeans2(data.q, count, minit="++", seed=seeded, missing="warn")[1]
+    )
 
 
 def region_name(data: Measurements, rows: Array) -> str:

@@ -11,6 +11,7 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import cached_property
 
 import numpy as np
 
@@ -94,7 +95,7 @@ class Names:
     target_names: tuple[str, ...]
     effects: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def all(self) -> tuple[str, ...]:
         """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..., effects."""
         links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]

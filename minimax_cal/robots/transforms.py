@@ -8,7 +8,6 @@ parallel ones, whose common normal is nowhere, it keeps d = 0 and uses beta [Hay
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.kinematics import hat
@@ -172,4 +171,4 @@ def shared_base(one: Array, other: Array) -> Array:
 
 def rotation_vector(rotation: Array) -> Array:
     """Axis times angle of a rotation (3, 3) [rad]."""
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+    return rotation_vector(rotation)

@@ -269,7 +269,6 @@
   }
 
   const shown = () => Number(document.querySelector("input[name=shown]:checked").value);
-  const spots = (points) => triples(points).map((p) => p.map((x) => x / 1e3));
 
   // The errors in two colours where a limit is given: within it, and beyond.
   function errorTraces(arms) {
@@ -283,12 +282,12 @@
       const some = size.map((s, i) => i).filter((i) => holds(size[i]));
       const flat = (list) => some.flatMap((i) => list[i]);
       const trace = { type: "scatter3d", name: `${name} (${some.length})`, legendgroup: name };
-      const at = spots(flat(points));
+      const at = triples(flat(points));
       return [
         { ...put({ ...trace, mode: "lines", hoverinfo: "skip", showlegend: false,
           line: { color: colour, width: 4 } },
         arrows(flat(points), flat(vectors), arms.steps[Number(byId("times").value)])) },
-        { ...trace, mode: "markers", x: at.map((p) => p[0]), y: at.map((p) => p[1]), z: at.map((p) => p[2]),
+        { ...put({ ...trace, mode: "markers" }, at),
           customdata: some.map((i) => arms.keys[i]), hovertemplate: "%{text}<extra></extra>",
           text: some.map((i) => `line ${arms.keys[i].replace(":", ", ")}: ${size[i].toFixed(3)} mm`),
           marker: { color: colour, symbol, size: symbol === "x" ? 4 : 3.5 } },

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FEWEST, between
@@ -27,7 +27,7 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
         spread = revisit_scatter(data)
         if len(spread) < FEWEST:
             return ()
-        seen, by = 1.96 * float(np.sqrt(np.median(spread) / stats.chi2.median(1))), "revisits"
+        seen, by = 1.96 * float(np.sqrt(np.median(spread) / chdtri(1.0, 0.5))), "revisits"
     ratio = seen / declared
     if ratio > 0.5 and (ratio < 2.0 or by == "revisits"):
         return ()

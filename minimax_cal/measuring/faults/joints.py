@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FEWEST
@@ -49,7 +49,7 @@ def lag(error: Array, path: Array) -> Lag:
         along / length,
         float(own.sum() / total.sum()),
         float(strange.sum() / total.sum()),
-        float(stats.binomtest(wins, len(error), 0.5, alternative="greater").pvalue),
+        float(scipy.stats.binomtest(wins, len(error), 0.5, alternative="greater").pvalue),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 FALSE_ALARM = 0.002  # of each test, over a whole data set
 ALIKE = 9.0  # squared standard scores that are no reason to prefer one target to another
@@ -15,4 +15,4 @@ def outlier_limit(count: int, tests: int, m: int) -> float:
     Widened by what the robust scatter of m values may be wrong.
     """
     wider = 1.0 + 2.5 * 1.17 / np.sqrt(m)
-    return float(stats.chi2.isf(FALSE_ALARM / tests, count) * wider**2)
+    return float(chdtri(count, FALSE_ALARM / tests) * wider**2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import Between, between, scatter
@@ -66,7 +66,7 @@ def find_step(off: Array, apart: Between) -> Step | None:
         if len(known) >= 2 * SHORTEST:
             best[pair], first = scan(off[pair, known])
             place[pair] = known[first]
-    limit = float(stats.chi2.isf(FALSE_ALARM / max(pairs * m, 1), 1))
+    limit = float(scipy.stats.chi2.isf(FALSE_ALARM / max(pairs * m, 1), 1))
     if not pairs or best.max() < limit:
         return None
     at = int(place[best.argmax()])
@@ -113,7 +113,7 @@ def scan(value: Array) -> tuple[float, int]:
     value: (m,).  0 where a steady drift explains the series as well.
     """
     m = len(value)
-    score = stats.norm.ppf((stats.rankdata(value) - 0.5) / m)
+    score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / m)
     score = (score - score.mean()) / max(float(score.std()), 1e-12)
     count = np.arange(SHORTEST, m - SHORTEST + 1)
     total = np.cumsum(score)[count - 1]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST
@@ -71,7 +71,7 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
             "frame",
             f"{data.source}: all targets stand elsewhere from {told}: was the instrument or the "
             "base moved, or another workspace measured? name the sessions in a column `session`, "
-            "or free the jump (--effects session_jump)",
+            "or free the jump with effects='session_jump'",
             rows,
             parameters=tuple(Amount("size", float(size), "m") for size in sizes),
         ),
@@ -181,6 +181,6 @@ def jump_between(poses: Rigid, first: int, last: int) -> int:
     best = int(np.argmin(apart))
     whole, two = float(poses.left(np.array(first), np.array(last))), float(apart[best])
     ratio = (whole - two) / 6.0 / max(two / dof, 1e-30)
-    chance = stats.f.sf(ratio, 6, dof) * len(at)
+    chance = fdtrc(6, dof, ratio) * len(at)
     clear = whole - two > CLEAR * poses.left(np.array(0), np.array(len(poses.value)))
     return int(at[best]) if clear and chance < 0.1 * FALSE_ALARM else 0

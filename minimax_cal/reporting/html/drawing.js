@@ -50,8 +50,7 @@ const drawing = (() => {
   const triples = (flat) => Array.from({ length: flat.length / 3 },
     (_, i) => flat.slice(3 * i, 3 * i + 3));
   const put = (trace, points) => ({ ...trace,
-    x: points.map((p) => p[0] / 1e3), y: points.map((p) => p[1] / 1e3),
-    z: points.map((p) => p[2] / 1e3) });
+    x: points.map((p) => p[0]), y: points.map((p) => p[1]), z: points.map((p) => p[2]) });
   const GAP = [NaN, NaN, NaN];
 
   // Lines with heads; a head lies in the plane of its arrow and the vertical.

@@ -6,6 +6,7 @@
   const paper = "paper" in root.dataset;
   const PAPER_WIDTH = 680; // pixels between the margins of A4
   const PAPER_HEIGHT = 0.8; // of the height on a screen
+  const NARROW = window.matchMedia("(max-width: 40rem)"); // no room for buttons beside the legend
   const figures = [...document.querySelectorAll(".chart")].map((element) => ({
     element, ...JSON.parse(element.nextElementSibling.textContent),
   }));
@@ -27,7 +28,7 @@
     figure.element.style.height = `${heightOf(figure)}px`;
     const layout = drawing.layoutOf(figure, colours, sizeOf(figure));
     return Plotly.react(figure.element, coloured(traces, colours), layout,
-      { ...CONFIG, ...buttons });
+      { ...CONFIG, ...buttons, displayModeBar: NARROW.matches ? false : "hover" });
   }
 
   function drawAll() {
