@@ -85,6 +85,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
     ),
+    "watch": (
+        "experiments.watch",
+        "Is a shifted joint found by ten poses, and how often is one named that did not move",
+    ),
     "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "simulator_gap": (
         "experiments.simulator_gap",

@@ -103,6 +103,8 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
         "plan", arm, "--poses", "4", "--fit", "plain.json", "--candidates", "40",
         "--separate", "joint_compliance:J2", "link_bending:L2", "--json",
     ]  # fmt: skip
+    yield "check", ["check", "plain.json", poses, "--tolerance", "rms 0.5", "--json"]
+    yield "compare", ["compare", "plain.json", "base.json", "--json"]
     yield "tradeoff", ["tradeoff", arm, poses, "--steps", "3", "--json"]
     yield "effects", ["effects", arm, poses, "--json"]
     yield "robots", ["robots", "--json"]

@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
+    "kernels",
     "solvers",
     "robots",
     "measuring",
@@ -20,6 +21,7 @@ FOLDERS = (
     "correcting",
     "simulators",
     "reporting",
+    "serving",
     "cli",
 )
 MODULES = sorted((ROOT / "minimax_cal").rglob("*.py"))

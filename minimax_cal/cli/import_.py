@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ from minimax_cal.cli.options import (
     with_output,
 )
 from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import names_of
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
+from minimax_cal.measuring.left_out import left_out
 from minimax_cal.measuring.measurements import read_measurements
 
 TOLD = "What the files do not tell"
@@ -55,6 +58,14 @@ TOLD = "What the files do not tell"
     help="Which points follow each other, in a file with several a pose.",
 )
 @plain_option(TOLD, "--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@plain_option(
+    TOLD,
+    "--leave-out",
+    default="",
+    metavar="POINTS",
+    help="The points to treat as if nobody had measured them: 12:smr2 is that of line 12, 12 all "
+    "of its pose; several with commas.",
+)
 @SAFE_CELLS
 @JSON
 @QUIET
@@ -66,6 +77,7 @@ def import_command(
     joints: Path | None,
     layout: str | None,
     decimal: str | None,
+    leave_out: str,
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -75,6 +87,7 @@ def import_command(
     Without -o nothing is written.
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
+    found = replace(found, data=left_out(found.data, names_of([leave_out])))
     to.write_rows(
         lambda: to.cells(csv_of(found), safe_cells), lambda: json_text(content(found, to.path))
     )

@@ -224,7 +224,7 @@ class Output:
         """Say on stderr which files were written."""
         for path in paths:
             if path and not self.quiet:
-                click.echo(f"written: {path}", err=True)
+                say_written(path)
 
     def write_rows(self, csv: Callable[[], str], json: Callable[[], str]) -> None:
         """Write a result that is rows: CSV, or JSON where the file's ending asks for it."""
@@ -330,6 +330,11 @@ def terminal() -> Console:
     """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
+def say_written(path: Path) -> None:
+    """Say on stderr that a file was written, whatever its name."""
+    click.echo(f"written: {one_line(str(path))}", err=True)
 
 
 def show(*tables: Table, headline: str = "") -> None:

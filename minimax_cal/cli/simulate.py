@@ -53,5 +53,5 @@ def simulate_command(
         write_whole(truth, json_text(content))
     for path in (output, truth):
         if path:
-            click.echo(f"written: {path}", err=True)
+            options.say_written(path)
     return 0

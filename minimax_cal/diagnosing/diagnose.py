@@ -138,6 +138,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     progress("gap ladder")
     ladder = climbed(study, [finding.terms for finding in causes.effects])
     steps = steps_of(asked, study, judges, causes, ladder)
+    for step in steps:
+        progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
     effects = valued(causes.effects, ladder)

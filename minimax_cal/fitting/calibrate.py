@@ -52,6 +52,7 @@ from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
@@ -86,7 +87,7 @@ def calibrate(
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
     priors: Mapping[str, float | str] | None = None,
-    method: str = "snllm",
+    method: str = AUTO,
     lever: float | None = None,
     hessian: str = "gauss-newton",
     distance: str = "two-sided",

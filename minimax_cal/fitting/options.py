@@ -19,7 +19,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.least_squares import METHODS
+from minimax_cal.solvers.least_squares import AUTO, METHODS
 from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 
@@ -153,8 +153,8 @@ class Options:
         group="What is fitted",
     )
     method: str = option(
-        "snllm",
-        f"The method of least squares: {', '.join(METHODS)}.",
+        AUTO,
+        f"The method of least squares: {', '.join((AUTO, *METHODS))}.",
         group="How it is solved",
     )
     loss: str = option(
@@ -225,7 +225,7 @@ def objective_of(objective: str, data: Measurements) -> int:
 def check_options(options: Options) -> None:
     """Raise an error for a choice that does not exist, before any work."""
     for name, value, choices in (
-        ("method", options.method, tuple(METHODS)),
+        ("method", options.method, (AUTO, *METHODS)),
         ("hessian", options.hessian, minimax.HESSIANS),
         ("distance form", options.distance, DISTANCE_FORMS),
     ):

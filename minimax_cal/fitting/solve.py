@@ -38,10 +38,11 @@ from minimax_cal.modelling.model import (
     pose_weights,
     with_poses,
 )
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares, minimax
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 
@@ -155,18 +156,16 @@ class Task:
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
+        if not np.isfinite(self.sigma).any():
+            return model, nearby(model, begin, self.options.method)
         sigma = np.pad(self.sigma, (0, len(model.fields)), constant_values=np.inf)
         points = float(model.counts.sum())
-        method = METHODS[self.options.method]
         mean_square = self.frame.mean_square / 3.0
-        for _ in range(PRIOR_ROUNDS if np.isfinite(sigma).any() else 1):
+        for _ in range(PRIOR_ROUNDS):
             model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
-            problem = SumOfSquares(model)
-            found = least_squares.solve(
-                problem, begin.batch(), 1, points, method, least_squares.NEAR
-            )
+            found = nearby(model, begin, self.options.method)
             state = found.x.take(np.array(0))
-            _, _, gram = problem.normal(state)
+            _, _, gram = SumOfSquares(model).normal(state)
             weight = np.diag(model.prior.weight[model.active])
             paid = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
             previous = mean_square
@@ -380,7 +379,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
 
     The turn that fits the errors best vanishes for half a turn too: start near the answer.
     """
-    points, method = float(model.counts.sum()), METHODS[task.options.method]
+    points, method = float(model.counts.sum()), method_of(task.options.method)
     problem = SumOfSquares(model)
     return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
 

@@ -12,10 +12,10 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of, of_sessions
-from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
+from minimax_cal.modelling.model import Model, Prior, model_of
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
-from minimax_cal.solvers import least_squares
 
 
 def scene_of(robot: Robot, data: Measurements, model: Model, state: State) -> Scene:
@@ -93,8 +93,4 @@ def refitted(robot: Robot, data: Measurements, start: State, active: Array) -> t
     model, begin = model_of(robot, data).only(active), replace(start, effects=np.zeros(0))
     if free := of_sessions(data.frames):
         model, begin = extended(model, robot, data, begin, free)
-    points, method = float(model.counts.sum()), least_squares.METHODS["snllm"]
-    found = least_squares.solve(
-        SumOfSquares(model), begin.batch(), 1, points, method, least_squares.NEAR, trace=False
-    )
-    return model, found.x.take(np.array(0))
+    return model, nearby(model, begin).x.take(np.array(0))

@@ -1,19 +1,20 @@
 """The bridge from robot and measurements to numbers: errors, normal equations, separable split.
 
-The Jacobian of all points is never stored: poses are taken in blocks that fit the cache, and each
-block adds to the normal equations of its target.  Sums over thousands of poses then cost what the
-arithmetic costs.
+Sums over poses are those of `kernels`.  Errors of whole poses (`mix`) and rows of the Jacobian are
+taken here, in blocks of poses that fit the cache: the Jacobian of all points is never stored.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.kernels.choice import kernels, ready
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import Names, State, links_of
 from minimax_cal.robots import kinematics
@@ -54,11 +55,6 @@ class Block:
     def screws(self) -> tuple[Array, Array]:
         """See `kinematics.screws`."""
         return kinematics.screws(self.links)
-
-    def stretched(self, state: State, model: Model) -> Block:
-        """The same poses with other lengths, angles as they were."""
-        q = model.q[self.rows]
-        return Block(self.rows, kinematics.stretch(self.links, state.mdh, q, model.prismatic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +195,17 @@ class Model:
             error = error * np.sqrt(self.weight[:, None, poses])
         return error
 
+    @cached_property
+    def sight(self) -> tuple[Array, ...]:
+        """What the kernels ask of the poses: q ... `moved`, as `kernels.plain.cost`."""
+        parts = (self.q, self.prismatic, self.y, self.weight, self.fields, self.moved)
+        return ready(*parts)
+
     def cost(self, state: State) -> Array:
         """F_i: (..., k) [m^2], the prior left out."""
+        if not len(self.mix):
+            found = kernels().cost(*arrays_of(state), *self.sight)
+            return np.asarray(found.reshape(*state.mdh.shape[:-2], -1))
         total = np.zeros(1)
         for block in self.blocks(state):
             error, _ = self.error_of(state, block)
@@ -209,13 +214,13 @@ class Model:
 
     def normal(self, state: State, active: Array) -> Normal:
         """Normal equations for the parameters that are True in active (p,), at a state."""
-        return self.normal_on(state, active, self.blocks(state))
-
-    def normal_on(self, state: State, active: Array, blocks: list[Block]) -> Normal:
-        """`normal` with the chains at hand."""
+        if not len(self.mix):
+            found = kernels().normal(*arrays_of(state), *self.sight, np.flatnonzero(active))
+            outer = state.mdh.shape[:-2]
+            return Normal(*(part.reshape(*outer, *part.shape[1:]) for part in found))
         select = Columns.of(self.names, active)
         cost, gradient, gram = np.zeros((3, 1))
-        for block in blocks:
+        for block in self.blocks(state):
             error, turned = self.rows_of(state, block, select)
             *batch, k, p, _, c = turned.shape
             flat = turned.reshape(*batch, k, p, 3 * c)
@@ -299,11 +304,11 @@ class SumOfSquares:
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
         """Cost (...), slope (..., free) and Gram matrix (..., free, free)."""
-        return self.normal_on(x, self.model.active, self.model.blocks(x))
+        return self.normal_of(x, self.model.active)
 
-    def normal_on(self, x: State, active: Array, blocks: list[Block]) -> tuple[Array, Array, Array]:
-        """The same over any choice of parameters, with the chains at hand."""
-        normal, prior = self.model.normal_on(x, active, blocks), self.model.prior
+    def normal_of(self, x: State, active: Array) -> tuple[Array, Array, Array]:
+        """The same over any choice of parameters."""
+        normal, prior = self.model.normal(x, active), self.model.prior
         off = prior.mean - self.model.values(x)
         weight = prior.weight[active]
         cost = normal.cost.sum(-1) + (prior.weight * off**2).sum(-1)
@@ -317,22 +322,34 @@ class SumOfSquares:
         """
         model = self.model
         lengths = model.active & model.names.linear
-        blocks = model.blocks(x)
-        _, gradient, gram = self.normal_on(x, lengths, blocks)
+        _, gradient, gram = self.normal_of(x, lengths)
         dx = np.zeros((*gradient.shape[:-1], model.names.count))
         dx[..., lengths] = solve_normal(gram, gradient[..., None])[..., 0]
         x = x.step(dx)
-        blocks = [block.stretched(x, model) for block in blocks]
-        found = self.normal_on(x, model.active, blocks)
+        found = self.normal_of(x, model.active)
         free = self.linear
         nothing = np.zeros((*gradient.shape[:-1], free.sum(), (~free).sum()))
-        return x, *found, model.coupling_on(x, blocks) if full else nothing
+        return x, *found, model.coupling_on(x, model.blocks(x)) if full else nothing
 
     def step(self, x: State, dx: Array) -> State:
         """The states moved by a step in the free parameters."""
         full = np.zeros((*dx.shape[:-1], self.model.names.count))
         full[..., self.model.active] = dx
         return x.step(full)
+
+
+def arrays_of(state: State) -> tuple[Array, ...]:
+    """A state, or a batch of them flattened, as the kernels ask for it."""
+    batch, (n, _), k = state.mdh.shape[:-2], state.mdh.shape[-2:], state.target_positions.shape[-2]
+    count = math.prod(batch)
+    effects = np.broadcast_to(state.effects, (*batch, state.effects.shape[-1]))
+    return ready(
+        state.mdh.reshape(count, n, 5),
+        np.broadcast_to(state.rotation, (*batch, 3, 3)).reshape(count, 3, 3),
+        np.broadcast_to(state.origin, (*batch, 3)).reshape(count, 3),
+        np.broadcast_to(state.target_positions, (*batch, k, 3)).reshape(count, k, 3),
+        effects.reshape(count, -1),
+    )
 
 
 def in_base(state: State, y: Array) -> Array:

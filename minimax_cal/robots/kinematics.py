@@ -7,13 +7,20 @@ stand for a batch of robots.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.kernels import plain
+from minimax_cal.kernels.choice import kernels, ready
+from minimax_cal.kernels.plain import ALPHA as ALPHA
+from minimax_cal.kernels.plain import BETA as BETA
+from minimax_cal.kernels.plain import THETA as THETA
+from minimax_cal.kernels.plain import A as A
+from minimax_cal.kernels.plain import D as D
+from minimax_cal.kernels.plain import cross as cross
 
-A, D, THETA, ALPHA, BETA = range(5)  # columns of an MDH table
 MDH_NAMES = ("a", "d", "theta", "alpha", "beta")
 
 
@@ -50,54 +57,14 @@ def chain(mdh: Array, q: Array, prismatic: Array) -> Chain:
     q: (..., m, n) joint values with their signs applied [rad, or m where prismatic].
     prismatic: (n,) True where q moves along the joint axis.
     """
-    theta, alpha, beta = (mdh[..., i] for i in (THETA, ALPHA, BETA))
-    turn = theta[..., None] + turned_by(q, prismatic)
-    cos, sin = np.cos(turn), np.sin(turn)
-    ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
-    bent = (beta != 0.0).reshape(-1, beta.shape[-1]).any(axis=0)
-    *batch, n, m = turn.shape
-    x, y, z = np.empty((3, *batch, n, 3, m), dtype=turn.dtype)
-    ex, ey, ez = np.broadcast_to(np.eye(3, dtype=turn.dtype)[:, :, None], (3, 3, m))
-    for i in range(n):
-        z[..., i, :, :] = ez
-        ex, ey = turn_pair(cos[..., i, None, :], sin[..., i, None, :], ex, ey, x[..., i, :, :])
-        # alpha turns y and z about x, then beta turns z and x about y
-        ey, ez = turn_pair(ca[..., i, None, None], sa[..., i, None, None], ey, ez, y[..., i, :, :])
-        if bent[i]:
-            ez, ex = turn_pair(cb[..., i, None, None], sb[..., i, None, None], ez, ex)
-    axes = np.stack(np.broadcast_arrays(ex, ey, ez), axis=-3)
-    return stretch(Chain(x, y, z, z, z, axes), mdh, q, prismatic)
-
-
-def turn_pair(
-    c: Array, s: Array, u: Array, v: Array, out: Array | None = None
-) -> tuple[Array, Array]:
-    """Axes u, v turned towards each other: c u + s v (into out), c v - s u."""
-    first = np.multiply(c, u, out=out)
-    first += s * v
-    second = c * v
-    second -= s * u
-    return first, second
-
-
-def turned_by(q: Array, prismatic: Array) -> Array:
-    """The joint values that turn, (..., n, m) [rad]; 0 at a prismatic joint."""
-    flipped = np.ascontiguousarray(np.swapaxes(q, -1, -2))
-    return np.where(prismatic[:, None], 0.0, flipped) if prismatic.any() else flipped
-
-
-def stretch(links: Chain, mdh: Array, q: Array, prismatic: Array) -> Chain:
-    """The same directions with the lengths a, d of another MDH table: only origins move."""
-    a, d = mdh[..., A, None, None], mdh[..., D, None, None]
-    if prismatic.any():
-        slide = np.where(prismatic[:, None], np.swapaxes(q, -1, -2), 0.0)
-        step = a * links.x + (d + slide[..., :, None, :]) * links.z
+    if q.ndim == 2 and mdh.dtype == q.dtype == np.float64:
+        every = kernels().chain(*ready(mdh.reshape(-1, *mdh.shape[-2:]), q, prismatic))
+        x, y, z, after, axes = (part.reshape(*mdh.shape[:-2], *part.shape[1:]) for part in every)
     else:
-        step = a * links.x + d * links.z
-    after = np.cumsum(step, axis=-3)
+        x, y, z, after, axes = plain.chain(mdh, q, prismatic)
     before = np.zeros_like(after)
     before[..., 1:, :, :] = after[..., :-1, :, :]
-    return replace(links, before=before, after=after)
+    return Chain(x, y, z, before, after, axes)
 
 
 def forward(mdh: Array, q: Array, prismatic: Array) -> Array:
@@ -116,9 +83,7 @@ def points(links: Chain, targets: Array) -> Array:
 
     targets: (..., k, 3) in the last frame [m].
     """
-    *batch, _, _, m = links.axes.shape
-    turned = targets @ links.axes.reshape(*batch, 3, 3 * m)
-    return turned.reshape(*turned.shape[:-1], 3, m) + links.origin[..., None, :, :]
+    return plain.points(links.axes, links.origin, targets)
 
 
 def screws(links: Chain) -> tuple[Array, Array]:
@@ -129,15 +94,6 @@ def screws(links: Chain) -> tuple[Array, Array]:
     axis = np.concatenate([links.z, links.x, links.y], axis=-3)
     through = np.concatenate([links.before, links.after, links.after], axis=-3)
     return axis, cross(through, axis)
-
-
-def cross(u: Array, v: Array) -> Array:
-    """u x v along the last axis but one: (..., 3, m).  (Faster than np.cross on short arrays.)"""
-    out = np.empty(np.broadcast_shapes(u.shape, v.shape), dtype=np.result_type(u, v))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(u[..., j, :], v[..., k, :], out=out[..., i, :])
-        out[..., i, :] -= u[..., k, :] * v[..., j, :]
-    return out
 
 
 def hat(w: Array) -> Array:

@@ -71,6 +71,13 @@ METHODS = {
     "snllm-kaufman": Method(separable=True, damped=True, full=False),
 }
 
+AUTO = "auto"  # plain Gauss-Newton steps where they lead straight down, else the usual method
+
+
+def method_of(name: str) -> Method:
+    """The method called name; of auto that for a start that may be far."""
+    return METHODS["snllm" if name == AUTO else name]
+
 
 @dataclass(frozen=True)
 class Limits:

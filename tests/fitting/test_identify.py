@@ -65,7 +65,7 @@ def test_a_prismatic_joint_has_its_own_redundancy() -> None:
     made = simulate(robot, 80, 3, seed=3)
     model, state, found = find(robot, made.data)
     every = np.ones(model.names.count, dtype=bool)
-    _, _, gram = SumOfSquares(model).normal_on(state, every, model.blocks(state))
+    _, _, gram = SumOfSquares(model).normal_of(state, every)
     scale = np.sqrt(np.diag(gram))
     rank = np.linalg.matrix_rank(gram / np.outer(scale, scale), tol=1e-10, hermitian=True)
     assert found.active.sum() <= rank

@@ -77,18 +77,6 @@ def test_batched_chain_equals_each_alone(robot: mc.Robot, rng: np.random.Generat
         assert_allclose(kinematics.forward(one, q, robot.prismatic), alone, rtol=0, atol=1e-15)
 
 
-def test_stretch_is_the_chain_with_other_lengths(rng: np.random.Generator) -> None:
-    robot = mc.load_robot("scara_600")
-    q = rng.uniform(-1, 1, (9, 4))
-    other = robot.mdh.copy()
-    other[:, :2] += rng.normal(size=(4, 2))
-    links = kinematics.chain(robot.mdh, q, robot.prismatic)
-    moved = kinematics.stretch(links, other, q, robot.prismatic)
-    fresh = kinematics.chain(other, q, robot.prismatic)
-    assert_allclose(moved.after, fresh.after, rtol=0, atol=1e-15)
-    assert_allclose(moved.before, fresh.before, rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 1.0, 3.1])
 def test_rotation_is_scipys(size: float, rng: np.random.Generator) -> None:
     from scipy.spatial.transform import Rotation

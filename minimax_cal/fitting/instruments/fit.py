@@ -28,7 +28,7 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares, solve_normal
+from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def fit_instrument(
         nominal.batch(),
         1,
         float(instrument.points),
-        METHODS[options.method],
+        method_of(options.method),
         least_squares.NEAR,
     )
     state = found.x.take(np.array(0))

@@ -25,6 +25,7 @@ from minimax_cal.fitting.instruments.split import held_out
 from minimax_cal.fitting.options import listed
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.least_squares import AUTO
 
 
 def relative(
@@ -39,7 +40,7 @@ def relative(
     offset: bool = False,
     known_distances: Sequence[Known] = (),
     lever: float | None = None,
-    method: str = "snllm",
+    method: str = AUTO,
     resolution: float = RESOLUTION,
 ) -> RelativeCalibration:
     """Calibrate a robot from lengths, closures or poses.

@@ -15,7 +15,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.parameters import Names
-from minimax_cal.solvers.least_squares import METHODS
+from minimax_cal.solvers.least_squares import AUTO, METHODS
 
 Progress = Callable[[str], None]
 Known = tuple[str, str, float]
@@ -83,8 +83,8 @@ class RelativeOptions:
 
 def check_options(data: RelativeData, options: RelativeOptions) -> None:
     """Raise OptionError for a choice that does not exist or does not suit the data."""
-    if options.method not in METHODS:
-        raise OptionError(f"no method {options.method!r}; choose {', '.join(METHODS)}")
+    if options.method not in (AUTO, *METHODS):
+        raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
     for kind, name, chosen in (

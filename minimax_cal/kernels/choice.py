@@ -1,0 +1,37 @@
+"""Which kernels run: compiled ones where numba is installed, else those of NumPy."""
+
+from __future__ import annotations
+
+import logging
+import os
+from functools import cache
+from importlib import import_module, util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+
+SWITCH = "MINIMAX_CAL_KERNELS"  # plain or fast, in the environment; unset takes what is there
+NOTICE = "compiling kernels for this machine, once: about half a minute"
+
+
+@cache
+def kernels() -> Any:
+    """The module of the kernels: `fast` where numba is installed, else `plain`."""
+    told = os.environ.get(SWITCH, "")
+    if told == "plain" or (told != "fast" and util.find_spec("numba") is None):
+        return import_module("minimax_cal.kernels.plain")
+    fast = import_module("minimax_cal.kernels.fast")
+    if not any(Path(fast.cost.stats.cache_path).glob("fast.*.nbi")):
+        logging.getLogger("minimax_cal").warning(NOTICE)
+    return fast
+
+
+def ready(*arrays: Array) -> tuple[Array, ...]:
+    """Arrays as the compiled kernels know them: in order and writeable; others compile anew."""
+    return tuple(
+        array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")
+        for array in arrays
+    )

@@ -1,0 +1,125 @@
+"""The kernels: compiled and NumPy's alike, and both against the Jacobian written out."""
+
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.kernels import choice, plain
+from minimax_cal.modelling.model import Model, arrays_of, model_of
+from minimax_cal.modelling.parameters import State
+
+Arrays = tuple[np.ndarray, ...]
+ALIKE = 1e-12  # relative to the largest entry
+POSES = 150  # more than a block of the compiled kernels
+
+
+@pytest.fixture
+def fast() -> ModuleType:
+    pytest.importorskip("numba", reason="numba is not installed: pip install 'minimax-cal[fast]'")
+    from minimax_cal.kernels import fast
+
+    return fast
+
+
+def cell(name: str, robots: int, effects: int, rng: np.random.Generator) -> tuple[Model, State]:
+    """An arm amid measurements with holes and weights, and a batch of states near the truth."""
+    sim = mc.simulate(mc.load_robot(name), POSES, 2, 0)
+    y = sim.data.y.copy()
+    y[rng.random(y.shape[:2]) < 0.2] = np.nan
+    model = model_of(sim.cell.robot, sim.data.with_y(y))
+    fields, moved = (
+        1e-3 * rng.normal(size=(effects, *model.y.shape)),
+        1e-4 * rng.normal(size=model.y.shape),
+    )
+    weight = model.weight * rng.uniform(0.5, 2.0, model.weight.shape)
+    names = replace(model.names, effects=tuple(f"e{i}" for i in range(effects)))
+    model = replace(
+        model, names=names, weight=weight, active=np.ones(names.count, dtype=bool),
+        fields=fields if effects else model.fields, moved=moved if effects else model.moved,
+    )  # fmt: skip
+    begin = replace(sim.cell.state, effects=np.zeros(effects)).repeat(robots)
+    return model, begin.step(1e-3 * rng.normal(size=(robots, names.count)))
+
+
+CELLS = [("irb120", 1, 0), ("irb2600", 3, 2), ("scara_600", 2, 0), ("scara_600", 1, 3)]
+
+
+def near(found: Arrays, wanted: Arrays, alike: float = ALIKE) -> None:
+    for mine, other in zip(found, wanted, strict=True):
+        assert mine.shape == other.shape
+        assert_allclose(mine, other, rtol=0, atol=alike * np.abs(other).max(initial=0.0))
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_pairs(
+    name: str, robots: int, effects: int, fast: ModuleType, rng: np.random.Generator
+) -> None:
+    model, state = cell(name, robots, effects, rng)
+    at, q, prismatic = arrays_of(state), *model.sight[:2]
+    links = plain.chain(at[0], q, prismatic)
+    near(fast.chain(at[0], q, prismatic), links)
+    tip = links[3][:, -1].copy()
+    near((fast.points(links[4], tip, at[3]),), (plain.points(links[4], tip, at[3]),))
+    near((fast.cost(*at, *model.sight),), (plain.cost(*at, *model.sight),))
+    for share in (1.0, 0.6):
+        which = np.flatnonzero(rng.random(model.names.count) < share)
+        near(fast.normal(*at, *model.sight, which), plain.normal(*at, *model.sight, which))
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_normal_equations_are_those_of_the_jacobian(
+    name: str, robots: int, effects: int, rng: np.random.Generator
+) -> None:
+    model, state = cell(name, robots, effects, rng)
+    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
+    cost, gradient, gram = plain.normal(*arrays_of(state), *model.sight, which)
+    error, J = np.nan_to_num(model.error(state)), model.jacobian(state)[..., which]
+    weight = model.weight[..., None]
+    near(
+        (cost, gradient, gram),
+        (
+            (weight * error**2).sum(axis=(-1, -2)),
+            np.einsum("km,bkmi,bkmip->bkp", model.weight, error, J),
+            np.einsum("km,bkmip,bkmiq->bkpq", model.weight, J, J),
+        ),
+    )
+    near((plain.cost(*arrays_of(state), *model.sight),), (cost,))
+
+
+@pytest.mark.parametrize(("name", "effects"), [("irb120", 0), ("irb2600", 2)])
+def test_plain_steps_end_alike(
+    name: str, effects: int, fast: ModuleType, rng: np.random.Generator
+) -> None:
+    model, state = cell(name, 1, effects, rng)
+    names = ("a1", "a2", "a3", "theta2", "theta3", "theta4", "theta5")
+    told = [model.names.index(one) for one in names]  # by any poses
+    which = np.array([*told, *range(5 * model.names.joints, model.names.count)])
+    prior = np.full(len(which), 1e-3), np.where(which < 5 * model.names.joints, 1e-3, 0.0)
+    ends = [
+        module.descend(*arrays_of(state), *model.sight, which, *prior, 1e-12, 15)
+        for module in (fast, plain)
+    ]
+    assert ends[0][-1]
+    assert ends[1][-1]
+    near(ends[0][:-1], ends[1][:-1], alike=1e-10)  # systems of a condition of 1e4
+
+
+def test_choice(monkeypatch: pytest.MonkeyPatch, fast: ModuleType) -> None:
+    choice.kernels.cache_clear()
+    monkeypatch.setenv(choice.SWITCH, "plain")
+    assert choice.kernels() is plain
+    choice.kernels.cache_clear()
+    monkeypatch.delenv(choice.SWITCH)
+    assert choice.kernels() is fast
+
+
+def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    choice.kernels.cache_clear()
+    monkeypatch.delenv(choice.SWITCH, raising=False)
+    monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
+    assert choice.kernels() is plain
+    choice.kernels.cache_clear()
