@@ -26,7 +26,6 @@ from minimax_cal.serving.panels import diagnosis_words, state_of
 from minimax_cal.serving.sessions import (
     GIVEN,
     MOST_BYTES,
-    MOST_FILES,
     Session,
     mark,
     new_session,
@@ -204,21 +203,20 @@ async def put(request: Request) -> Response:
     """A file that is dropped; whole, or not at all."""
     at = session_of(request)
     path = at.file(GIVEN, request.query_params.get("name", ""))
+    room = at.room(path.name)
     told = request.headers.get("content-length", "0")
     too_large = OptionError(
-        f"{path.name}: is larger than {MOST_BYTES >> 20} MiB; that is no file of measurements"
+        f"{path.name}: is larger than {room >> 20} MiB; that is no file of measurements"
     )
-    if not told.isdigit() or int(told) > MOST_BYTES:
+    if not told.isdigit() or int(told) > room:
         return said(too_large, 413)
-    if len(at.given()) >= MOST_FILES and not path.exists():
-        raise OptionError(f"a session holds {MOST_FILES} files; remove some, or begin another")
     part_of_it = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
     size = 0
     try:
         with part_of_it.open("wb") as stream:
             async for chunk in request.stream():
                 size += len(chunk)
-                if size > MOST_BYTES:
+                if size > room:
                     return said(too_large, 413)
                 stream.write(chunk)
         os.replace(part_of_it, path)

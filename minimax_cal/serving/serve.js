@@ -133,6 +133,8 @@
     badge(name, step.state);
     const place = document.querySelector(`[data-said="${name}"]`);
     place.dataset.state = step.state;
+    if (name === "read" && step.error) byId("untold").open = true;
+    if (name === "diagnose") byId("chart-ladder").classList.toggle("old", step.state !== "done");
     const parts = [];
     if (step.error) parts.push(made("p", step.error, "problem"));
     if (step.waits) parts.push(made("p", step.waits, "waits"));

@@ -22,13 +22,13 @@ from minimax_cal.robots.robot import builtin_robots
 GIVEN, LOG = "given", "log"  # folders of a session: what people dropped, how each step ended
 CHOICES, SCRIPT = "session.json", "commands.sh"
 MOST_BYTES = 256 << 20  # of a file that is dropped: a million poses
-MOST_FILES = 200
+MOST_FILES, MOST_TOGETHER = 200, 1 << 30  # of a session: how many, and their bytes
 NAME = re.compile(r"[\w(][\w .()+@=-]{0,119}")
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)  # devices of Windows
 SESSION = re.compile(r"[a-z0-9][a-z0-9-]{0,59}")
 
 Limit = Annotated[float, Field(gt=0.0, le=1e6)] | None
-Word = Annotated[str, Field(max_length=2000)]
+Word = Annotated[str, Field(max_length=2000, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 class Choices(BaseModel):
@@ -115,6 +115,15 @@ class Session:
         """Names of the files that were dropped."""
         return sorted(path.name for path in (self.folder / GIVEN).iterdir() if is_whole(path))
 
+    def room(self, name: str) -> int:
+        """How many bytes a file may have that is dropped now.  Raises OptionError for none."""
+        others = [self.folder / GIVEN / one for one in self.given() if one != name]
+        left = MOST_TOGETHER - sum(path.stat().st_size for path in others)
+        if len(others) >= MOST_FILES or left <= 0:
+            most = f"{MOST_FILES} files and {MOST_TOGETHER >> 30} GiB"
+            raise OptionError(f"a session holds {most}; remove some, or begin another")
+        return min(MOST_BYTES, left)
+
     def remove(self, name: str) -> Choices:
         """Remove a file that was dropped, and every choice of it."""
         self.file(GIVEN, name).unlink(missing_ok=True)
@@ -134,7 +143,8 @@ class Session:
     def stamp(self) -> tuple[tuple[str, int, int], ...]:
         """Changes whenever a file of the session does."""
         every = (self.folder, self.folder / GIVEN, self.folder / LOG)
-        found = [path for folder in every for path in folder.iterdir() if is_whole(path)]
+        there = [folder for folder in every if folder.is_dir()]
+        found = [path for folder in there for path in folder.iterdir() if is_whole(path)]
         return tuple(sorted(map(mark, found)))
 
 

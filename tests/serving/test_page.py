@@ -305,6 +305,12 @@ def test_the_whole_work_in_two_browsers(
             assert (folders[0] / name).stat().st_size > 100, name
         assert severe(left) == severe(right) == []
 
+        left.get(f"{left.current_url.partition('#')[0]}/file/report.html?look")  # in its sandbox
+        drawn = "return document.body.dataset.drawn"
+        assert until(lambda: left.execute_script(drawn), "the report was not drawn") == "yes"
+        assert left.execute_script("return self.origin") == "null"
+        assert severe(left) == []
+
 
 @pytest.mark.slow
 def test_a_real_arm(driver: Any, server: Served, tmp_path: Path) -> None:

@@ -68,7 +68,8 @@ def test_choices_are_kept_as_they_were_made(at: Session) -> None:
     "changes",
     [{"measured": ["../x"]}, {"measured": ["none.csv"]}, {"robot": "nobody"}, {"rms": -1},
      {"rms": float("nan")}, {"left_out": ["x; rm"]}, {"objective": "best"}, {"poses": 0},
-     {"unknown": 1}, {"measured": "poses.csv"}, {"units": "x" * 3000}],
+     {"unknown": 1}, {"measured": "poses.csv"}, {"units": "x" * 3000},
+     {"units": "a\0b"}, {"columns": "a\nb"}, {"units": "\ud800"}],
 )  # fmt: skip
 def test_choices_that_are_refused_change_nothing(at: Session, changes: dict[str, object]) -> None:
     before = at.choose({"measured": ["poses.csv"]})
@@ -82,6 +83,16 @@ def test_a_removed_file_is_chosen_no_more(at: Session) -> None:
     left = at.remove("poses.csv")
     assert (left.measured, left.joints) == ((), "")
     assert at.given() == []
+
+
+def test_a_session_is_full_at_last(at: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert at.room("new.csv") == 256 << 20
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 10)
+    assert at.room("new.csv") == 3  # beside the seven bytes of the one that is there
+    assert at.room("poses.csv") == 10  # in its place
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_FILES", 1)
+    with pytest.raises(OptionError, match="remove some"):
+        at.room("new.csv")
 
 
 def test_choices_that_somebody_broke_are_told(at: Session) -> None:

@@ -18,6 +18,7 @@ import minimax_cal as mc
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 POSES, TARGETS = 30, 2
 TOO_LARGE = str(2 << 30)
+STARTING = ("waiting for a free core", "diagnose")  # what a job says before its process does
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,7 @@ def test_the_script_of_the_session_does_it_all_again(server: Served, fitted: str
             assert f"\n{line}\n" in script
 
 
+@pytest.mark.slow
 def test_a_point_that_is_unticked_is_out_of_the_next_fit(server: Served, fitted: str) -> None:
     worst = folder_of(server, fitted) / "fit.json"
     before = result(worst)
@@ -116,6 +118,21 @@ def test_an_error_is_the_line_of_the_command(server: Served) -> None:
     assert found["error"].startswith("given/points.csv:1: columns a, b are not known; say what")
     assert not (folder_of(server, home) / "poses.csv").exists()
     assert not (folder_of(server, home) / "understood.json").exists()
+
+
+def test_files_of_tracker_and_controller_are_one(server: Served, poses: bytes) -> None:
+    """Without headers: what they do not tell is chosen, and goes to the command as it is."""
+    home = server.begin(robot="irb120")
+    rows = [line.split(",") for line in poses.decode().splitlines()[1:]]
+    for name, part in (("joints.txt", slice(0, 6)), ("smr_1.txt", slice(6, 9))):
+        server.put(home, name, "\n".join(" ".join(row[part]) for row in rows).encode())
+    files = ["smr_1.txt", "joints.txt"]
+    server.choose(home, measured=files, joints="joints.txt", units="q=rad,smr=mm")
+    state = server.run(home, "read")
+    assert state["steps"]["read"]["state"] == "done", state["steps"]["read"]["error"]
+    assert f"{POSES} poses, 6 joints, targets smr1" in state["panels"]["understood"]
+    found = mc.read_measurements(folder_of(server, home) / "poses.csv")
+    assert found.q.shape == (POSES, 6)
 
 
 def test_names_from_files_are_only_text(server: Served, poses: bytes) -> None:
@@ -245,7 +262,7 @@ def waited_for(server: Served, home: str) -> Any:
     """A diagnosis that has told its first stage."""
     assert server.ask("POST", f"{home}/run/diagnose").status == 200
     end = time.monotonic() + PATIENCE
-    while (job := server.state(home)["job"])["stage"] == "diagnose":
+    while (job := server.state(home)["job"])["stage"] in STARTING:
         assert time.monotonic() < end
         time.sleep(0.05)
     return job
