@@ -143,10 +143,10 @@ class Poses:
         count = 3.0 * np.count_nonzero(self.seen)
         return float((self.error**2).sum()) / max(count - paid, 1.0)
 
-    @cached_property
-    def gram(self) -> Array:
-        """(m, p, p) J'A J of each pose."""
-        return np.asarray(np.swapaxes(self.jacobian, -1, -2) @ self.weighted)
+    def gram_of(self, part: Array) -> Array:
+        """(p, p) J'A J of some poses.  part: mask (m,)."""
+        p = self.jacobian.shape[-1]
+        return np.asarray(self.jacobian[part].reshape(-1, p).T @ self.weighted[part].reshape(-1, p))
 
     @cached_property
     def score(self) -> Array:
@@ -279,21 +279,28 @@ def by_poses(poses: Poses, group: Array) -> Array:
     """The jackknife over poses: (p, p) of the free parameters [SI].
 
     (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
-    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  group: (m,) rows with the same
-    number are one pose.  NaN where the fit needs one of the poses.
+    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  With C = H^-1 and L = J C J'A it is
+    C J'A (1 - L)^-1 e.  group: (m,) rows with the same number are one pose.  NaN where the fit needs
+    one of the poses.
     """
-    _, member = np.unique(group, return_inverse=True)
-    count, p = int(member.max()) + 1, poses.jacobian.shape[-1]
-    gram, score = np.zeros((count, p, p)), np.zeros((count, p))
-    np.add.at(gram, member, poses.gram)
-    np.add.at(score, member, poses.score)
-    try:
-        np.linalg.cholesky((1.0 - ALONE) * poses.bread - gram)
-    except np.linalg.LinAlgError:
-        return np.full((p, p), np.nan)
-    change = solve_normal(poses.bread - gram, score[..., None])[..., 0]
+    member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
+    order, count, p = np.argsort(member.reshape(-1), kind="stable"), len(sizes), poses.bread.shape[0]
+    cover, ends = solve_normal(poses.bread, np.eye(p)), np.cumsum(sizes)
+    total = np.zeros((p, p))
+    for size in np.unique(sizes):  # groups of as many rows at once
+        rows = order[(ends[sizes == size] - size)[:, None] + np.arange(size)]
+        jacobian, weighted = (
+            part[rows].reshape(len(rows), -1, p) for part in (poses.jacobian, poses.weighted)
+        )
+        back = cover @ np.swapaxes(weighted, 1, 2)
+        lever = jacobian @ back
+        if not (np.linalg.eigvals(lever).real < 1.0 - ALONE).all():
+            return np.full((p, p), np.nan)
+        error = poses.error[rows].reshape(len(rows), -1, 1)
+        change = (back @ np.linalg.solve(np.eye(lever.shape[1]) - lever, error))[..., 0]
+        total += change.T @ change
     prior = sandwich(poses, np.zeros((p, p)))
-    return np.asarray((count - 1) / count * change.T @ change + prior)
+    return np.asarray((count - 1) / count * total + prior)
 
 
 def sandwich(poses: Poses, meat: Array) -> Array:

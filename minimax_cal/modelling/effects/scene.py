@@ -209,6 +209,7 @@ class Columns:
     doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
     doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
+    ridge: (d,) weight of a prior of mean zero beside points [m^2 per unit^2]; empty for none.
     """
 
     names: tuple[str, ...]
@@ -218,6 +219,7 @@ class Columns:
     doubt: tuple[Array, ...] = ()
     doubt_shift: tuple[Callable[[], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
+    ridge: Array = field(default_factory=lambda: np.zeros(0))
 
     def displacement(self, scene: Scene) -> Array:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
@@ -268,6 +270,8 @@ class Effect:
     positive: whether its one parameter is a compliance, which cannot be negative.
     lines: whether several of its variants at one place are one cause: waves of one gear.
     typical: usual size of a parameter; far larger ones are believed less [SI].
+    is_map: whether its parameters are those of a free curve, told by the curve; sought when causes
+    with a formula are known.
     """
 
     name: str
@@ -281,6 +285,7 @@ class Effect:
     positive: bool = False
     lines: bool = False
     typical: float = np.inf
+    is_map: bool = False
 
 
 def joint_of(place: str) -> int:
