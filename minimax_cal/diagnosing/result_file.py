@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
+from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
+from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
     EARLIER,
@@ -29,6 +31,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
+BELOW = math.nextafter(FIRM, 0.0)  # what was tentative when it was written stays so
 
 
 class FallPart(Part):
@@ -51,6 +54,8 @@ class FindingPart(Part):
     holdout_rms_mm: FallPart = FallPart()
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
+    established: bool = True
+    found_again: Number = math.nan
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -70,7 +75,29 @@ class FindingPart(Part):
             after=self.holdout_rms_mm.after,
             fixed=self.fixed,
             rows=self.lines,
+            again=1.0 if self.established else min(self.found_again, BELOW),
         )
+
+
+class PlacePart(Part):
+    """A share of what is still predictable."""
+
+    place: str
+    share: Number
+
+
+class RemainderPart(Part):
+    """What free functions still predict."""
+
+    predictable_mm: Number
+    where: tuple[PlacePart, ...] = ()
+    unpredictable_mm: Number
+    floor_mm: Ends | None = None
+
+    def remainder(self) -> Remainder:
+        """As the code has it."""
+        where = tuple((one.place, one.share) for one in self.where)
+        return Remainder(self.predictable_mm, where, self.unpredictable_mm, self.floor_mm)
 
 
 class RungPart(Part):
@@ -155,6 +182,7 @@ class DiagnosisPart(Part):
     reasons: tuple[str, ...]
     effects: tuple[FindingPart, ...]
     gap: GapPart
+    remainder: RemainderPart | None = None
     noise: NoisePart = NoisePart()
     structure: StructurePart = StructurePart()
     where: dict[str, Any] = Field(default_factory=dict)
@@ -217,6 +245,7 @@ def assembled(
         data=data,
         held=held,
         cells=cells,
+        remainder=part.remainder.remainder() if part.remainder else None,
         stated_errors=errors,
         stated_curves={name: curve.curve() for name, curve in part.curves.items()},
     )

@@ -284,7 +284,11 @@ def by_poses(poses: Poses, group: Array) -> Array:
     one of the poses.
     """
     member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
-    order, count, p = np.argsort(member.reshape(-1), kind="stable"), len(sizes), poses.bread.shape[0]
+    order, count, p = (
+        np.argsort(member.reshape(-1), kind="stable"),
+        len(sizes),
+        poses.bread.shape[0],
+    )
     cover, ends = solve_normal(poses.bread, np.eye(p)), np.cumsum(sizes)
     total = np.zeros((p, p))
     for size in np.unique(sizes):  # groups of as many rows at once
