@@ -11,7 +11,14 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of, of_sessions, ridge_of
+from minimax_cal.modelling.effects.table import (
+    Fitted,
+    Term,
+    fields_of,
+    names_of,
+    of_sessions,
+    ridge_of,
+)
 from minimax_cal.modelling.model import Model, Prior, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots.robot import Robot
