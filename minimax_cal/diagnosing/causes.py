@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of, structure
+from minimax_cal.diagnosing.established import judged_again
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.study import Study
@@ -20,8 +21,10 @@ from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.table import Term
 
 LEVEL = 0.01  # chance that noise alone is called structure
+CERTAIN = 1e-6  # chance below which something is there, whatever its name
 MATTERS = 0.015  # share of what was explained below which more structure is of no account
 OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
 
@@ -54,14 +57,25 @@ def causes_of(
     if read_back:  # what is left of a move looks like play in the gears
         lib, choice = chosen(study, (*exclude, "backlash"))
     progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known)
+    traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
     if choice.noise.variance < selection.EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = "gear_ripple" not in exclude
+    effects = judged_again(effects, choice, study.data, lib, ripple)
     return Causes(
         (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
     )
+
+
+def named_in(choice: Choice) -> list[Named]:
+    """The effects selected with their motions: of few parameters each its own, else together."""
+    out = []
+    for one in choice.fits:
+        motion = choice.library.columns[:, one.candidate.main].T
+        motion = motion if len(motion) <= FEW else (one.value @ motion)[None]
+        out.append(Named(one.candidate.term, motion))
+    return out
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
@@ -168,9 +182,9 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
 def merged(findings: Sequence[Finding]) -> list[Finding]:
     """Lines of one joint are one effect: their parameters together, the strongest first."""
     out: dict[tuple[str, str], Finding] = {}
-    for found in findings:
-        key = (found.term.effect, found.term.place)
-        if found.term.effect == "gear_ripple":
+    keys = [(found.term.effect, found.term.place) for found in findings]
+    for key, found in zip(keys, findings, strict=True):
+        if found.term.effect == "gear_ripple" or keys.count(key) > 1:
             turns = found.fixed["waves_per_turn"]
             names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
@@ -203,6 +217,7 @@ def judged(
     """
     worst = min(traces, key=lambda trace: trace.p)
     p = min(1.0, worst.p * len(traces))
+    findings = [found for found in findings if found.established or found.p_value < CERTAIN]
     loud = [t for t in traces if t.p * len(traces) < LEVEL and t.excess > MATTERS * explained]
     if loud:
         return "unknown", (min(loud, key=lambda t: t.p).name, p)
@@ -210,6 +225,8 @@ def judged(
         return "unknown", ("two laws for one joint may stand for one that is not known", p)
     if not findings:
         return "none", (worst.name, p)
+    if not all(found.established for found in findings):
+        return "unknown", ("names that change with the poses", p)
     several = any(found.alternatives for found in findings)
     return ("one_of" if several else "named"), (worst.name, p)
 

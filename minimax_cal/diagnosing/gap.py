@@ -61,14 +61,13 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
-    square = fits[0].cross_validated(spared)
     for number, terms in enumerate(effects):
         wide = joint(study, (*fits[-1].terms, *terms))
-        new = wide.cross_validated(spared)
+        told = wide.spared(spared)
+        square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
             taken.append(number)
-            square = new
     return Ladder(tuple(fits), tuple(taken))
 
 

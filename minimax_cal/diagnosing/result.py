@@ -27,6 +27,7 @@ from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
+FIRM = 1.0  # share of the parts without which an effect is found again, to be established
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 FAULTS = {
@@ -69,7 +70,8 @@ class Finding:
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
-    told; empty otherwise.
+    told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
+    was found again.
     """
 
     terms: tuple[Term, ...]
@@ -86,6 +88,12 @@ class Finding:
     fixed: Mapping[str, float] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
+    again: float = 1.0
+
+    @property
+    def established(self) -> bool:
+        """Whether it was found again whichever poses were left out."""
+        return self.again >= FIRM
 
     @property
     def term(self) -> Term:
@@ -150,6 +158,8 @@ class Finding:
         return {
             "effect": self.term.effect,
             "place": self.term.place,
+            "established": self.established,
+            "found_again": self.again,
             "share": finite(self.share),
             "lambda": finite(self.size),
             "chance": finite(self.p_value),

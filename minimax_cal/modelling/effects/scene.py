@@ -269,6 +269,7 @@ class Effect:
     choices: the variants of the law at a place that are worth trying.
     finer: variants near one that was chosen, to try afterwards.
     positive: whether its one parameter is a compliance, which cannot be negative.
+    lines: whether several of its variants at one place are one cause: waves of one gear.
     typical: usual size of a parameter; far larger ones are believed less [SI].
     is_map: whether its parameters are those of a free curve, told by the curve; sought when causes
     with a formula are known.
@@ -283,6 +284,7 @@ class Effect:
     choices: Callable[[Scene, str], Sequence[Choice]] = lambda scene, place: PLAIN
     finer: Callable[[Scene, Choice], Sequence[Choice]] = lambda scene, choice: ()
     positive: bool = False
+    lines: bool = False
     typical: float = np.inf
     is_map: bool = False
 

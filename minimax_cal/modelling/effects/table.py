@@ -82,6 +82,11 @@ class Term:
         return f"{self.effect}:{self.place}"
 
     @property
+    def key(self) -> tuple[str, str]:
+        """Effect and place."""
+        return self.effect, self.place
+
+    @property
     def frees_frames(self) -> bool:
         """Whether it is that of `of_sessions`, which says nothing of the robot."""
         return "sessions" in self.choice
