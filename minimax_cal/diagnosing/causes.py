@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
 from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
@@ -35,7 +36,8 @@ class Causes:
     faults: of the data.  library: what could be tested, and ripple:
     whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
     weightiest first.
-    traces: of what they leave.  untestable: effects, and what the data lack for them.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.  maps: of
+    joints, sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -45,6 +47,7 @@ class Causes:
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
+    maps: Mapped = NO_MAPS
 
 
 def causes_of(

@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
+from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
@@ -138,6 +139,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     noise = causes.choice.noise
     progress("gap ladder")
     ladder = climbed(study, [finding.terms for finding in causes.effects])
+    if "joint_error_map" not in options.exclude:
+        progress("error maps of joints")
+        causes, ladder = with_maps(causes, ladder)
     steps = steps_of(asked, study, judges, causes, ladder)
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
@@ -183,6 +187,16 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
     )
+
+
+def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:
+    """The causes and the ladder with the error maps that joints have besides."""
+    maps, study = error_maps(ladder.last), ladder.last.study
+    if not maps.terms:
+        return causes, ladder
+    effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
+    causes = replace(causes, effects=tuple(effects), maps=maps)
+    return causes, climbed(study, [finding.terms for finding in effects])
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -1,7 +1,7 @@
 """Joints whose error is a curve of their own angle that no formula tells: sought after the names.
 
 A map enters where groups of poses that are left out tell that it helps, beside geometry, the
-effects that were named, and the slow laws of the same joint: a gain, and one to three waves a turn.
+effects that were named, and more than slow laws of the same joint do: a gain, one to three waves.
 Where its curve is one wave, that wave is named instead.  Laws of the same angle that the map makes
 needless leave: lines of a free frequency are a series for such a curve.
 """
@@ -23,9 +23,10 @@ from minimax_cal.diagnosing.remainder import (
     by_joint,
     gain_chance,
 )
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.maps import FINEST, range_of, sines
-from minimax_cal.modelling.effects.scene import BESIDE, joint_of
+from minimax_cal.modelling.effects.scene import BESIDE, Scene, joint_of
 from minimax_cal.modelling.effects.table import Term
 
 LEVEL = 1e-3  # chance that groups gain so much by a map of a joint that has none
@@ -40,13 +41,36 @@ NEEDLESS = 2e-2  # of what maps and laws of these angles explain: a rise that is
 class Mapped:
     """terms: what is found, the largest gain first.  chances: that groups gain so much by accident.
 
-    gains: of the square left out, over its variance.  needless: terms that they replace.
+    gains: of the square left out, over its variance.  again: share of the parts left out that are
+    met better.  needless: terms that they replace.
     """
 
     terms: tuple[Term, ...] = ()
     chances: tuple[float, ...] = ()
     gains: tuple[float, ...] = ()
+    again: tuple[float, ...] = ()
     needless: tuple[Term, ...] = ()
+
+    def beside(self, effects: Sequence[Sequence[Term]]) -> list[Sequence[Term]]:
+        """The effects of a ladder with the maps, without what these replace."""
+        gone = {term.key for term in self.needless}
+        kept = [terms for terms in effects if terms[0].key not in gone]
+        return [*kept, *((term,) for term in self.terms)]
+
+    def findings(self, named: Sequence[Finding], scene: Scene) -> list[Finding]:
+        """`beside` for findings; values are those of a fit that comes."""
+        gone = {term.key for term in self.needless}
+        out = [finding for finding in named if finding.term.key not in gone]
+        for i, term in enumerate(self.terms):
+            columns = term.columns(scene)
+            none = (0.0,) * len(columns.names)
+            names, units, chance = columns.names, columns.units, self.chances[i]
+            new = Finding((term,), names, units, none, none, self.gains[i], chance)
+            out.append(replace(new, fixed=columns.fixed, again=self.again[i]))
+        return out
+
+
+NO_MAPS = Mapped()
 
 
 def error_maps(fit: Joint) -> Mapped:
@@ -61,13 +85,16 @@ def error_maps(fit: Joint) -> Mapped:
     blocks = [block for block, _ in found]
     needless = replaced(fit, left, usual, blocks)
     at = begun(without(fit, left, needless).take(usual))
-    terms, gains = [], []
+    terms, gains, again = [], [], []
     for block in blocks:
         wide = at.with_block(block)
         terms.append(term_of(fit, block, wide, at.variance))
         gains.append((at.square - wide.square) / wide.variance)
+        fell = (at.error**2 - wide.error**2).sum(axis=1)
+        again.append(float(np.mean([fell[part].sum() > 0.0 for part in at.parts])))
         at = wide
-    return Mapped(tuple(terms), tuple(chance for _, chance in found), tuple(gains), needless)
+    chances = tuple(chance for _, chance in found)
+    return Mapped(tuple(terms), chances, tuple(gains), tuple(again), needless)
 
 
 def chosen(fit: Joint, left: Left) -> list[tuple[Block, float]]:
@@ -80,7 +107,8 @@ def chosen(fit: Joint, left: Left) -> list[tuple[Block, float]]:
         tried = [at.with_block(block) for block in waiting]
         for number in np.argsort([one.square for one in tried]).tolist():
             plain = at.with_block(slow(left, waiting[number].place))
-            chance = tries * gain_chance(plain, plain.with_block(waiting[number]), left.group)
+            each = [gain_chance(base, tried[number], left.group) for base in (at, plain)]
+            chance = tries * max(each)
             if chance < LEVEL:
                 at = tried[number]
                 out.append((waiting.pop(number), chance))

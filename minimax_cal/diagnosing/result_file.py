@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
+from minimax_cal.diagnosing.result import CURVE, Alternative, Diagnosis, Finding, Step
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
     EARLIER,
@@ -51,6 +52,7 @@ class FindingPart(Part):
     holdout_rms_mm: FallPart = FallPart()
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
+    curve: dict[str, list[Number]] = Field(default_factory=dict)
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -70,6 +72,7 @@ class FindingPart(Part):
             after=self.holdout_rms_mm.after,
             fixed=self.fixed,
             rows=self.lines,
+            curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
 
 

@@ -1,8 +1,12 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from test_remainder import geometric, rigid
 
+import minimax_cal as mc
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.study import SUM, studied
@@ -13,6 +17,14 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.maps import sines, spread
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.robot import Robot
+
+NODES = np.arange(-2.0, 3.0, 0.15)
+HEIGHTS = 3e-4 * np.random.default_rng(2).normal(size=len(NODES))
+
+
+def bumps(q: Array) -> Array:
+    """A curve of no period."""
+    return np.asarray(np.interp(q, NODES, HEIGHTS))
 
 
 def saw(q: Array) -> Array:
@@ -68,11 +80,9 @@ def test_slow_laws_of_the_same_angle_need_no_map(robot: Robot) -> None:
 def test_lines_that_a_map_makes_needless_leave(robot: Robot) -> None:
     sim = rigid(robot, 220, 2, 6)
     turn = np.zeros_like(sim.data.q)
-    nodes = np.arange(-2.0, 3.0, 0.15)
-    heights = 3e-4 * np.random.default_rng(2).normal(size=len(nodes))
-    turn[:, 1] = np.interp(sim.data.q[:, 1], nodes, heights)
+    turn[:, 1] = bumps(sim.data.q[:, 1])
     bare = geometric(robot, sim, turn)
-    line, _ = strongest_wave(nodes, heights)
+    line, _ = strongest_wave(NODES, HEIGHTS)
     named = joint(bare.study, [Term("gear_ripple", "J2", {"turns": line})])
     found = error_maps(named)
     assert [term.label for term in found.terms] == ["joint_error_map:J2"]
@@ -85,3 +95,31 @@ def test_the_strongest_wave_of_a_curve() -> None:
     assert abs(turns - 21.3) < 0.1
     assert share > 0.99
     assert strongest_wave(x, np.abs(np.sin(9.0 * x)) + np.sin(17.0 * x))[1] < 0.9
+
+
+def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_path: Path) -> None:
+    sim = rigid(robot, 220, 1, 3)
+    q = sim.data.q
+    turn = np.zeros_like(q)
+    turn[:, 1] = bumps(q[:, 1])
+    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+    told = mc.diagnose(robot, data, quick=True)
+    (found,) = [f for f in told.findings if f.term.label == "joint_error_map:J2"]
+    x, y, band = found.curve
+    inside = (x > q[:, 1].min()) & (x < q[:, 1].max())
+    off = (y - bumps(x))[inside]  # geometry may take a constant turn
+    assert np.mean(np.abs(off - off.mean()) < 3.0 * band[inside]) > 0.9
+    assert [p["name"] for p in found.parameters()] == ["RMS", "largest"]
+    again = mc.Diagnosis.from_dict(json.loads(told.json()))
+    assert json.loads(again.json())["effects"] == json.loads(told.json())["effects"]
+
+    told.save(tmp_path / "diagnosis.json")
+    fit = mc.calibrate(robot, data, objective="sum", effects=tmp_path / "diagnosis.json")
+    assert fit.accuracy["holdout"].rms_mm < 0.5 * told.ladder[1].holdout.rms_mm
+    rows = fit.effect_table().rows
+    assert [row[0] for row in rows] == ["joint_error_map:J2 RMS"]
+    fit.save(tmp_path / "fit.json")
+    loaded = mc.load_fit(tmp_path / "fit.json")
+    assert_allclose(loaded.predict(q), fit.predict(q), atol=1e-12)
+    fixed = mc.compensate(loaded, q[:10])
+    assert fixed.distance.max() < 2e-5
