@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
 from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
@@ -16,6 +17,7 @@ from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT
+from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
@@ -32,7 +34,8 @@ class Causes:
     faults: of the data.  library: what could be tested, and ripple:
     whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
     weightiest first.
-    traces: of what they leave.  untestable: effects, and what the data lack for them.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.  maps: of
+    joints, sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -42,6 +45,7 @@ class Causes:
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
+    maps: Mapped = NO_MAPS
 
 
 def causes_of(
@@ -63,6 +67,14 @@ def causes_of(
     return Causes(
         (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
     )
+
+
+def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
+    """Traces of what effects and maps leave together."""
+    maps = [term.columns(study.scene).displacement(study.scene) for term in causes.maps.terms]
+    known = np.concatenate([causes.choice.known, *map(study.rows.of, maps)], axis=1)
+    noise = restricted(study.rows, known)
+    return structure(study.scene, study.rows, noise, known, named_in(causes.choice))
 
 
 def named_in(choice: Choice) -> list[Named]:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import Causes, causes_of, fault_findings
+from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings
+from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
@@ -142,6 +143,10 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     progress("gap ladder")
     spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
+    if "joint_error_map" not in options.exclude:
+        progress("error maps of joints")
+        spoken, ladder = with_maps(spoken, ladder)
+        causes = spoken if spoken.maps.terms else causes
     steps = steps_of(asked, study, judges, spoken, ladder)
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
@@ -190,6 +195,17 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         nominal=study.nominal,
         remainder=rest,
     )
+
+
+def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:
+    """The causes and the ladder with the error maps that joints have besides."""
+    maps, study = error_maps(ladder.last), ladder.last.study
+    if not maps.terms:
+        return causes, ladder
+    effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
+    causes = replace(causes, effects=tuple(effects), maps=maps)
+    causes = replace(causes, traces=beside_maps(study, causes))
+    return causes, climbed(study, [finding.terms for finding in effects])
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -18,8 +18,9 @@ from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.maps import curve_of
+from minimax_cal.modelling.effects.scene import Scene, joint_of
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.parameters import State
 
 SHAKY = 3.0  # times what the instrument alone would show between visits
@@ -84,8 +85,24 @@ def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
         at = own.stop
         values, sure = last.state.effects[own].tolist(), sigma[own].tolist()
         motion = motions(ladder.last.study.scene, finding)
-        out.append(replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion))
+        new = replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion)
+        covers = slice(geometric + own.start, geometric + own.stop)
+        out.append(replace(new, curve=drawn(new, last, covers)))
     return out
+
+
+def drawn(finding: Finding, fit: Joint, own: slice) -> Array:
+    """(3, g) the curve of an error map, as `curve_of`; (3, 0) of another effect.
+
+    own: of its parameters among those of the fit.
+    """
+    term = finding.term
+    if not (term.effect in EFFECTS and EFFECTS[term.effect].is_map):
+        return np.zeros((3, 0))
+    sign = float(fit.study.robot.sign[joint_of(term.place)])
+    return curve_of(
+        term.choice, sign, np.array(finding.values), fit.uncertainty.covariance[own, own]
+    )
 
 
 def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:

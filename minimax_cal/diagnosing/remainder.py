@@ -25,14 +25,13 @@ from minimax_cal.diagnosing.joint import FOLDS, Joint
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
-from minimax_cal.modelling.effects.maps import sines, spread
+from minimax_cal.modelling.effects.maps import range_of, sines, spread, waves_over
 from minimax_cal.modelling.effects.scene import Scene
 
 FEWEST = 10  # groups that can say anything
 LEVEL = 1e-3  # chance that groups gain so much by one block that tells nothing
-LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0])  # of a joint's curve [rad]
-SIZES = (5e-5, 2e-4, 8e-4)  # of it [rad]
-FINEST = np.radians(6.0)  # wavelength of the shortest sine
+LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0]).tolist()  # of a joint's curve [rad]
+SHAPES = list(product((5e-5, 2e-4, 8e-4), LENGTHS))  # its size, beside what is left, and length
 LEAST_SWEEP = np.radians(10.0)  # a joint must turn so far to have a curve
 LEAST_LEVER = 0.1  # of the largest: joints that move the targets less count so much
 CENTRES = 150  # poses about which the functions of all joints are built, at most
@@ -161,7 +160,7 @@ def climbed(left: Left) -> tuple[list[Beside], list[str]]:
         while waiting:
             tried = [rungs[-1].with_block(block) for block in waiting]
             best = min(range(len(tried)), key=lambda i: tried[i].square)
-            if not helps(rungs[-1], tried[best], left.group):
+            if gain_chance(rungs[-1], tried[best], left.group) > LEVEL:
                 break
             place = waiting[best].place
             waiting = [block for block in waiting if block.place != place]
@@ -170,13 +169,18 @@ def climbed(left: Left) -> tuple[list[Beside], list[str]]:
     return rungs, places
 
 
-def helps(before: Beside, after: Beside, group: Array) -> bool:
-    """Whether groups of poses that were left out are met better.  group: (m,)."""
+def gain_chance(before: Beside, after: Beside, group: Array) -> float:
+    """Chance that groups of poses left out gain so much by what tells nothing.  group: (m,).
+
+    By the sum of their gains, or by their ranks, which a few poses far from all others do not sway.
+    """
     names = np.unique(group, return_inverse=True)[1].reshape(-1)
     gains = np.bincount(names, (before.error**2 - after.error**2).sum(axis=1))
     if len(gains) < FEWEST or not gains.sum() > 0.0:
-        return False
-    return float(stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue) < LEVEL
+        return 1.0
+    mean = stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue
+    ranks = stats.wilcoxon(gains, alternative="greater").pvalue
+    return min(2.0 * float(min(mean, ranks)), 1.0)
 
 
 # ---- free functions ----------------------------------------------------------------------------
@@ -198,14 +202,13 @@ class Block:
 def by_joint(left: Left) -> Iterator[Block]:
     """A turn of each joint that is smooth in its own angle; of a slide, in its place."""
     for j, q in enumerate(left.q.T):
-        span = float(np.ptp(q))
-        if span < LEAST_SWEEP:
+        if np.ptp(q) < LEAST_SWEEP:
             continue
-        low, high = q.min() - LENGTHS[0], q.max() + LENGTHS[0]
-        count = max(min(int(2.0 * span / FINEST) + 1, left.groups // 2), 1)
+        low, high = range_of(q)
+        count = max(min(waves_over(high - low), left.groups // 2), 1)
         columns = left.arm[:, :, j, None] * sines(q, low, high, count).T[:, None]
-        shapes = [spread(length, high - low, count) for length in LENGTHS]
-        yield Block(f"J{j + 1}", columns, np.array([s * w for s, w in product(SIZES, shapes)]))
+        priors = [size * spread(length, high - low, count) for size, length in SHAPES]
+        yield Block(f"J{j + 1}", columns, np.array(priors))
 
 
 def by_all(left: Left) -> Iterator[Block]:
@@ -253,7 +256,8 @@ class Beside:
     """A fit of some columns, and what it predicts of each part of the poses without that part.
 
     parts: (f, m) masks of the poses left out.  y: (m, r) what is fitted.  columns: (m, r, p), with
-    weights `ridge` (p,) of a prior of mean 0.  error: (m, r) of each pose, without its part.
+    weights `ridge` (p,) of a prior of mean 0.  error: (m, r) what is left of each pose without its
+    part.  picked: which prior of the last block.
     """
 
     parts: Array
@@ -261,19 +265,25 @@ class Beside:
     columns: Array
     ridge: Array
     error: Array
+    picked: int = 0
 
     @staticmethod
     def of(parts: Array, y: Array, columns: Array) -> Beside:
         """Columns that are fitted freely."""
-        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
-        columns = columns / np.maximum(size, 1e-300)
-        bare = Beside(parts, y, columns, np.full(len(size), RIDGE), np.zeros_like(y))
-        return replace(bare, error=bare.cleared(y[..., None])[0][..., 0])
+        nothing = Beside(parts, y, columns[..., :0], np.zeros(0), y)
+        return nothing.with_free(columns)
+
+    @property
+    def variance(self) -> float:
+        """Of a coordinate that is left out [m^2]."""
+        return self.square / self.y.size
 
     @cached_property
-    def judged(self) -> Array:
-        """(m,) True for poses that some fit does without."""
-        return np.asarray(self.parts.any(axis=0))
+    def value(self) -> Array:
+        """(p,) with all poses."""
+        gram = product_of(self.columns, self.columns) + np.diag(self.ridge)
+        pull = product_of(self.columns, self.y[..., None])
+        return np.asarray(np.linalg.solve(gram, pull)[:, 0])
 
     @property
     def usual(self) -> Array:
@@ -313,7 +323,7 @@ class Beside:
         clear, cross = self.cleared(both)
         fall = np.swapaxes(cross, 1, 2) @ np.linalg.solve(self.grams, cross)
         left = (self.without(both, both) - fall)[:, None]
-        ridge = self.square / self.y.size / block.priors**2
+        ridge = self.variance / block.priors**2
         eye = np.eye(ridge.shape[1])
         value = np.linalg.solve(left[..., :-1, :-1] + ridge[:, :, None] * eye, left[..., :-1, -1:])
         error = np.zeros((len(ridge), *self.y.shape))
@@ -323,7 +333,16 @@ class Beside:
             error[:, part] = rest - told.reshape(len(ridge), *rest.shape)
         best = int(np.argmin((error**2).sum(axis=(1, 2))))
         columns = np.concatenate([self.columns, block.columns], axis=-1)
-        return Beside(self.parts, self.y, columns, np.append(self.ridge, ridge[best]), error[best])
+        ridge = np.append(self.ridge, ridge[best])
+        return Beside(self.parts, self.y, columns, ridge, error[best], best)
+
+    def with_free(self, columns: Array) -> Beside:
+        """The fit with columns (m, r, c) besides that nothing holds."""
+        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
+        both = np.concatenate([self.columns, columns / np.maximum(size, 1e-300)], axis=-1)
+        ridge = np.append(self.ridge, np.full(len(size), RIDGE))
+        bare = Beside(self.parts, self.y, both, ridge, self.y)
+        return replace(bare, error=bare.cleared(self.y[..., None])[0][..., 0])
 
 
 def product_of(one: Array, other: Array) -> Array:

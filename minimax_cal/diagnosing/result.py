@@ -10,12 +10,14 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
 from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, number, write_whole
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from minimax_cal.diagnosing.remainder import Remainder
 
 SCHEMA = 1
+CURVE = ("q_rad", "turn_rad", "sigma_rad")
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 FAULTS = {
@@ -74,7 +77,7 @@ class Finding:
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
     told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
-    was found again.
+    was found again.  curve: (3, g) of an error map: joint value, turn, sigma [rad].
     """
 
     terms: tuple[Term, ...]
@@ -92,6 +95,7 @@ class Finding:
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
     again: float = 1.0
+    curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
 
     @property
     def established(self) -> bool:
@@ -139,6 +143,8 @@ class Finding:
 
         Where masses are not told, by the largest motion that it makes: mrad, or mm.
         """
+        if self.curve.size:
+            return of_curve(self.curve)
         scale, units = [1e3 if unit == "m" else 1.0 for unit in self.units], self.units
         units = tuple("mm" if unit == "m" else unit for unit in units)
         if self.motion:
@@ -168,10 +174,26 @@ class Finding:
             "chance": finite(self.p_value),
             "parameters": self.parameters(),
             "fixed": {key: finite(value) for key, value in self.fixed.items()},
+            **(
+                {"curve": dict(zip(CURVE, plain(self.curve), strict=True))}
+                if self.curve.size
+                else {}
+            ),
             "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
             "alternatives": [other.to_dict() for other in self.alternatives],
             "lines": list(self.rows),
         }
+
+
+def of_curve(curve: Array) -> list[dict[str, Any]]:
+    """An error map in two numbers, for JSON.  curve: as `Finding.curve`."""
+    _, turn, sigma = curve
+    most = int(np.argmax(np.abs(turn)))
+    told = {"RMS": (rms(turn), rms(sigma)), "largest": (abs(turn[most]), sigma[most])}
+    return [
+        {"name": name, "value": float(value), "sigma": finite(float(sure)), "unit": "rad"}
+        for name, (value, sure) in told.items()
+    ]
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
+from minimax_cal.diagnosing.result import CURVE, Alternative, Diagnosis, Finding, Step
 from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
@@ -56,6 +57,7 @@ class FindingPart(Part):
     lines: tuple[int, ...] = ()
     established: bool = True
     found_again: Number = math.nan
+    curve: dict[str, list[Number]] = Field(default_factory=dict)
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -76,6 +78,7 @@ class FindingPart(Part):
             fixed=self.fixed,
             rows=self.lines,
             again=1.0 if self.established else min(self.found_again, BELOW),
+            curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
 
 

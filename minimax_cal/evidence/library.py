@@ -193,7 +193,7 @@ def library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:
     """Every effect at every place in every variant that the data can test."""
     terms, untestable = [], []
     for name, effect in EFFECTS.items():
-        if name in exclude or effect.is_map:
+        if name in exclude or effect.is_map:  # maps are sought when the rest is known
             continue
         if missing := effect.needs(scene):
             untestable.append((name, missing))

@@ -21,6 +21,7 @@ from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, row
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
 from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
@@ -92,6 +93,7 @@ class Poses:
     arm: (m, r, n) motion of the points per unit of each joint.
     weighted: (m, r, p) A times `jacobian`.
     off, prior: (p,) how far the parameters are from the prior's mean, and its weights.
+    beside: (p,) variance beside which a prior was weighed, 0 for a typical coordinate [m^2].
     seen: (k, m) which points were measured.
     """
 
@@ -101,6 +103,7 @@ class Poses:
     weighted: Array
     off: Array
     prior: Array
+    beside: Array
     seen: Array
 
     @staticmethod
@@ -120,6 +123,7 @@ class Poses:
             weighted = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * jacobian
         joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
         off = (model.prior.mean - model.values(state))[model.active]
+        geometric = model.names.geometric
         return Poses(
             error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
             jacobian=jacobian,
@@ -127,6 +131,9 @@ class Poses:
             weighted=weighted,
             off=off,
             prior=model.prior.weight[model.active],
+            beside=np.repeat([0.0, BESIDE**2], [geometric, model.names.count - geometric])[
+                model.active
+            ],
             seen=model.seen,
         )
 
@@ -280,8 +287,8 @@ def by_poses(poses: Poses, group: Array) -> Array:
 
     (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
     the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  With C = H^-1 and L = J C J'A it is
-    C J'A (1 - L)^-1 e.  group: (m,) rows with the same number are one pose.  NaN where the fit needs
-    one of the poses.
+    C J'A (1 - L)^-1 e.  group: (m,) rows with the same number are one pose.  NaN where the fit
+    needs one of the poses.
     """
     member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
     order, count, p = (
@@ -308,9 +315,10 @@ def by_poses(poses: Poses, group: Array) -> Array:
 
 
 def sandwich(poses: Poses, meat: Array) -> Array:
-    """H^-1 F H^-1.  A prior is rows as noisy as a typical one: its weight times their variance."""
+    """H^-1 F H^-1.  A prior is rows as noisy as what it was weighed beside."""
     if poses.prior.any():
-        meat = meat + poses.mean_square * np.diag(poses.prior)
+        variance = np.where(poses.beside > 0.0, poses.beside, poses.mean_square)
+        meat = meat + np.diag(variance * poses.prior)
     half = solve_normal(poses.bread, meat)
     return np.asarray(solve_normal(poses.bread, half.T))
 

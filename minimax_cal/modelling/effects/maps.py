@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
 from minimax_cal.modelling.effects.scene import (
+    BESIDE,
     Choice,
     Columns,
     Effect,
@@ -20,8 +21,8 @@ from minimax_cal.modelling.effects.scene import (
 )
 
 LENGTH, SIZE = float(np.radians(5.0)), 3e-4  # of a usual curve [rad]
-NOISE = 5e-5  # of a coordinate, with which the size of a curve is weighed [m]
 FINEST = float(np.radians(6.0))  # wavelength of the shortest sine
+SHOWN = float(np.radians(2.0))  # from one point of a curve that is told to the next
 MARGIN = float(np.radians(4.0))  # beyond the measured angles the curve goes to nothing
 
 
@@ -55,7 +56,7 @@ def error_map(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = f(q_j): f a Gaussian process between `low` and `high`, 0 elsewhere.
 
     length, size: of its covariance (Matern of order 3/2), size beside coordinates that err by
-    `NOISE`.
+    `BESIDE`.
     """
     joint, low, high = joint_of(place), choice["low"], choice["high"]
     count = waves_over(high - low)
@@ -65,7 +66,7 @@ def error_map(scene: Scene, place: str, choice: Choice) -> Columns:
         tuple(f"w{k + 1}" for k in range(count)),
         ("rad",) * count,
         one_joint(scene, joint, wave),
-        ridge=(NOISE / sigma) ** 2,
+        ridge=(BESIDE / sigma) ** 2,
     )
 
 
@@ -84,3 +85,16 @@ JOINT_ERROR_MAP = Effect(
     choices=usual,
     is_map=True,
 )
+
+
+def curve_of(choice: Choice, sign: float, values: Array, covariance: Array) -> Array:
+    """(3, g) the curve of a fitted map: joint value as the controller has it, turn, and its sigma.
+
+    sign: of the joint in the robot file.  values: (d,), covariance: (d, d) [rad].
+    """
+    low, high = choice["low"], choice["high"]
+    x = np.linspace(low, high, int((high - low) / SHOWN) + 2)
+    wave = sines(x, low, high, len(values))
+    band = np.sqrt(np.maximum(np.einsum("dg,de,eg->g", wave, covariance, wave), 0.0))
+    out = np.stack([sign * x, sign * (values @ wave), band])
+    return np.asarray(out[:, :: int(sign)])

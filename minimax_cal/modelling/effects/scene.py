@@ -18,6 +18,7 @@ from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
 MASS_DOUBT = 0.2  # relative sigma of the masses and centres of gravity in a robot file
+BESIDE = 5e-5  # error of a coordinate beside which priors of effects are weighed [m]
 LEAST_ARM = 0.02  # sigma of a centre of gravity, where 20 % of it is less [m]
 
 
@@ -209,7 +210,7 @@ class Columns:
     doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
     doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
-    ridge: (d,) weight of a prior of mean zero beside points [m^2 per unit^2]; empty for none.
+    ridge: (d,) weight of a prior of mean zero, (BESIDE / sigma)^2 [m^2 per unit^2]; empty for none.
     """
 
     names: tuple[str, ...]
