@@ -53,7 +53,7 @@ def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
         return text
     what = "the causes below leave" if causes else "geometry leaves"
     guess = "these names are a best guess" if causes else "the cause is unknown"
-    if not found.structure < STRUCTURE and causes:  # two laws of one joint stand for another
+    if not found.structure < STRUCTURE:  # it is the names that do not hold
         return f"{text} {found.structure_in[:1].upper()}{found.structure_in[1:]}: {guess}."
     return (
         f"{text} What {what} is not noise ({found.structure_in}: by chance {found.structure:.1g}, "

@@ -152,7 +152,7 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
 
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
-    assert "by chance 1e-07, below 0.01 is no accident" in told.headline()
+    assert "by chance 1e-07, below 0.005 is no accident" in told.headline()
     assert "0.005 is rare enough" in told.effects_table().title
     assert "power 25 tells apart" in told.rival_table().title
     assert " p = " not in told.headline()
