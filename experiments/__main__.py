@@ -61,6 +61,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
     ),
+    "machine_gap": (
+        "experiments.machine_gap",
+        "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
+    ),
     "relative": (
         "experiments.relative",
         "What lengths, closures and poses tell beside a tracker, and how true their positions are",

@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
-from minimax_cal.evidence.alternatives import BAND, ENOUGH
-from minimax_cal.evidence.selection import LEVEL
+from minimax_cal.evidence.limits import BAND, ENOUGH, FIRM, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, number, write_whole
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
@@ -28,7 +29,11 @@ from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.solvers.status import Status
 
+if TYPE_CHECKING:
+    from minimax_cal.diagnosing.remainder import Remainder
+
 SCHEMA = 1
+CURVE = ("q_rad", "turn_rad", "sigma_rad")
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 FAULTS = {
@@ -81,7 +86,8 @@ class Finding:
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
-    told; empty otherwise.
+    told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
+    was found again.  curve: (3, g) of an error map: joint value, turn, sigma [rad].
     """
 
     terms: tuple[Term, ...]
@@ -98,6 +104,13 @@ class Finding:
     fixed: Mapping[str, float] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
+    again: float = 1.0
+    curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
+
+    @property
+    def established(self) -> bool:
+        """Whether it was found again whichever poses were left out."""
+        return self.again >= FIRM
 
     @property
     def term(self) -> Term:
@@ -135,6 +148,8 @@ class Finding:
 
         Where masses are not told, by the largest motion that it makes: mrad, or mm.
         """
+        if self.curve.size:
+            return of_curve(self.curve)
         scale, units = [1e3 if unit == "m" else 1.0 for unit in self.units], self.units
         units = tuple("mm" if unit == "m" else unit for unit in units)
         if self.motion:
@@ -157,15 +172,33 @@ class Finding:
         return {
             "effect": self.term.effect,
             "place": self.term.place,
+            "established": self.established,
+            "found_again": self.again,
             "share": finite(self.share),
             "lambda": finite(self.size),
             "chance": finite(self.p_value),
             "parameters": self.parameters(),
             "fixed": {key: finite(value) for key, value in self.fixed.items()},
+            **(
+                {"curve": dict(zip(CURVE, plain(self.curve), strict=True))}
+                if self.curve.size
+                else {}
+            ),
             "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
             "alternatives": [other.to_dict() for other in self.alternatives],
             "lines": list(self.rows),
         }
+
+
+def of_curve(curve: Array) -> list[dict[str, Any]]:
+    """An error map in two numbers, for JSON.  curve: as `Finding.curve`."""
+    _, turn, sigma = curve
+    most = int(np.argmax(np.abs(turn)))
+    told = {"RMS": (rms(turn), rms(sigma)), "largest": (abs(turn[most]), sigma[most])}
+    return [
+        {"name": name, "value": float(value), "sigma": finite(float(sure)), "unit": "rad"}
+        for name, (value, sure) in told.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -193,6 +226,7 @@ class Diagnosis:
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
+    remainder: what free functions still predict, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -220,6 +254,7 @@ class Diagnosis:
     stated_errors: tuple[Array, Array] | None = None
     stated_curves: Mapping[str, Curve] | None = None
     nominal: Cell | None = None
+    remainder: Remainder | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -301,6 +336,7 @@ class Diagnosis:
                     for step in self.ladder
                 ],
             },
+            "remainder": self.remainder.to_dict() if self.remainder else None,
             "noise": {
                 "instrument_mm": finite(1e3 * self.noise),
                 "joint_jitter_mrad": finite(1e3 * self.jitter),
@@ -363,19 +399,21 @@ class Diagnosis:
 
     def effects_table(self) -> Table:
         """The effects found, with what each does for held-out poses; tentative ones last."""
-        found = sorted(self.by_rung, key=lambda f: not established(f))
+        found = sorted(self.by_rung, key=lambda f: not f.established)
         rows: list[tuple[TableCell, ...]] = [
             (f"{f.term.effect} {f.term.place}{f.lines}",
              "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
              100.0 * f.share + 0.0, f.before, f.after, f.chance,
-             "established" if established(f) else "tentative")
+             "established" if f.established else "tentative")
             for i, f in enumerate(found)
         ]  # fmt: skip
         title = f"effects found, rung by rung; by chance, {LEVEL:g} is rare enough"
         header = ("effect", "cause", "share of gap %", "before mm", "after mm", "by chance",
                   "evidence")  # fmt: skip
         formats = ("", "", ".0f", ".4f", ".4f", "", "")
-        shown = len(header) - all(map(established, found))  # without the column that says one thing
+        shown = len(header) - all(
+            f.established for f in found
+        )  # without the column that says one thing
         return Table(title, header[:shown], tuple(row[:shown] for row in rows), formats[:shown])
 
     def parameter_table(self) -> Table:
@@ -424,11 +462,6 @@ class Diagnosis:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
-
-
-def established(finding: Finding) -> bool:
-    """Whether the evidence suffices; so it does for every effect of a file that tells nothing."""
-    return bool(getattr(finding, "established", True))
 
 
 def in_words(place: str) -> str:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from minimax_cal.diagnosing.causes import LEVEL
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, established, in_words
+from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
+from minimax_cal.evidence.limits import STRUCTURE
 
 NOTHING_MM = 5e-4  # of a length that is told to three digits
 SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
-NO_CHANCE = f"below {LEVEL:g} is no accident"
+NO_CHANCE = f"below {STRUCTURE:g} is no accident"
 VERDICTS = {  # what stands first
     "none": "Verdict: none. Nothing beyond geometry and noise is established.",
     "named": "Verdict: named, and no rival explains the errors as well.",
@@ -24,8 +23,8 @@ VERDICTS = {  # what stands first
 
 def reasons(found: Diagnosis) -> tuple[str, ...]:
     """Verdict, established causes, share, remainder, next measurement; then what is tentative."""
-    causes = [f for f in found.by_rung if established(f)]
-    tentative = [f for f in found.by_rung if not established(f)]
+    causes = [f for f in found.by_rung if f.established]
+    tentative = [f for f in found.by_rung if not f.established]
     large = [f for f in causes if not f.share < SMALL] or causes[:1]
     small = [f for f in causes if f not in large]
     return tuple(
@@ -44,12 +43,6 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     )
 
 
-def remainder_of(found: Diagnosis) -> Mapping[str, Any] | None:
-    """What remains, as in the JSON: what could be predicted, where, and what could not."""
-    part = getattr(found, "remainder", None)
-    return part if part is None or isinstance(part, Mapping) else part.to_dict()
-
-
 # ---- the sentences -----------------------------------------------------------------------------
 
 
@@ -60,7 +53,7 @@ def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
         return text
     what = "the causes below leave" if causes else "geometry leaves"
     guess = "these names are a best guess" if causes else "the cause is unknown"
-    if not found.structure < LEVEL and causes:  # two laws of one joint stand for another
+    if not found.structure < STRUCTURE:  # it is the names that do not hold
         return f"{text} {found.structure_in[:1].upper()}{found.structure_in[1:]}: {guess}."
     return (
         f"{text} What {what} is not noise ({found.structure_in}: by chance {found.structure:.1g}, "
@@ -126,20 +119,17 @@ def remaining(found: Diagnosis) -> str:
         if floor.certain
         else f"at most {floor.value:.3f} mm, the noise of the fit"
     )
-    left = remainder_of(found)
-    if not left or left.get("predictable_mm") is None:
+    left = found.remainder
+    if left is None:
         return f"Noise alone would leave {noise}."
-    if left["predictable_mm"] < NOTHING_MM:
+    if left.predictable_mm < NOTHING_MM:
         return f"What remains follows nothing known; noise alone would leave {noise}."
-    places = left.get("where") or ()
-    where = ", ".join(
-        f"{in_words(part['place'])} {100.0 * part['share']:.0f} %" for part in places[:3]
+    where = ", ".join(f"{in_words(place)} {100.0 * share:.0f} %" for place, share in left.where[:3])
+    told = f" ({where})" if where else ""
+    return (
+        f"Of what remains, {left.predictable_mm:.3f} mm follow the pose{told}, "
+        f"{left.unpredictable_mm:.3f} mm follow nothing known; noise alone would leave {noise}."
     )
-    text = f"Of what remains, {left['predictable_mm']:.3f} mm follow the pose"
-    text += f" ({where})" if where else ""
-    if left.get("unpredictable_mm") is not None:
-        text += f", {left['unpredictable_mm']:.3f} mm follow nothing known"
-    return f"{text}; noise alone would leave {noise}."
 
 
 def away(found: Diagnosis) -> str:

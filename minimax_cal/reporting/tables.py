@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis, in_words
-from minimax_cal.diagnosing.sentences import remainder_of
 from minimax_cal.diagnosing.where import triage_table
 from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
@@ -77,20 +76,20 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
 
 def remainder_table(found: Diagnosis) -> Table:
     """What the last rung leaves: what follows the pose, and where; what follows nothing known."""
-    left = remainder_of(found) or {}
-    parts = [("follows the pose, and could be predicted", left.get("predictable_mm"), math.nan)]
-    parts += [
-        (f"  of it {in_words(part['place'])}", None, 100.0 * number(part["share"]))
-        for part in left.get("where") or ()
-    ]
-    parts.append(("follows nothing known", left.get("unpredictable_mm"), math.nan))
-    ends = left.get("floor_mm") or (None, None)
-    parts += [(f"noise alone, {name}", end, math.nan)
-              for name, end in zip(("at least", "at most"), ends, strict=True)]  # fmt: skip
-    rows = tuple((name, number(size), share) for name, size, share in parts
-                 if size is not None or math.isfinite(share))  # fmt: skip
+    left, rows = found.remainder, []
+    if left:
+        ends = zip(("at least", "at most"), left.floor_mm or (), strict=False)
+        rows = [
+            ("follows the pose, and could be predicted", left.predictable_mm, math.nan),
+            *(
+                (f"  of it {in_words(place)}", math.nan, 100.0 * share)
+                for place, share in left.where
+            ),
+            ("follows nothing known", left.unpredictable_mm, math.nan),
+            *((f"noise alone, {name}", end, math.nan) for name, end in ends),
+        ]
     header = ("what remains", "RMS mm", "share %")
-    return Table("what the last rung leaves", header, rows, ("", ".4f", ".0f"))
+    return Table("what the last rung leaves", header, tuple(rows), ("", ".4f", ".0f"))
 
 
 def bare_scene() -> Scene:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import VERDICTS, Alternative, Diagnosis, Finding, Step
 from minimax_cal.diagnosing.sentences import VERDICTS as OPENINGS
 from minimax_cal.fitting.beyond import Beyond
@@ -64,7 +65,7 @@ def marked(found: Diagnosis, **more: Any) -> Diagnosis:
     """With what the evidence says besides: whether effects are established, what remains."""
     for name, value in more.pop("established", {}).items():
         one = next(f for f in found.findings if f.term.effect == name)
-        object.__setattr__(one, "established", value)
+        object.__setattr__(one, "again", float(value))
     for name, value in more.items():
         object.__setattr__(found, name, value)
     return found
@@ -118,18 +119,17 @@ def test_tentative_effects_stand_together_below(found: Diagnosis) -> None:
 
 
 def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
-    assert not remainder_table(found).rows  # of a file that tells none
-    left = {"predictable_mm": 0.2, "where": [{"place": "J3", "share": 0.6}],
-            "unpredictable_mm": 0.05, "floor_mm": [0.02, 0.03]}  # fmt: skip
-    told = marked(replace(found), remainder=left)
+    assert not remainder_table(replace(found, remainder=None)).rows  # of a file that tells none
+    left = Remainder(0.2, (("J3", 0.6),), 0.05, (0.02, 0.03))
+    told = replace(found, remainder=left)
     text = next(text for text in told.reasons if text.startswith("Of what remains"))
     assert "0.200 mm follow the pose (at joint 3 60 %), 0.050 mm follow nothing known" in text
     assert [row[1] for row in remainder_table(told).rows if not math.isnan(float(row[1]))] == [
         0.2, 0.05, 0.02, 0.03
     ]  # fmt: skip
-    told = marked(replace(found), remainder={**left, "predictable_mm": 0.0})
+    told = replace(found, remainder=replace(left, predictable_mm=0.0))
     assert any(text.startswith("What remains follows nothing known;") for text in told.reasons)
-    told = marked(replace(found), remainder={**left, "predictable_mm": None, "floor_mm": None})
+    told = replace(found, remainder=None)
     assert not any(text.startswith("Of what remains") for text in told.reasons)
 
 
@@ -152,7 +152,7 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
 
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
-    assert "by chance 1e-07, below 0.01 is no accident" in told.headline()
+    assert "by chance 1e-07, below 0.005 is no accident" in told.headline()
     assert "0.005 is rare enough" in told.effects_table().title
     assert "power 25 tells apart" in told.rival_table().title
     assert " p = " not in told.headline()

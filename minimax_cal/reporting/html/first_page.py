@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.diagnosing.result import Diagnosis, Finding, established
-from minimax_cal.diagnosing.sentences import remainder_of
+from minimax_cal.diagnosing.result import Diagnosis, Finding
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
@@ -217,9 +216,8 @@ def limits_now(sources: Sources, found: Signed) -> str:
         alone = f"{'' if floor.certain else 'at most '}{number(floor.value)}"
         if left <= NEAR_NOISE * floor.value:
             return f"the noise of the measurements, which alone leaves {alone}."
-        rest = remainder_of(sources.gap) or {}
-        follows = rest.get("predictable_mm")
-        known = "" if follows is None else f" ({number(follows)} of it follow the pose)"
+        rest = sources.gap.remainder
+        known = f" ({number(rest.predictable_mm)} of it follow the pose)" if rest else ""
         return f"a remainder that no known effect explains{known}; noise alone would leave {alone}."
     if sources.fit:
         few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
@@ -234,7 +232,7 @@ def limits_now(sources: Sources, found: Signed) -> str:
 
 def causes(gap: Diagnosis) -> list[Finding]:
     """The effects that the diagnosis holds for established, the largest first."""
-    return [f for f in gap.findings if established(f) and not f.rows]
+    return [f for f in gap.findings if f.established and not f.rows]
 
 
 def holds(sources: Sources, finding: Finding) -> bool:

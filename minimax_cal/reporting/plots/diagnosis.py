@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.diagnosing.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
-from minimax_cal.diagnosing.result import Diagnosis, established
+from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.arrays import Array
 from minimax_cal.reporting.plots.figures import (
     AFTER,
@@ -130,7 +130,7 @@ def draw_maps(part: Any, left: Leftover) -> None:
 
 def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict in a few words."""
-    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.by_rung if established(f)]
+    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.by_rung if f.established]
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     found = ", ".join(names[:3]) + more
     return {
