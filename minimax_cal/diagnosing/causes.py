@@ -14,17 +14,14 @@ from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import ENOUGH, alternatives
+from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.limits import ENOUGH, EXACT
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.table import Term
 
-LEVEL = 0.01  # chance that noise alone is called structure
-CERTAIN = 1e-6  # chance below which something is there, whatever its name
-MATTERS = 0.015  # share of what was explained below which more structure is of no account
-OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
 FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
@@ -61,7 +58,7 @@ def causes_of(
         lib, choice = chosen(study, (*exclude, "backlash"))
     progress("what remains")
     traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
-    if choice.noise.variance < selection.EXACT**2:
+    if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = "gear_ripple" not in exclude
@@ -209,46 +206,6 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
             fixed={**first.fixed, **found.fixed},
         )
     return list(out.values())
-
-
-def judged(
-    findings: Sequence[Finding], traces: Sequence[Trace], explained: float
-) -> tuple[str, tuple[str, float]]:
-    """The verdict; where what remains has structure, and the probability of that by chance.
-
-    explained: weighed square that the effects explain; structure far below it is of no account.
-    """
-    worst = min(traces, key=lambda trace: trace.p)
-    p = min(1.0, worst.p * len(traces))
-    findings = [found for found in findings if found.established or found.p_value < CERTAIN]
-    loud = [t for t in traces if t.p * len(traces) < LEVEL and t.excess > MATTERS * explained]
-    if loud:
-        return "unknown", (min(loud, key=lambda t: t.p).name, p)
-    if patched(findings):
-        return "unknown", ("two laws for one joint may stand for one that is not known", p)
-    if not findings:
-        return "none", (worst.name, p)
-    if not all(found.established for found in findings):
-        return "unknown", ("names that change with the poses", p)
-    several = any(found.alternatives for found in findings)
-    return ("one_of" if several else "named"), (worst.name, p)
-
-
-def explained(study: Study, choice: Choice) -> float:
-    """Weighed square that the effects explain."""
-    none = np.zeros((len(study.rows.error), 0))
-    without, left = (
-        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
-    )
-    return without - left
-
-
-def patched(findings: Sequence[Finding]) -> bool:
-    """Whether one joint needs two laws of its own angle: likely one law that is not known."""
-    by_angle = [f.term for f in findings if f.term.effect in OF_ANGLE]
-    joints = [t.place for t in by_angle if t.place != "all"]
-    twice = len(set(joints)) < len(joints)
-    return twice or (bool(joints) and any(t.place == "all" for t in by_angle))
 
 
 def fault_findings(faults: Sequence[Fault]) -> list[Finding]:

@@ -11,11 +11,9 @@ from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.bench import Added
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.selection import AGAIN, Choice, select
+from minimax_cal.evidence.limits import AGAIN, DIFFER, FOLDS, SAME
+from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.measuring.measurements import Measurements
-
-FOLDS = 5  # fifths of the groups
-DIFFER = 1e-3  # chance that parameters of a fold differ so much from those of all poses
 
 
 def judged_again(
@@ -40,9 +38,12 @@ def judged_again(
 def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
     """Whether a choice has an effect, or a rival that was told with it, as large as before."""
     rivals = {(a.effect, a.place) for a in finding.alternatives}
+    effect, place = finding.term.key
     own = [one for one in choice.fits if one.candidate.key == finding.term.key]
-    if not own:
-        return any(one.candidate.key in rivals for one in choice.fits)
+    if not own:  # all joints hold one, too
+        alike = {one.candidate.key for one in choice.fits}
+        wide = any(name == effect and "all" in (place, other) for name, other in alike)
+        return wide or bool(alike & rivals)
     before = [one for one in whole.fits if one.candidate.key == finding.term.key]
     if {one.candidate.term.text for one in own} != {one.candidate.term.text for one in before}:
         return True  # another variant of the law, or another of its lines
@@ -53,5 +54,5 @@ def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
 def agree(part: Added, whole: Added) -> bool:
     """Whether the parameters of a part are those of the whole, within the sigmas of both."""
     variance = part.sigma**2 + whole.sigma**2 + 1e-300
-    off = float(((part.value - whole.value) ** 2 / variance).sum())
-    return bool(off < chi2.isf(DIFFER, len(part.value)))
+    off, size = (float((x**2 / variance).sum()) for x in (part.value - whole.value, whole.value))
+    return bool(off < max(chi2.isf(DIFFER, len(part.value)), SAME * size))

@@ -39,10 +39,12 @@ class Ladder:
 
     taken: numbers of the effects that the ladder took.  With the others groups of poses that were
     left out, or the training poses themselves, are met no better.
+    parts: masks (m,) of those groups.
     """
 
     fits: tuple[Joint, ...]
     taken: tuple[int, ...]
+    parts: tuple[Array, ...]
 
     @property
     def last(self) -> Joint:
@@ -69,7 +71,7 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
             taken.append(number)
-    return Ladder(tuple(fits), tuple(taken))
+    return Ladder(tuple(fits), tuple(taken), tuple(spared))
 
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.alternatives import ENOUGH
+from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements

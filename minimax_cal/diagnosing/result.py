@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
+from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.ground.arrays import Array, rms
@@ -28,9 +29,11 @@ from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.solvers.status import Status
 
+if TYPE_CHECKING:
+    from minimax_cal.diagnosing.remainder import Remainder
+
 SCHEMA = 1
 CURVE = ("q_rad", "turn_rad", "sigma_rad")
-FIRM = 1.0  # share of the parts without which an effect is found again, to be established
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 FAULTS = {
@@ -219,6 +222,7 @@ class Diagnosis:
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
+    remainder: what free functions still predict, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -247,6 +251,7 @@ class Diagnosis:
     stated_errors: tuple[Array, Array] | None = None
     stated_curves: Mapping[str, Curve] | None = None
     nominal: Cell | None = None
+    remainder: Remainder | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -313,6 +318,7 @@ class Diagnosis:
                     for step in self.ladder
                 ],
             },
+            "remainder": self.remainder.to_dict() if self.remainder else None,
             "noise": {
                 "instrument_mm": finite(1e3 * self.noise),
                 "joint_jitter_mrad": finite(1e3 * self.jitter),

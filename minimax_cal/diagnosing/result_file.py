@@ -11,7 +11,9 @@ import numpy as np
 from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
+from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import CURVE, Alternative, Diagnosis, Finding, Step
+from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
     EARLIER,
@@ -30,6 +32,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
+BELOW = math.nextafter(FIRM, 0.0)  # what was tentative when it was written stays so
 
 
 class FallPart(Part):
@@ -53,6 +56,8 @@ class FindingPart(Part):
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
     curve: dict[str, list[Number]] = Field(default_factory=dict)
+    established: bool = True
+    found_again: Number = math.nan
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -73,7 +78,29 @@ class FindingPart(Part):
             fixed=self.fixed,
             rows=self.lines,
             curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
+            again=1.0 if self.established else min(self.found_again, BELOW),
         )
+
+
+class PlacePart(Part):
+    """A share of what is still predictable."""
+
+    place: str
+    share: Number
+
+
+class RemainderPart(Part):
+    """What free functions still predict."""
+
+    predictable_mm: Number
+    where: tuple[PlacePart, ...] = ()
+    unpredictable_mm: Number
+    floor_mm: Ends | None = None
+
+    def remainder(self) -> Remainder:
+        """As the code has it."""
+        where = tuple((one.place, one.share) for one in self.where)
+        return Remainder(self.predictable_mm, where, self.unpredictable_mm, self.floor_mm)
 
 
 class RungPart(Part):
@@ -158,6 +185,7 @@ class DiagnosisPart(Part):
     reasons: tuple[str, ...]
     effects: tuple[FindingPart, ...]
     gap: GapPart
+    remainder: RemainderPart | None = None
     noise: NoisePart = NoisePart()
     structure: StructurePart = StructurePart()
     where: dict[str, Any] = Field(default_factory=dict)
@@ -220,6 +248,7 @@ def assembled(
         data=data,
         held=held,
         cells=cells,
+        remainder=part.remainder.remainder() if part.remainder else None,
         stated_errors=errors,
         stated_curves={name: curve.curve() for name, curve in part.curves.items()},
     )

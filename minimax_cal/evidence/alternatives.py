@@ -6,12 +6,9 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.limits import BAND, ENOUGH, LIGHT, LUCK
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.ground.arrays import Array
-
-LIGHT = 4.0  # of fit, in the same sense
-ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
-BAND = 12.0  # of evidence: what fits worse by less may be the truth
 
 
 def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:

@@ -14,21 +14,23 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
 from minimax_cal.evidence.library import Candidate, Library
+from minimax_cal.evidence.limits import (
+    CONTENDERS,
+    EXACT,
+    LEAST_DOF,
+    LEVEL,
+    MOST,
+    NEAR,
+    REFINED,
+    TIE,
+    TUNINGS,
+)
 from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
-LEVEL = 0.005  # chance of any false name on data without an effect
-AGAIN = 0.2  # the same where a name that was found is sought again in a part of the poses
-EXACT = 1e-8  # noise below which data were computed, not measured [m]
-TIE = 2.0  # of evidence that a replacement must gain
-SMALL, PLENTY = 0.02, 2000.0  # of degrees of freedom beyond so many: less gain is no matter
-REFINED = 6  # effects among which each is compared anew with all others
-NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
-TUNINGS = 3  # rounds of a finer search
-LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -66,7 +68,7 @@ class Choice:
         return remaining(rows, weight, self.known)
 
 
-def select(lib: Library, most: int = 20, *, ripple: bool = True, level: float = LEVEL) -> Choice:
+def select(lib: Library, most: int = MOST, *, ripple: bool = True, level: float = LEVEL) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
@@ -138,8 +140,7 @@ def addition(lib: Library, table: Bench, level: float) -> tuple[Library, list[Ad
             break
         if one.candidate.key in seen or repeated(one.candidate, table.chosen):
             continue
-        large = one.gain > SMALL * (table.dof - PLENTY)
-        if large and table.improbable(one, level):
+        if table.improbable(one, level):
             seen.add(one.candidate.key)
             lib, better = adopted(lib, tuned(table, one), one.candidate)
             best = better if not best or better.evidence > best.evidence else best
