@@ -24,14 +24,12 @@ from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
-from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 FRAMES = ("best-fit", "flange", "own")
-# What moves the reflectors or the instrument, and not the flange of the arm.
-SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "session_jump", "target_shift", "target_offset"})
 TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 CORNERS = tuple(f"corner{i + 1}" for i in range(4))
 LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
@@ -285,7 +283,7 @@ def arm_of(cell: Cell) -> Cell:
     kept = [
         (term, value)
         for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term.effect not in SEEN_ONLY and term.place not in cell.target_names
+        if EFFECTS[term.effect].of_flange and term.place not in cell.target_names
     ]
     effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
     return replace(
@@ -314,10 +312,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
         )
     scene = arm.scene(data.take(np.arange(1)))
     whole = any(
-        part % 4 == WHOLE
-        for term in terms
-        if term.effect == "joint_compliance"
-        for part in unmasked(term.choice["parts"])
+        part % 4 == WHOLE for term in terms for part in unmasked(term.choice.get("parts", 0.0))
     )
     if whole and not (scene.known_masses or scene.measured_torques):
         out.append(

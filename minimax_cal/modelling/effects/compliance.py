@@ -99,6 +99,7 @@ JOINT_COMPLIANCE = Effect(
     columns,
     choices=parts_of,
     positive=True,
+    follows="load",
 )
 
 
@@ -153,4 +154,5 @@ GRAVITY_COMPENSATOR = Effect(
     choices=lambda scene, place: springs((-0.25, 0.0, 0.25), (0.4, 0.55), (0.45, 0.65)),
     finer=finer_spring,
     typical=1e-2,
+    follows="angle",
 )

@@ -73,6 +73,7 @@ GEAR_ERROR = Effect(
     ],
     lines=True,
     typical=5e-4,
+    follows="angle",
 )
 
 
@@ -93,6 +94,7 @@ GEAR_RIPPLE = Effect(
     choices=ratios,
     lines=True,
     typical=5e-4,
+    follows="wave",
 )
 
 
@@ -111,6 +113,8 @@ ENCODER_GAIN = Effect(
     gain,
     choices=lambda scene, place: [at_all(place, sweeping(scene))],
     typical=1e-3,
+    follows="angle",
+    linear=True,
 )
 
 
@@ -135,6 +139,8 @@ JOINT_COUPLING = Effect(
     coupling,
     choices=sources,
     typical=1e-2,
+    follows="source",
+    linear=True,
 )
 
 
@@ -175,6 +181,7 @@ BACKLASH = Effect(
     ),
     choices=lambda scene, place: [at_all(place, moved(scene, "approach"))],
     typical=1e-3,
+    follows="approach",
 )  # fmt: skip
 
 
@@ -194,4 +201,5 @@ SETTLING = Effect(
     ),
     choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
     typical=1e-2,
+    follows="move",
 )

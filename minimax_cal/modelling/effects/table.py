@@ -23,7 +23,7 @@ from minimax_cal.modelling.effects.gears import (
     SETTLING,
 )
 from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
-from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
+from minimax_cal.modelling.effects.scene import DRIVERS, MOVED, Choice, Columns, Effect, Scene
 from minimax_cal.modelling.effects.time import (
     FRAME_DRIFT,
     SESSION_JUMP,
@@ -60,10 +60,17 @@ EFFECTS: dict[str, Effect] = {
 def register(effect: Effect) -> Effect:
     """Add an effect of one's own to the library of this process.
 
-    effect: its law gives metres and radians per unit of each parameter.  Returns it.
+    effect: its law gives metres and radians per unit of each parameter.  Returns it.  Raises
+    OptionError for facts that are none.
 
     >>> mc.register(effect)
     """
+    for fact, known in (("moves", MOVED), ("follows", DRIVERS)):
+        if getattr(effect, fact) not in known:
+            told = ", ".join(filter(None, known))
+            raise OptionError(
+                f"effect {effect.name}: {fact} {getattr(effect, fact)!r}; choose {told}"
+            )
     EFFECTS[effect.name] = effect
     return effect
 

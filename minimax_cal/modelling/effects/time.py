@@ -90,6 +90,7 @@ THERMAL_GROWTH = Effect(
         {**choice, "apart": apart} for choice in courses(scene, place) for apart in (0.0, 1.0)
     ),
     typical=1e-3,
+    follows="time",
 )
 
 
@@ -120,6 +121,8 @@ FRAME_DRIFT = Effect(
     needs=lambda scene: "" if scene.has("clock") else "column order or time_s" + scene.untold,
     choices=lambda scene, place: tuple(c for c in courses(scene, place) if "constant" in c),
     typical=1e-2,
+    moves="frame",
+    follows="time",
 )
 
 
@@ -157,6 +160,8 @@ TARGET_SHIFT = Effect(
     ),
     choices=moments,
     typical=5e-3,
+    moves="target",
+    follows="time",
 )
 
 
@@ -184,6 +189,8 @@ SESSION_JUMP = Effect(
     needs=lambda scene: "" if scene.has("clock") else "column order or time_s",
     choices=lambda scene, place: (),  # its moment is read off the errors: `faults.jumps`
     typical=1e-2,
+    moves="frame",
+    follows="time",
 )
 
 
@@ -204,4 +211,6 @@ TARGET_OFFSET = Effect(
     lambda scene: (*scene.data.target_names, "all") if scene.targets > 1 else ("all",),
     sight,
     typical=5e-3,
+    moves="instrument",
+    follows="sight",
 )
