@@ -271,10 +271,11 @@ LAWS: dict[str, Law] = {
     **{name: gap_cases.LAWS[name] for name in (
         "joint_compliance", "link_bending", "gear_error", "encoder_gain", "backlash", "settling",
         "frame_drift", "tool_flex", "target_offset", "target_shift", "joint_compliance/hardening",
-        "outside_sum", "outside_product", "outside_waves", "outside_step", "outside_cubic",
+        "outside_sum", "outside_product", "outside_waves", "outside_cubic",
         "outside_field",
     )},
     "gear_error/orders": two_orders,
+    "joint_error_map/step": gap_cases.LAWS["outside_step"],
     "gear_ripple": ripple,
     "settling/saturating": saturating,
     "backlash/loaded": loaded_play,

@@ -17,6 +17,7 @@ from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT
+from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
@@ -66,6 +67,14 @@ def causes_of(
     return Causes(
         (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
     )
+
+
+def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
+    """Traces of what effects and maps leave together."""
+    maps = [term.columns(study.scene).displacement(study.scene) for term in causes.maps.terms]
+    known = np.concatenate([causes.choice.known, *map(study.rows.of, maps)], axis=1)
+    noise = restricted(study.rows, known)
+    return structure(study.scene, study.rows, noise, known, named_in(causes.choice))
 
 
 def named_in(choice: Choice) -> list[Named]:

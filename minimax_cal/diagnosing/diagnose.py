@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import Causes, causes_of, fault_findings, named_in
+from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
@@ -25,7 +25,6 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, structure
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.sentences import reasons
@@ -36,7 +35,7 @@ from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
 from minimax_cal.evidence.limits import WEAK
-from minimax_cal.evidence.noise import Noise, Rows, linearised, restricted
+from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
@@ -49,7 +48,7 @@ from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
 from minimax_cal.measuring.floor import Floor, floor_of
-from minimax_cal.measuring.grouping import groups, held_out, split, with_groups
+from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -146,7 +145,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
     if "joint_error_map" not in options.exclude:
         progress("error maps of joints")
-        causes, spoken, ladder = with_maps(causes, spoken, ladder)
+        spoken, ladder = with_maps(spoken, ladder)
+        causes = spoken if spoken.maps.terms else causes
     steps = steps_of(asked, study, judges, spoken, ladder)
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
@@ -197,29 +197,15 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     )
 
 
-def with_maps(causes: Causes, spoken: Causes, ladder: Ladder) -> tuple[Causes, Causes, Ladder]:
-    """All causes, those spoken of, and their ladder, with the error maps that joints have besides.
-
-    What the maps replace is gone from all, and so is the structure that they take away.
-    """
+def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:
+    """The causes and the ladder with the error maps that joints have besides."""
     maps, study = error_maps(ladder.last), ladder.last.study
     if not maps.terms:
-        return causes, spoken, ladder
-    own = maps.findings([spoken.effects[i] for i in ladder.taken], study.scene)
-    every = maps.findings(causes.effects, study.scene)
-    ladder = climbed(study, [finding.terms for finding in own])
-    traces = traces_beneath(ladder.last, named_in(causes.choice))
-    causes = replace(causes, effects=tuple(every), maps=maps, traces=traces)
-    return causes, replace(causes, effects=tuple(own)), ladder
-
-
-def traces_beneath(last: Joint, named: Sequence[Named]) -> tuple[Trace, ...]:
-    """Structure that a fit leaves, all its parameters projected out."""
-    scene, data = last.study.scene, last.study.data
-    rows = linearised(last.model, last.state, scene.jacobian)
-    rows = replace(rows, poses=groups(data))
-    none = np.zeros((len(rows.error), 0))
-    return tuple(structure(scene, rows, restricted(rows, none), none, named))
+        return causes, ladder
+    effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
+    causes = replace(causes, effects=tuple(effects), maps=maps)
+    causes = replace(causes, traces=beside_maps(study, causes))
+    return causes, climbed(study, [finding.terms for finding in effects])
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -55,9 +55,9 @@ class FindingPart(Part):
     holdout_rms_mm: FallPart = FallPart()
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
-    curve: dict[str, list[Number]] = Field(default_factory=dict)
     established: bool = True
     found_again: Number = math.nan
+    curve: dict[str, list[Number]] = Field(default_factory=dict)
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -77,8 +77,8 @@ class FindingPart(Part):
             after=self.holdout_rms_mm.after,
             fixed=self.fixed,
             rows=self.lines,
-            curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
             again=1.0 if self.established else min(self.found_again, BELOW),
+            curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
 
 
