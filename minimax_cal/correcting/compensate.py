@@ -304,7 +304,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
             f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"
         )
     terms = arm.effects.terms
-    timed = [term.label for term in terms if "constant" in term.choice or "since" in term.choice]
+    timed = [term.label for term in terms if {"constant", "fast", "since"} & term.choice.keys()]
     if timed:
         out.append(
             f"{', '.join(timed)} depends on the time in the calibration's session: taken at "

@@ -13,7 +13,11 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
-from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.compliance import (
+    CROSS_COMPLIANCE,
+    GRAVITY_COMPENSATOR,
+    JOINT_COMPLIANCE,
+)
 from minimax_cal.modelling.effects.gears import (
     BACKLASH,
     ENCODER_GAIN,
@@ -28,15 +32,18 @@ from minimax_cal.modelling.effects.time import (
     FRAME_DRIFT,
     SESSION_JUMP,
     TARGET_OFFSET,
+    TARGET_RESEAT,
     TARGET_SHIFT,
     THERMAL_GROWTH,
 )
+from minimax_cal.modelling.effects.wobble import AXIS_WOBBLE
 from minimax_cal.robots import kinematics
 
 EFFECTS: dict[str, Effect] = {
     effect.name: effect
     for effect in (
         JOINT_COMPLIANCE,
+        CROSS_COMPLIANCE,
         GRAVITY_COMPENSATOR,
         LINK_BENDING,
         BASE_FLEX,
@@ -46,12 +53,14 @@ EFFECTS: dict[str, Effect] = {
         ENCODER_GAIN,
         JOINT_ERROR_MAP,
         JOINT_COUPLING,
+        AXIS_WOBBLE,
         BACKLASH,
         SETTLING,
         THERMAL_GROWTH,
         FRAME_DRIFT,
         SESSION_JUMP,
         TARGET_SHIFT,
+        TARGET_RESEAT,
         TARGET_OFFSET,
     )
 }
@@ -179,8 +188,13 @@ def terms(
     return tuple(out)
 
 
-FREE = frozenset({"turns", "constant", "since", "zero", "eye", "rest",
-                  "low", "high", "length", "size"})  # any number will do  # fmt: skip
+CONSTANTS = frozenset(
+    {"constant", "fast", "slow"}
+)  # of time, above 0; infinite is straight
+FREE = frozenset({  # any number will do
+    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest", "limit",
+    "low", "high", "length", "size",
+})  # fmt: skip
 
 
 def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choice, ...]:
@@ -194,8 +208,8 @@ def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choic
         if key in known - FREE and value not in listed:
             offer = ", ".join(f"{number:g}" for number in listed)
             raise OptionError(f"effect {text!r}: no {key} {value:g}; choose {offer}")
-        low = 0.0 if key == "constant" else -np.inf
-        if not (value > low and (np.isfinite(value) or key == "constant")):
+        low = 0.0 if key in CONSTANTS else -np.inf
+        if not (value > low and (np.isfinite(value) or key in CONSTANTS)):
             raise OptionError(f"effect {text!r}: {key} {value:g} is not possible")
     fitting = [c for c in choices if given.keys() <= c.keys()] if choices else [{}]
     if not fitting:
