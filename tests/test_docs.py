@@ -366,7 +366,7 @@ def chunks(text: str) -> Iterator[list[str]]:
     yield chunk
 
 
-RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md"]
+RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md"]
 
 
 @pytest.mark.parametrize("name", RUN)

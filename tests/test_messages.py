@@ -37,7 +37,8 @@ def strings(tree: ast.AST) -> Iterator[ast.Constant]:
 
 
 def test_messages_of_python_speak_of_no_flag() -> None:
-    rooms = [path for path in PACKAGE.rglob("*.py") if "cli" not in path.parts]
+    theirs = {"cli", "serving"}  # the page writes the command lines that do the same
+    rooms = [path for path in PACKAGE.rglob("*.py") if not theirs & set(path.parts)]
     found = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.value!r}"
         for path in rooms

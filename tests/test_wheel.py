@@ -60,7 +60,9 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Ca
     (folder / "targets.csv").write_text(f"{header}\n20,30,-10,40,50,60\n-20,10,20,-40,60,10\n")
 
     (folder / "wires.csv").write_bytes(material()["wires.csv"])
-    (folder / "cells.toml").write_text(CELLS.replace("robot.json", "irb120"))
+    (folder / "cells.toml").write_text(
+        CELLS.replace("robot.json", "irb120").replace("data.csv", "poses.csv")
+    )
     known.clear()
 
     def run(*arguments: object, code: int = 0) -> Ran:
@@ -101,6 +103,7 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("relative", "irb120", "wires.csv")
     run("check", "fit.json", "poses.csv", "--tolerance", "rms 0.5")
     run("compare", "fit.json", "fit.json")
+    run("fleet", "cells.toml", "--jobs", 1)
     run("compensate", "fit.json", "targets.csv")
     run("iso9283", "fit.json")
     run("map", "fit.json", "--samples", 1000, "--json")
@@ -117,7 +120,6 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
         (("map", "fit.json", "-o", "a.png"), "[plot]"),
         (("report", "fit.json", "-o", "a.html"), "[report]"),
         (("gap", "arm.xml", "poses.csv"), "mujoco"),
-        (("fleet", "cells.toml"), "[fleet]"),
         (("serve", "--no-browser"), "[app]"),
     ):
         ended = run(*command, code=2)

@@ -7,17 +7,30 @@ from pathlib import Path
 import click
 
 from minimax_cal.cli import FAILED
-from minimax_cal.cli.options import DATA, FIT, Output, options_of, result_options, show
+from minimax_cal.cli.options import (
+    DATA,
+    FIT,
+    InGroups,
+    Output,
+    options_of,
+    plain_option,
+    result_options,
+    show,
+)
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import one_line
 from minimax_cal.judging.watching.health import check
 
+ASKED = "What is asked"
 
-@click.command(name="check")
+
+@click.command(name="check", cls=InGroups)
 @FIT
 @DATA
-@click.option("--tolerance", required=True, help='What is required in mm, as "rms 0.2, max 0.5".')
+@plain_option(
+    ASKED, "--tolerance", required=True, help='What is required in mm, as "rms 0.2, max 0.5".'
+)
 @options_of(
     check,
     known=Option(
@@ -25,8 +38,9 @@ from minimax_cal.judging.watching.health import check
         "reflectors).",
         metavar="NAMES",
         many=tuple,
+        group=ASKED,
     ),
-    seed=Option("The seed of samples behind the intervals."),
+    seed=Option("The seed of samples behind the intervals.", group=ASKED),
 )
 @result_options("the calibration with what moved refitted (JSON)")
 def check_command(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH, Output, result_options, show
+from minimax_cal.cli.options import PATH, InGroups, Output, result_options, show
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.watching.comparison import compare
 
 
-@click.command(name="compare")
+@click.command(name="compare", cls=InGroups)
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
 @result_options("the comparison (JSON)")

@@ -226,7 +226,7 @@ class Output:
             if path and not self.quiet:
                 say_written(path)
 
-    def write_rows(self, csv: Callable[[], str], json: Callable[[], str]) -> None:
+    def write_rows(self, csv: Callable[[], str | bytes], json: Callable[[], str]) -> None:
         """Write a result that is rows: CSV, or JSON where the file's ending asks for it."""
         if self.path:
             write_whole(self.path, json() if self.path.suffix.lower() == ".json" else csv())

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH
+from minimax_cal.cli.options import PATH, InGroups
 from minimax_cal.serving.server import FOLDER, PORT, serve
 
 
-@click.command(name="serve")
+@click.command(name="serve", cls=InGroups)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),

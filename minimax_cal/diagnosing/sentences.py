@@ -9,6 +9,7 @@ from typing import Any
 from minimax_cal.diagnosing.causes import LEVEL
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, established, in_words
 
+NOTHING_MM = 5e-4  # of a length that is told to three digits
 SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
 NO_CHANCE = f"below {LEVEL:g} is no accident"
 VERDICTS = {  # what stands first
@@ -128,6 +129,8 @@ def remaining(found: Diagnosis) -> str:
     left = remainder_of(found)
     if not left or left.get("predictable_mm") is None:
         return f"Noise alone would leave {noise}."
+    if left["predictable_mm"] < NOTHING_MM:
+        return f"What remains follows nothing known; noise alone would leave {noise}."
     places = left.get("where") or ()
     where = ", ".join(
         f"{in_words(part['place'])} {100.0 * part['share']:.0f} %" for part in places[:3]

@@ -160,7 +160,7 @@ def understood_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | N
         )
         tables = [understood(each) for each in content["files"]]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CalibrationError(f"{path}: is not what import --json wrote") from error
+        raise CalibrationError(f"{path}: is not the JSON of an import") from error
     return {"headline": visible(headline), "tables": tables, "notices": content["notices"]}
 
 

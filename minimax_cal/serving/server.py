@@ -65,4 +65,4 @@ def listening(port: int | None) -> socket.socket:
             reason = error.strerror
         else:
             return found
-    raise OptionError(f"--port {port}: cannot be had ({reason}); choose another")
+    raise OptionError(f"port={port}: cannot be had ({reason}); choose another")

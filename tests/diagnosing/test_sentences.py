@@ -127,6 +127,8 @@ def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
     assert [row[1] for row in remainder_table(told).rows if not math.isnan(float(row[1]))] == [
         0.2, 0.05, 0.02, 0.03
     ]  # fmt: skip
+    told = marked(replace(found), remainder={**left, "predictable_mm": 0.0})
+    assert any(text.startswith("What remains follows nothing known;") for text in told.reasons)
     told = marked(replace(found), remainder={**left, "predictable_mm": None, "floor_mm": None})
     assert not any(text.startswith("Of what remains") for text in told.reasons)
 

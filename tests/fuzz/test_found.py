@@ -108,8 +108,7 @@ def test_the_name_of_an_output_moves_no_cursor(
     ):
         assert run(*command, "-o", odd) == 0
     out, err = capsys.readouterr()
-    assert err.count("written: ") == 3
-    assert out.count("wrote ") == 1
+    assert err.count("written: ") == 4
     assert "\x1b" not in out + err
 
 
@@ -190,3 +189,10 @@ def test_a_file_whose_link_is_named_is_an_input(
         arguments = ("export", named, "--to", "urdf", "-o", "robot.urdf")
         assert "is an input of this command" in refused(capsys, *arguments)
     assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
+
+
+def test_a_fleet_has_no_more_processes_than_cells_can_use(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for jobs in ("0", "-2", "9" * 20):
+        assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)

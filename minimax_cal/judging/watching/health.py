@@ -17,11 +17,12 @@ from minimax_cal.fitting.options import listed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
-from minimax_cal.judging.watching.moved import Search, Watched, search
+from minimax_cal.judging.watching.moved import Search, search
 from minimax_cal.judging.watching.opening import in_names, own_rows, watched_of
 from minimax_cal.judging.watching.prospects import hidden, prospects
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.moved import APART, Rows, Search, Watched, critical, joint_of
+from minimax_cal.judging.watching.moved import APART, Search, critical, joint_of
 from minimax_cal.judging.watching.result import SHIFT, Hidden
+from minimax_cal.judging.watching.watched import Rows, Watched
 from minimax_cal.solvers.least_squares import solve_normal
 
 OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,8 +14,9 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.moved import Search, Watched
+from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
@@ -27,18 +29,9 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     rows = found.last
     state = rows.state.step(rows.step)
     names, data = watched.names, watched.data
-    factor = rows.factor(watched.root)
-    covariance = factor @ factor.T
     n = fit.robot.joints
-    known = in_names(fit, watched, fit.identification.active) | rows.active
-    covariance[~known] = np.nan
-    covariance[:, ~known] = np.nan
-    old = dict(zip(fit.known.names.all, fit.known.units, strict=True))
-    own = {
-        name: "m" if length else "rad" for name, length in zip(names.all, names.linear, strict=True)
-    }
-    units = tuple(old.get(name, own[name]) for name in names.all)
-    sure = Uncertainty(names, units, covariance, fit.known.noise, fit.known.dof, fit.known.source)
+    sure = spread_of(fit, watched, found)
+    known = sure.active
     cell = Cell.of(
         watched.cell.robot, state, names.target_names, watched.cell.effects, watched.cell.sessions
     )
@@ -89,7 +82,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         prior=np.zeros(names.count),
         widening=1.0,
         provenance=Provenance.of(drawn, data, settings),
-        beyond=Beyond(reason="few poses after a check: nothing is left out"),
+        claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
     )
@@ -125,3 +118,19 @@ def told_parameters(
         )
         for i in (*order, *range(5 * n, len(names)))
     )
+
+
+def spread_of(fit: Fit, watched: Watched, found: Search) -> Uncertainty:
+    """What is known about the parameters then."""
+    rows, names = found.last, watched.names
+    factor = rows.factor(watched.root)
+    covariance = factor @ factor.T
+    known = in_names(fit, watched, fit.identification.active) | rows.active
+    covariance[~known] = np.nan
+    covariance[:, ~known] = np.nan
+    old = dict(zip(fit.known.names.all, fit.known.units, strict=True))
+    own = {
+        name: "m" if length else "rad" for name, length in zip(names.all, names.linear, strict=True)
+    }
+    units = tuple(old.get(name, own[name]) for name in names.all)
+    return replace(fit.known, names=names, units=units, covariance=covariance)

@@ -15,7 +15,7 @@ from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
 from minimax_cal.judging.watching.result import NOT_VALID, VALID
-from minimax_cal.reporting.fleet.cells import read_cells
+from minimax_cal.reporting.fleet.cells import MOST, read_cells
 from minimax_cal.reporting.fleet.work import FAILED, NEEDED, Row, arriving, checked_folder
 from minimax_cal.reporting.html.page import part, policy
 
@@ -110,8 +110,8 @@ def fleet(
 
     >>> print(mc.fleet("cells.toml", page="fleet.html").summary())
     """
-    if processes == 0 or processes < -1:
-        raise OptionError(f"processes {processes}: give their number, or -1 for one a core")
+    if processes == 0 or not -1 <= processes <= MOST:
+        raise OptionError(f"processes {processes:.6g}: give their number, or -1 for one a core")
     if page is not None:
         check_writable(page, (".html", ".htm"))
         optional("jinja2", "an overview page", NEEDED)

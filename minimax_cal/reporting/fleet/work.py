@@ -132,7 +132,9 @@ def arriving(jobs: Sequence[Job], processes: int, cluster: str) -> Iterator[Row]
     else:
         joblib = optional("joblib", "several cells at a time", NEEDED)
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            parallel = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
+            parallel = joblib.Parallel(
+                n_jobs=min(processes, len(jobs)), return_as="generator_unordered"
+            )
             yield from parallel(joblib.delayed(done)(job) for job in jobs)
 
 
