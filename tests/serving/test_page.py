@@ -182,7 +182,11 @@ def test_from_dropped_files_to_a_passed_report(
 
     until(lambda: one(driver, "#chart-workspace").get_attribute("data-drawn"), "no view")
     fill(driver, "#cell [name=most]", "0.001")
-    names = "return document.getElementById('chart-workspace').data.map(t => t.name)"
+    place = "return document.getElementById('chart-workspace')"
+    drawn = f"{place}.data.map(t => [t.x[0], t.y[0], t.z[0]])"
+    arrow, reflector, *_ = driver.execute_script(drawn)
+    assert arrow == reflector
+    names = f"{place}.data.map(t => t.name)"
     until(lambda: "beyond 0.001 mm" in str(driver.execute_script(names)), "no red")
     count = driver.execute_script("return document.querySelectorAll('tr.beyond').length")
     assert count > POSES * TARGETS / 2
