@@ -65,10 +65,14 @@ HOW = "How targets are corrected"
     "--tool",
     default="",
     metavar="FRAME",
-    help="The tool of a program: x,y,z,q1..q4, or a name.",
+    help="The tool of a program: x,y,z,q1,q2,q3,q4 in mm, or one that it declares.",
 )
 @plain_option(
-    HOW, "--wobj", default="", metavar="FRAME", help="The work object of a program, alike."
+    HOW,
+    "--wobj",
+    default="",
+    metavar="FRAME",
+    help="The work object of a program, in the same way.",
 )
 @SAFE_CELLS
 @RUNG
