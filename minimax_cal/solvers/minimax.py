@@ -235,6 +235,8 @@ class Iterate(Generic[X]):
             matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
             matrix = self.quasi.matrix
+        if not self.damping:
+            return matrix
         return np.asarray(matrix + self.damping * np.diag(np.maximum(np.diag(matrix), 1e-8)))
 
     def subproblem(
@@ -376,9 +378,9 @@ def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
 def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
     """The KKT residuals at a point."""
     stationarity = here.jacobian.T @ mu + here.normal.T @ lam
-    with np.errstate(invalid="ignore"):
-        room = np.where(lam > 0, upper - here.c, here.c - lower)
-        slack = np.where(lam == 0, 0.0, np.abs(lam) * np.abs(room))
+    held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
+    room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
+    slack = np.abs(lam[held] * room)
     return Kkt(
         float(np.abs(stationarity).max(initial=0.0)),
         float(mu @ (here.f.max() - here.f) + slack.sum()),
