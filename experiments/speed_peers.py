@@ -8,6 +8,7 @@ the instrument, on the same free parameters, from the same start.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -149,10 +150,12 @@ def gauss_newton(raw: Raw, most: int = 20) -> Array:
 def scipy_squares(raw: Raw) -> Array:
     """scipy.optimize.least_squares with finite differences, scaled: u (p,)."""
     scale = np.sqrt((raw.rows(np.zeros(len(raw.free)))[1] ** 2).sum((1, 2, 3)) / raw.y[..., 0].size)
-    found = optimize.least_squares(
-        lambda v: 1e3 * raw.rows(v / scale)[0].reshape(-1), np.zeros(len(scale)), xtol=1e-12,
-        ftol=1e-12, gtol=1e-12,
-    )  # fmt: skip
+
+    def error(v: Array) -> Array:
+        return np.asarray(1e3 * raw.rows(v / scale)[0].reshape(-1))
+
+    begin = np.zeros(len(scale))
+    found = optimize.least_squares(error, begin, xtol=1e-12, ftol=1e-12, gtol=1e-12)
     return np.asarray(found.x / scale)
 
 
@@ -191,7 +194,7 @@ def ipopt(raw: Raw, scale: Array, size: float) -> Any:
 
     Building the expressions and their derivatives is not part of it.
     """
-    import casadi as ca
+    ca: Any = import_module("casadi")
 
     p, (m, k, _), n = len(scale), raw.y.shape, len(raw.mdh)
     u, q, y = ca.SX.sym("u", p), ca.SX.sym("q", n), ca.SX.sym("y", 3 * k)
@@ -232,7 +235,7 @@ def ipopt(raw: Raw, scale: Array, size: float) -> Any:
 
 def ca_screw(axis: int, angle: Any, along: Any) -> Any:
     """CasADi's `screws`, of one angle."""
-    import casadi as ca
+    ca: Any = import_module("casadi")
 
     out = ca.SX.eye(4)
     j, k = (axis + 1) % 3, (axis + 2) % 3
@@ -243,8 +246,8 @@ def ca_screw(axis: int, angle: Any, along: Any) -> Any:
 
 
 def cones(raw: Raw, begin: Array, most: int = 20) -> Array:
-    """The least worst point by second-order cones on errors linear in the step, by cvxpy: u (p,)."""
-    import cvxpy as cp
+    """The least worst point by cvxpy: second-order cones on errors linear in the step.  u (p,)."""
+    cp: Any = import_module("cvxpy")
 
     u, worst = begin, np.inf
     for _ in range(most):
