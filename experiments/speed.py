@@ -300,7 +300,7 @@ def main(study: Study, repeats: int) -> None:
     """
     quick = study.quick
     with threadpool_limits(1):
-        seconds = races(study.seed, 2 if quick else repeats, quick=quick)
+        seconds = races(study.seed, 3 if quick else repeats, quick=quick)
         seconds |= points(study.seed, (300,) if quick else (300, 3000, 30000))
         seconds |= others(study.seed, quick=quick)
         grown = growth(study.seed, (1000,) if quick else (1000, 10000, 100000))

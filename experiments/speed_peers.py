@@ -168,7 +168,8 @@ def scaled(raw: Raw) -> tuple[Array, float]:
 
 
 def slsqp(raw: Raw, scale: Array, size: float) -> Array:
-    """min v with F_i / m <= v and the distances, by SLSQP from the start: u (p,)."""
+    """min v with F_i / m <= v and the distances, by SLSQP after `gauss_newton`: u (p,)."""
+    begin = gauss_newton(raw)
     p, unit = len(scale), np.append(np.zeros(len(scale)), 1.0)
 
     def limits(x: Array) -> Array:
@@ -180,7 +181,7 @@ def slsqp(raw: Raw, scale: Array, size: float) -> Array:
         none = np.zeros((len(c), 1))
         return np.block([[-f, np.ones((len(f), 1))], [c, none], [-c, none]])
 
-    first = np.append(np.zeros(p), raw.squares(np.zeros(p))[0].max() / size)
+    first = np.append(begin * scale, raw.squares(begin)[0].max() / size)
     found: Any = optimize.minimize(  # type: ignore[call-overload]
         lambda x: x[p], first, jac=lambda x: unit, method="SLSQP",
         constraints={"type": "ineq", "fun": limits, "jac": slopes},
@@ -190,7 +191,7 @@ def slsqp(raw: Raw, scale: Array, size: float) -> Array:
 
 
 def ipopt(raw: Raw, scale: Array, size: float) -> Any:
-    """A function without arguments that solves the same by IPOPT, exact Hessian: u (p,).
+    """A function without arguments that does the same by IPOPT, exact Hessian: u (p,).
 
     Building the expressions and their derivatives is not part of it.
     """
@@ -224,9 +225,10 @@ def ipopt(raw: Raw, scale: Array, size: float) -> Any:
     solver = ca.nlpsol("minimax", "ipopt", {"x": x, "f": x[p], "g": bounds}, quiet)
     low = np.r_[np.full(k, -np.inf), np.full(len(raw.mean), -1.0)]
     high = np.r_[np.zeros(k), np.ones(len(raw.mean))]
-    first = np.append(np.zeros(p), raw.squares(np.zeros(p))[0].max() / size)
 
     def solve() -> Array:
+        begin = gauss_newton(raw)
+        first = np.append(begin * scale, raw.squares(begin)[0].max() / size)
         found = solver(x0=first, lbg=low, ubg=high)
         return np.asarray(found["x"]).reshape(-1)[:p] / scale
 
