@@ -1,7 +1,8 @@
 """Make the pictures of README and documentation again: python docs/pictures.py [PICTURE ...].
 
 Without a name those of the program itself, in some minutes (the report's needs Chromium, Chrome or
-Edge); a picture of a study by its name, as coverage.png, by running that study in full.
+Edge, the page's Chromium with its chromedriver); a picture of a study by its name, as coverage.png,
+by running that study in full.
 """
 
 import contextlib
@@ -61,7 +62,19 @@ def report() -> None:
     first_page.make(IMAGES / "report.png")
 
 
-OWN = {"irb2600.svg": example, "diagnosis.png": diagnosis, "report.png": report}
+def page() -> None:
+    """The page to work in."""
+    import serve_page
+
+    serve_page.make(IMAGES / "serve.png")
+
+
+OWN = {
+    "irb2600.svg": example,
+    "diagnosis.png": diagnosis,
+    "report.png": report,
+    "serve.png": page,
+}
 
 
 def from_studies(names: list[str]) -> None:

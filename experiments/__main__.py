@@ -65,6 +65,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.machine_gap",
         "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
     ),
+    "black_box": (
+        "experiments.black_box",
+        "What free functions predict beside geometry, and beside the effects that are named",
+    ),
     "relative": (
         "experiments.relative",
         "What lengths, closures and poses tell beside a tracker, and how true their positions are",

@@ -2,37 +2,53 @@
 
     python -m experiments.speed [--quick] [--repeats N] [--out FOLDER] [--json FILE] [--seed N]
 
-Least squares against scipy.optimize.least_squares (finite differences, and our Jacobian); minimax
-against SLSQP on the same scaled epigraph problem; and the growth with the number of poses.  All
-start where our own closed-form start ends, and all reach the same optimum: that is checked.
+Peers (`speed_peers`) share no line with the package and start where it starts; that all reach the
+same optimum is checked.  Times are of the processor, on one thread, medians of runs taken in turn,
+so that a slow spell hits all alike.  Peers that are not installed are left out, with a word:
+pip install ".[peers]".
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import platform
+import resource
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
-from scipy import optimize
+from threadpoolctl import threadpool_limits
 
-from experiments import sweep
+import minimax_cal as mc
+from experiments import speed_peers, sweep
+from experiments.speed_peers import Raw
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distances, minimax_problem
-from minimax_cal.ground.arrays import Array
+from minimax_cal.fitting.options import solver_of
+from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.tables import Table
+from minimax_cal.kernels import choice, plain
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import simulate
-from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares, minimax
-from qp_backends import solve as solve_qp
+
+SAME = 1e-6  # relative difference of two optima that are called the same
+Run = Callable[[], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,234 +94,231 @@ def fitted(robot: Robot, data: Measurements) -> tuple[Model, State]:
     return model, found.x.take(np.array(0))
 
 
-def ours_squares(case: Case) -> State:
-    """Our separable least squares."""
-    points = float(case.model.counts.sum())
-    found = least_squares.solve(
-        SumOfSquares(case.model), case.begin.batch(), 1, points, limits=least_squares.NEAR
-    )
-    return found.x.take(np.array(0))
+def raw_of(case: Case, data: Measurements) -> Raw:
+    """The same for the peers, as plain arrays."""
+    kept, x = measured_distances(data), case.begin
+    free = np.flatnonzero(case.model.active)
+    return Raw(case.model.q, data.y, x.mdh, x.rotation, x.origin, x.target_positions, free,
+               kept.pairs, kept.mean, kept.tolerance)  # fmt: skip
 
 
-def scipy_squares(case: Case, *, analytic: bool) -> State:
-    """scipy's least_squares on the same residuals and parameters, scaled as ours are."""
-    model, begin = case.model, case.begin
-    active = model.active
-    _, _, gram = SumOfSquares(model).normal(begin)
-    scale = np.sqrt(np.diag(gram) / model.counts.sum())
-
-    def state(u: Array) -> State:
-        full = np.zeros(model.names.count)
-        full[active] = u / scale
-        return begin.step(full)
-
-    def residual(u: Array) -> Array:
-        return np.asarray(model.error(state(u)).reshape(-1) * 1e3)
-
-    def jacobian(u: Array) -> Array:
-        # the rotation is parametrised at the start, so its columns turn with it
-        x = state(u)
-        full = np.zeros(model.names.count)
-        full[active] = u / scale
-        every = model.jacobian(x).reshape(-1, model.names.count)
-        first = 5 * model.names.joints
-        turn = right_jacobian(full[first + 3 : first + 6])
-        back = x.rotation.T @ begin.rotation
-        every[:, first + 3 : first + 6] = every[:, first + 3 : first + 6] @ turn
-        every[:, first : first + 3] = every[:, first : first + 3] @ back
-        # errors are reported in base axes, which turn too
-        error = model.error(x).reshape(-1, 3)
-        turning = np.cross(error[:, None, :], turn.T[None]).transpose(0, 2, 1).reshape(-1, 3)
-        out = -every
-        out[:, first + 3 : first + 6] += turning
-        return np.asarray(out[:, active] / scale * 1e3)
-
-    found = optimize.least_squares(
-        residual,
-        np.zeros(active.sum()),
-        jac=jacobian if analytic else "2-point",
-        method="trf",
-        xtol=1e-12,
-        ftol=1e-12,
-        gtol=1e-12,
-    )
-    return state(found.x)
+def squares(case: Case) -> State:
+    """Our least squares from the nominal start."""
+    return nearby(case.model, case.begin).x.take(np.array(0))
 
 
-def right_jacobian(w: Array) -> Array:
-    """Turn in body axes per change of the rotation vector w: (3, 3)."""
-    angle = float(np.linalg.norm(w))
-    k = kinematics.hat(w)
-    if angle < 1e-6:
-        return np.asarray(np.eye(3) - 0.5 * k)
-    first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) - first * k + second * k @ k)
-
-
-def ours_minimax(case: Case, begin: State) -> float:
-    """Our SQP from the least-squares fit; returns max F_i / m_i [mm^2]."""
+def worst_target(case: Case) -> float:
+    """Our minimax from the nominal start, least squares included: max F_i / m_i [m^2]."""
+    begin = squares(case)
     problem = case.worst(begin)
-    qp = partial(solve_qp, name="daqp", tolerance=1e-9)
-    return minimax.solve(problem, begin, qp).value * problem.size * 1e6
+    return minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0]).value * problem.size
 
 
-def slsqp_minimax(case: Case, begin: State) -> float:
-    """SLSQP on min v, f_i(x) <= v, with the same scaling, functions and derivatives as ours."""
-    problem = case.worst(begin)
-    size = int(case.model.active.sum())
-    lower, upper = problem.lower, problem.upper
-
-    def both(u: Array) -> tuple[Array, Array]:
-        return problem.evaluate(problem.step(begin, u[:size]))
-
-    def jacobians(u: Array) -> tuple[Array, Array]:
-        at = problem.linearise(problem.step(begin, u[:size]))
-        first = int(np.flatnonzero(np.flatnonzero(case.model.active) == 5 * 6 + 3)[0])
-        turn = right_jacobian((u[:size] / problem.scale)[first : first + 3])
-        move = kinematics.rotation((u[:size] / problem.scale)[first : first + 3]).T
-        f, c = at.jacobian.copy(), at.normal
-        s = problem.scale[first : first + 3]
-        f[:, first : first + 3] = f[:, first : first + 3] * s @ turn / s
-        s = problem.scale[first - 3 : first]
-        f[:, first - 3 : first] = f[:, first - 3 : first] * s @ move / s
-        return f, c
-
-    def inequality(u: Array) -> Array:
-        f, c = both(u)
-        return np.concatenate([u[size] - f, c - lower, upper - c])
-
-    def inequality_slope(u: Array) -> Array:
-        f, c = jacobians(u)
-        zero = np.zeros((len(c), 1))
-        return np.block([[-f, np.ones((len(f), 1))], [c, zero], [-c, zero]])
-
-    unit = np.zeros(size + 1)
-    unit[size] = 1.0
-    found = optimize.minimize(  # type: ignore[call-overload]
-        lambda u: float(u[size]),
-        np.append(np.zeros(size), 1.0),
-        jac=lambda u: unit,
-        method="SLSQP",
-        constraints=[{"type": "ineq", "fun": inequality, "jac": inequality_slope}],
-        options={"maxiter": 1000, "ftol": 1e-12},
-    )
-    return float(both(found.x)[0].max()) * problem.size * 1e6
+def worst_point(case: Case, begin: State, data: Measurements) -> float:
+    """Our least worst point from a least-squares fit, distances left free [m]."""
+    problem = minimax_problem(case.model, begin, measured_distances(data), "off", "point")
+    found = minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0])
+    return float(np.sqrt(found.value * problem.size))
 
 
-def seconds(run: Callable[[], object], repeats: int) -> list[float]:
-    """Times of several runs after one that does not count."""
-    run()
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - began)
-    return times
-
-
-def race(runs: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median time of each, the runs taken in turn so that a slow spell hits all alike [s]."""
+def race(runs: Mapping[str, Run], repeats: int) -> dict[str, float]:
+    """Median processor time of each, the runs taken in turn after one that does not count [s]."""
     times: dict[str, list[float]] = {name: [] for name in runs}
     for run in runs.values():
         run()
     for _ in range(repeats):
         for name, run in runs.items():
-            began = time.perf_counter()
-            run()
-            times[name].append(time.perf_counter() - began)
+            began, count = time.process_time(), 0
+            while count == 0 or (time.process_time() - began < 0.02 and count < 50):
+                run()
+                count += 1
+            times[name].append((time.process_time() - began) / count)
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def rms_mm(case: Case, state: State) -> float:
-    """RMS error of a fit [mm]."""
-    return float(1e3 * np.sqrt(case.model.cost(state).sum() / case.model.counts.sum()))
+def alike(name: str, values: Mapping[str, float]) -> None:
+    """ClickException where optima differ."""
+    if max(values.values()) > min(values.values()) * (1.0 + SAME):
+        raise click.ClickException(f"{name}: the optima differ: {values}")
 
 
-def peers(seed: int, repeats: int) -> tuple[Table, Table, dict[str, float]]:
-    """Tables of least squares and minimax against their peers, and the figures by name."""
-    case = case_of(100, seed)
-    fits: dict[str, Callable[[], object]] = {
-        "separable least squares (ours)": lambda: ours_squares(case),
-        "least_squares, our Jacobian": lambda: scipy_squares(case, analytic=True),
-        "least_squares, finite differences": lambda: scipy_squares(case, analytic=False),
+def races(seed: int, repeats: int, *, quick: bool) -> dict[str, float]:
+    """Seconds of everything at 100 poses by name; all must reach the same optimum."""
+    case, data = case_of(100, seed), simulated(100, seed)
+    raw = raw_of(case, data)
+    scale, size = speed_peers.scaled(raw)
+    fits: dict[str, Run] = {
+        "squares": lambda: squares(case),
+        "squares_without_numba": lambda: briefly(partial(squares, case)),
+        "squares_numpy_gn": lambda: speed_peers.gauss_newton(raw),
+        "squares_scipy": lambda: speed_peers.scipy_squares(raw),
     }
-    times = race(fits, repeats)
-    ends = {
-        "separable least squares (ours)": rms_mm(case, ours_squares(case)),
-        "least_squares, our Jacobian": rms_mm(case, scipy_squares(case, analytic=True)),
-        "least_squares, finite differences": rms_mm(case, scipy_squares(case, analytic=False)),
+    worst: dict[str, Run] = {
+        "minimax": lambda: worst_target(case),
+        "minimax_slsqp": lambda: speed_peers.slsqp(raw, scale, size),
     }
-    own = times["separable least squares (ours)"]
-    squares = Table(
-        "least squares, 100 poses x 3 targets, 33 parameters (median times)",
-        ("method", "ms", "ratio to ours", "RMS mm"),
-        tuple((name, 1e3 * t, t / own, ends[name]) for name, t in times.items()),
-        ("", ".2f", ".1f", ".9f"),
+    if there("casadi"):
+        worst["minimax_ipopt"] = speed_peers.ipopt(raw, scale, size)
+    split = replace(
+        data, columns={**data.columns, "split": np.repeat(["train", "holdout"], [80, 20])}
     )
-    begin = ours_squares(case)
-    minimaxes: dict[str, Callable[[], float]] = {
-        "minimax SQP (ours, daqp)": lambda: ours_minimax(case, begin),
-        "SLSQP, scaled epigraph": lambda: slsqp_minimax(case, begin),
+    whole: dict[str, Run] = {
+        "whole": lambda: mc.calibrate(case.robot, split),
+        "whole_beyond": lambda: mc.calibrate(case.robot, split).beyond,
+        "whole_without_numba": lambda: briefly(lambda: mc.calibrate(case.robot, split)),
     }
-    worst = race(dict(minimaxes), repeats)
-    own_worst = worst["minimax SQP (ours, daqp)"]
-    table = Table(
-        "minimax from the least-squares fit, same problem (median times)",
-        ("method", "ms", "ratio to ours", "max F_i/m mm^2"),
-        tuple((name, 1e3 * t, t / own_worst, minimaxes[name]()) for name, t in worst.items()),
-        ("", ".2f", ".1f", ".12f"),
+    seconds = (
+        race(fits, repeats) | race(worst, 1 if quick else min(repeats, 5)) | race(whole, repeats)
     )
-    figures = {
-        "least_squares_fd_over_ours": times["least_squares, finite differences"] / own,
-        "least_squares_jac_over_ours": times["least_squares, our Jacobian"] / own,
-        "slsqp_over_minimax": worst["SLSQP, scaled epigraph"] / own_worst,
-        "minimax_value_difference": abs(
-            minimaxes["SLSQP, scaled epigraph"]() / minimaxes["minimax SQP (ours, daqp)"]() - 1.0
-        ),
-        "least_squares_rms_difference_mm": max(ends.values()) - min(ends.values()),
-    }
-    return squares, table, figures
+    sums, ends = {"ours": float(case.model.cost(squares(case)).sum())}, {"ours": worst_target(case)}
+    for name in ("squares_numpy_gn", "squares_scipy"):
+        sums[name] = float((raw.rows(np.asarray(fits[name]()))[0] ** 2).sum())
+    for name in worst.keys() - {"minimax"}:
+        ends[name] = float(raw.squares(np.asarray(worst[name]()))[0].max())
+    alike("least squares", sums)
+    alike("minimax", ends)
+    return seconds
 
 
-def growth(seed: int, counts: tuple[int, ...], repeats: int) -> tuple[Table, dict[str, float]]:
-    """Time of a whole fit, least squares and minimax, against the number of poses."""
-    rows: list[tuple[str | float | int, ...]] = []
-    previous = np.nan
-    figures: dict[str, float] = {}
+def briefly(run: Run) -> object:
+    """A run with NumPy's kernels."""
+    with choice.work(brief=True):
+        return run()
+
+
+def there(package: str) -> bool:
+    """Whether a peer is installed; a word where it is not."""
+    found = find_spec(package) is not None
+    if not found:
+        click.echo(f'{package} is not installed and left out: pip install ".[peers]"', err=True)
+    return found
+
+
+def points(seed: int, counts: tuple[int, ...]) -> dict[str, float]:
+    """Seconds of the worst point by the number of points, ours and by cones."""
+    out: dict[str, float] = {}
+    for count in counts:
+        case, data = case_of(count // 3, seed), simulated(count // 3, seed)
+        begin = squares(case)
+        runs: dict[str, Run] = {f"point_{count}": lambda: worst_point(case, begin, data)}  # noqa: B023
+        raw = raw_of(case, data)
+        if count <= 300 and there("cvxpy"):
+            first = speed_peers.gauss_newton(raw)
+            runs["point_cvxpy"] = lambda: speed_peers.cones(raw, first)  # noqa: B023
+            end = raw.rows(speed_peers.cones(raw, first))[0]
+            largest = float(np.sqrt((end**2).sum(axis=0)).max())
+            alike("worst point", {"ours": worst_point(case, begin, data), "cvxpy": largest})
+        out |= race(runs, 3 if count <= 300 else 1)
+    return out
+
+
+def simulated(poses: int, seed: int) -> Measurements:
+    """The measurements of `case_of`."""
+    return simulate(load_robot("irb2600"), poses, 3, seed).data
+
+
+def command(seed: int) -> float:
+    """Processor time of `minimax-cal calibrate` on 100 poses, from the start of the process [s]."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.csv"
+        mc.write_measurements(path, simulated(100, seed))
+        words = [sys.executable, "-m", "minimax_cal.cli", "calibrate", "irb2600", str(path)]
+        times = []
+        for _ in range(3):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run(words, check=True, capture_output=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            spent = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+            times.append(spent)
+    return min(times)
+
+
+def calibrated_in(poses: int, seed: int, answer: Any) -> None:
+    """Put seconds and peak memory [GB] of one calibration; for a process of its own."""
+    data = simulated(poses, seed)
+    began = time.process_time()
+    mc.calibrate("irb2600", data)
+    spent = time.process_time() - began
+    answer.put((spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2))
+
+
+def growth(seed: int, counts: tuple[int, ...]) -> dict[str, tuple[float, float]]:
+    """Seconds and peak memory [GB] of a whole calibration by the number of poses."""
+    fresh = multiprocessing.get_context("spawn")
+    out: dict[str, tuple[float, float]] = {}
     for poses in counts:
-        case = case_of(poses, seed)
-        begin = ours_squares(case)
-        few = max(3, repeats // (1 + poses // 2000))
-        squares = statistics.median(seconds(partial(ours_squares, case), few))
-        worst = statistics.median(seconds(partial(ours_minimax, case, begin), few))
-        total = squares + worst
-        rows.append((poses, 1e3 * squares, 1e3 * worst, 1e3 * total, total / previous))
-        figures[f"growth_to_{poses}"] = total / previous
-        previous = total
-    table = Table(
-        "growth with the number of poses (3 targets; median times)",
-        ("poses", "least squares ms", "minimax ms", "together ms", "times the row above"),
-        tuple(rows),
-        ("d", ".2f", ".2f", ".2f", ".1f"),
-    )
-    return table, {key: value for key, value in figures.items() if np.isfinite(value)}
+        answer = fresh.SimpleQueue()
+        job = fresh.Process(target=calibrated_in, args=(poses, seed, answer))
+        job.start()
+        job.join()
+        if job.exitcode:
+            raise click.ClickException(f"{poses} poses: the process ended with {job.exitcode}")
+        out[str(poses)] = answer.get()
+    return out
+
+
+def others(seed: int, *, quick: bool) -> dict[str, float]:
+    """Seconds of the bootstrap, the command and the diagnosis."""
+    robot, data = load_robot("irb2600"), simulated(100, seed)
+    fit, count = mc.calibrate(robot, data), 20 if quick else 500
+    out = race({f"bootstrap_{count}": lambda: mc.bootstrap(fit, count)}, 1)
+    out["command"] = command(seed)
+    sizes = ((100, 3),) if quick else ((100, 3), (600, 3), (1200, 1), (2000, 3))
+    for poses, targets in sizes:
+        more = simulate(robot, poses, targets, seed).data
+        began = time.process_time()
+        mc.diagnose(robot, more)
+        out[f"diagnose_{poses}x{targets}"] = time.process_time() - began
+    return out
+
+
+def ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
+    """The peers' times over ours; None for a peer that is not there."""
+    pairs = {
+        "whole_over_slsqp": ("minimax_slsqp", "whole"),
+        "minimax_over_slsqp": ("minimax_slsqp", "minimax"),
+        "minimax_over_ipopt": ("minimax_ipopt", "minimax"),
+        "squares_over_numpy_gn": ("squares_numpy_gn", "squares"),
+        "point_over_cvxpy": ("point_cvxpy", "point_300"),
+        "squares_over_scipy": ("squares_scipy", "squares"),
+        "squares_without_numba_over_with": ("squares_without_numba", "squares"),
+        "whole_without_numba_over_with": ("whole_without_numba", "whole"),
+    }
+    return {
+        name: seconds[peer] / seconds[ours] if peer in seconds else None
+        for name, (peer, ours) in pairs.items()
+    }
 
 
 @click.command()
 @study_options("speed")
-@click.option("--repeats", type=int, default=15, show_default=True)
+@click.option("--repeats", type=int, default=9, show_default=True)
 def main(study: Study, repeats: int) -> None:
     """Ratios of our fits to their peers.
 
     Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
     """
-    repeats = 3 if study.quick else repeats
-    counts = (100, 1000) if study.quick else (100, 1000, 10000)
-    squares, worst, figures = peers(study.seed, repeats)
-    table, grown = growth(study.seed, counts, repeats)
-    study.save([squares, worst, table], {"figures": figures | grown})
-    if figures["minimax_value_difference"] > 1e-6:
-        raise click.ClickException("the two minimax solvers disagree")
+    quick = study.quick
+    with threadpool_limits(1):
+        seconds = races(study.seed, 3 if quick else repeats, quick=quick)
+        seconds |= points(study.seed, (300,) if quick else (300, 3000, 30000))
+        seconds |= others(study.seed, quick=quick)
+        grown = growth(study.seed, (1000,) if quick else (1000, 10000, 100000))
+    seconds |= {f"calibrate_{poses}": spent for poses, (spent, _) in grown.items()}
+    memory = {poses: held for poses, (_, held) in grown.items()}
+    over = ratios(seconds)
+    machine = f"{platform.processor() or platform.machine()}, kernels: {choice.kernels().__name__}"
+    numba = choice.kernels() is not plain
+    shown = tuple((k, "absent" if v is None else f"{v:.1f}") for k, v in over.items())
+    spent = tuple((name, 1e3 * value) for name, value in seconds.items())
+    tables = [
+        Table("the peer's time over ours", ("ratio", "times"), shown),
+        Table(f"processor time ({machine})", ("what", "ms"), spent, ("", ".2f")),
+        Table("peak memory of a whole calibration", ("poses", "GB"), tuple(memory.items()),
+              ("", ".2f")),
+    ]  # fmt: skip
+    content = {"ratios": over, "seconds": seconds, "memory_gb": memory, "numba": numba}
+    study.save(tables, content, packages=("numba", "casadi", "cvxpy", "daqp"))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.instruments.kinds import relative
+    from minimax_cal.fitting.many import calibrate_many
     from minimax_cal.fitting.options import Options
     from minimax_cal.ground.errors import (
         CalibrationError,
@@ -70,6 +71,7 @@ __all__ = [
     "bootstrap",
     "builtin_robots",
     "calibrate",
+    "calibrate_many",
     "check",
     "compare",
     "compensate",
@@ -124,6 +126,7 @@ MODULES = {  # name: where it is defined
     "load_fit": "fitting.fit",
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
+    "calibrate_many": "fitting.many",
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",

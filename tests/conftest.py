@@ -1,5 +1,7 @@
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # small matrices: threads only cost
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -35,6 +37,15 @@ def noisy(robot: mc.Robot) -> Simulation:
 def clean(robot: mc.Robot) -> Simulation:
     """Geometric errors only: the true robot can be found to rounding."""
     return simulate(robot, 60, 3, seed=6, truth=Truth(compliance=0, noise=0, noise_per_metre=0))
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """The page to work in, served once for all tests that ask it."""
+    from served import serving  # stands beside those tests
+
+    with serving(tmp_path_factory.mktemp("sessions")) as found:
+        yield found
 
 
 def shared(name: str) -> tuple[str, str]:

@@ -273,7 +273,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
             f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"
         )
     terms = arm.effects.terms
-    timed = [term.label for term in terms if "constant" in term.choice or "since" in term.choice]
+    timed = [term.label for term in terms if {"constant", "fast", "since"} & term.choice.keys()]
     if timed:
         out.append(
             f"{', '.join(timed)} depends on the time in the calibration's session: taken at "
@@ -281,10 +281,7 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
         )
     scene = arm.scene(data.take(np.arange(1)))
     whole = any(
-        part % 4 == WHOLE
-        for term in terms
-        if term.effect == "joint_compliance"
-        for part in unmasked(term.choice["parts"])
+        part % 4 == WHOLE for term in terms for part in unmasked(term.choice.get("parts", 0.0))
     )
     if whole and not (scene.known_masses or scene.measured_torques):
         out.append(

@@ -14,13 +14,10 @@ from minimax_cal.ground.files import plain
 from minimax_cal.measuring.history import numbered, visits, with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.drivers import axis_of, own_value
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Fitted, Term
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 
-BY_WEIGHT = ("joint_compliance", "link_bending", "base_flex")
-LINEAR = ("encoder_gain", "joint_coupling")
-BY_MOVE = {"backlash": "approach", "settling": "move"}
-BY_TIME = ("thermal_growth", "frame_drift", "session_jump", "target_shift")
 VIEWS = ("geometry alone", "with effects", "the first effect taken out")
 FLAT = 1e-6  # of its size: what varies less does not vary
 
@@ -130,55 +127,24 @@ def guilty(left: Leftover, turn: list[Array]) -> int:
 
     Without an effect, the one that moves the targets most.
     """
-    effect, place = (left.term.effect, left.term.place) if left.term else ("", "")
+    follows, place = (follows_of(left.term), left.term.place) if left.term else ("", "")
     if place[:1] == "J":
         return int(place[1:]) - 1
     lever = np.sqrt(np.nanmean((left.scene.jacobian**2).sum(axis=2), axis=(1, 2)))
     fell = (turn[0] ** 2).mean(axis=0) - ((turn[1] ** 2).mean(axis=0) if len(turn) > 1 else 0.0)
     size = fell * lever**2
-    if effect in BY_WEIGHT:
+    if follows == "load":
         torque = left.scene.gravity
         size = np.where(np.ptp(torque, axis=1) > FLAT * np.abs(torque).max(), size, -np.inf)
-    elif effect in BY_MOVE:
-        moved = [left.scene.has(f"{BY_MOVE[effect]}{j + 1}") for j in range(left.scene.joints)]
+    elif follows in ("approach", "move"):
+        moved = [left.scene.has(f"{follows}{j + 1}") for j in range(left.scene.joints)]
         size = np.where(moved, size, -np.inf)
     return int(np.argmax(size))
 
 
-def value_of(scene: Scene, joint: int) -> tuple[str, Array]:
-    """A joint's own value, as people read it."""
-    if scene.robot.prismatic[joint]:
-        return f"joint {joint + 1} (mm)", 1e3 * scene.data.q[:, joint]
-    return f"joint {joint + 1} (deg)", np.degrees(scene.data.q[:, joint])
-
-
-def against(scene: Scene, term: Term, joint: int) -> tuple[str, Array]:
-    """(m,) what the law of an effect looks at, for people, with its unit."""
-    name, stem = term.effect, BY_MOVE.get(term.effect, "")
-    if name == "gear_ripple":
-        period = 360.0 / term.choice["turns"]
-        wave = np.mod(np.degrees(scene.q[joint]), period)
-        return f"joint {joint + 1} within a wave of {period:.3g}° (deg)", wave
-    if name == "joint_coupling":
-        return value_of(scene, int(term.choice["source"]) - 1)
-    if name in BY_WEIGHT:
-        return f"static torque of joint {joint + 1} (N m)", scene.gravity[joint]
-    if stem and scene.has(f"move{joint + 1}"):
-        sliding = bool(scene.robot.prismatic[joint])
-        move = scene.column(f"move{joint + 1}")
-        unit, scale = ("mm", 1e3) if sliding else ("deg", 180.0 / np.pi)
-        return f"last move of joint {joint + 1} ({unit})", scale * move
-    if stem:
-        side = scene.column(f"{stem}{joint + 1}")
-        return f"side that joint {joint + 1} came from (-1 or 1)", side
-    if name == "tool_flex":
-        tilt = np.clip((scene.links.axes[2] * scene.robot.up[:, None]).sum(axis=0), -1.0, 1.0)
-        return "flange axis from the vertical (deg)", np.degrees(np.arccos(tilt))
-    if name in BY_TIME and "temperature" in term.choice:
-        return "temperature (°C)", scene.data.columns["temperature"].astype(float)
-    if name in BY_TIME:
-        return "time in the session (0 first, 1 last)", scene.column("clock")
-    return value_of(scene, joint)
+def follows_of(term: Term) -> str:
+    """What drives an effect, '' for a fault of the data."""
+    return EFFECTS[term.effect].follows if term.effect in EFFECTS else ""
 
 
 def along_motion(left: Leftover, term: Term) -> Curve:
@@ -186,12 +152,12 @@ def along_motion(left: Leftover, term: Term) -> Curve:
     scene, names = left.scene, left.scene.data.target_names
     chosen = [names.index(term.place)] if term.place in names else list(range(len(names)))
     sight = np.moveaxis(left.points, -1, 1) - scene.instrument[:, None]  # (k, 3, m)
-    if term.effect == "target_offset":
+    if follows_of(term) == "sight":
         motion, words = sight, "along the line of sight"
         xlabel, x = "distance from the instrument (m)", np.linalg.norm(sight, axis=1)
     else:
         motion, words = motion_of(left, term), f"along its {term.effect.partition('_')[2]}"
-        xlabel, time = against(scene, term, 0)
+        xlabel, time = axis_of(scene, term, 0)
         x = np.broadcast_to(time, (len(names), len(time)))
     along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
     y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in left.views)
@@ -212,16 +178,18 @@ def motion_of(left: Leftover, term: Term) -> Array:
 def residual_curve(left: Leftover) -> Curve:
     """The errors as turns of the guilty joint, against what its effect depends on."""
     scene, term = left.scene, left.term
-    if term and term.effect in ("target_offset", *BY_TIME):
+    if term and follows_of(term) in ("sight", "time"):
         return along_motion(left, term)
     turn = turns(left)
     joint = guilty(left, turn)
-    xlabel, x = against(scene, term, joint) if term else value_of(scene, joint)
+    xlabel, x = axis_of(scene, term, joint) if term else own_value(scene, joint, {})
     what, unit = ("travel", "mm") if scene.robot.prismatic[joint] else ("turn", "mrad")
     title = f"errors as a {what} of joint {joint + 1}"
     if term:
         title += f", for {term.effect} {term.place}"
-    if term and term.effect in LINEAR:  # a constant turn is geometry: leave it out
+    if (
+        term and term.effect in EFFECTS and EFFECTS[term.effect].linear
+    ):  # a constant turn is geometry: leave it out
         turn[-1] = turn[-1] - turn[-1].mean(axis=0)
     ylabel = f"equivalent {what} of joint {joint + 1} ({unit})"
     return Curve(title, xlabel, ylabel, x, tuple(1e3 * part[:, joint] for part in turn))

@@ -26,11 +26,10 @@ from minimax_cal.diagnosing.remainder import (
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.maps import FINEST, range_of, sines
-from minimax_cal.modelling.effects.scene import BESIDE, Scene, joint_of
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 
 LEVEL = 1e-3  # chance that groups gain so much by a map of a joint that has none
-OF_ANGLE = ("gear_error", "gear_ripple", "encoder_gain")
 USUAL = 1e-3  # size of slow laws [rad]
 SLOW = 4.0  # waves a turn of the slowest that is called a ripple
 ONE_WAVE = 0.9  # share of a curve's square that makes it a wave
@@ -162,7 +161,7 @@ def strongest_wave(x: Array, curve: Array) -> tuple[float, float]:
 def replaced(fit: Joint, left: Left, usual: Array, blocks: Sequence[Block]) -> tuple[Term, ...]:
     """Named laws of the same angles without which groups left out are met as well."""
     places = {block.place for block in blocks}
-    own = [t for t in fit.terms if t.effect in OF_ANGLE and t.place in places]
+    own = [t for t in fit.terms if t.place in places and is_series(EFFECTS[t.effect])]
     least = squared(left, usual, blocks)
     bare = begun(without(fit, left, own).take(usual)).square
     gone: tuple[Term, ...] = ()
@@ -171,6 +170,11 @@ def replaced(fit: Joint, left: Left, usual: Array, blocks: Sequence[Block]) -> t
         if squared(without(fit, left, fewer), usual, blocks) - least < NEEDLESS * (bare - least):
             gone = fewer
     return gone
+
+
+def is_series(effect: Effect) -> bool:
+    """Whether a law is a part of any curve of its joint's angle: a wave, or a gain."""
+    return effect.of_angle and (effect.lines or effect.linear)
 
 
 def squared(left: Left, usual: Array, blocks: Sequence[Block]) -> float:

@@ -13,9 +13,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import moved, station
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 
-MOVES = ("frame_drift", "session_jump")  # laws that move the foot as a whole, in time
 BLOCKS = 10  # of the visits, left out in turn: what the law misses goes on for a while
 LEAST = 30  # poses at which a reflector was measured
 AGREE = 3.0  # sigmas of a difference that is one
@@ -100,7 +99,7 @@ def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
     for term in fit.terms:
         count = len(term.columns(fit.study.scene).names)
         own, at = slice(at, at + count), at + count
-        if scene is None or term.effect not in MOVES or term.frees_frames:
+        if scene is None or EFFECTS[term.effect].moves != "frame" or term.frees_frames:
             continue
         across, told = motion(scene, term), measured(scene, term)
         value = across @ fit.cell.effects.values[fit.terms.index(term)]

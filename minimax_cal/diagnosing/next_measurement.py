@@ -19,14 +19,13 @@ from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term, fields_of, of_sessions
+from minimax_cal.modelling.effects.table import EFFECTS, Term, fields_of, of_sessions
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
 PREPARE = {"more": 0.0, "late": 5.0, "side": 5.0, "load": 15.0, "foot": 20.0}  # once [min]
-OF_BASE = frozenset({"base_flex", "frame_drift", "session_jump"})  # what moves the robot's foot
 GOLDEN = 0.6180339887498949
 COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
@@ -341,7 +340,7 @@ class Fields:
 def fields(site: Site, term: Term) -> tuple[Fields, Fields, list[int]]:
     """Motion per unit of each parameter; the doubts about it, and the parameter of each."""
     scene, k = site.whole, site.scene.targets
-    base = term.effect in OF_BASE
+    base = EFFECTS[term.effect].of_base
     if base:  # probes about the targets' centre tell how the law moves any point of the base
         centre = scene.points.mean(axis=0)
         probes = np.concatenate([np.eye(3), -np.eye(3)])[:, :, None] + centre

@@ -77,23 +77,23 @@ class Kept:
         gram: (p, p).  scale: (p,), see `Identification`.  stems: points as smr1, of which several
         are one thing to the reader, called `whole`.
         """
-        reasons = {}
-        for name, reason in self.reasons.items():
-            shown = self.partners(gram, scale, name, stems, whole) if "{}" in reason else ""
-            reasons[name] = reason.format(shown)
-        active = self.active
+        reasons, active = dict(self.reasons), self.active
+        lost = [name for name, reason in reasons.items() if "{}" in reason]
+        place = np.array([self.names.index(name) for name in lost], dtype=int)
+        mixes = solve_normal(gram[np.ix_(active, active)], gram[active][:, place])
+        for name, i, mix in zip(lost, place, mixes.T, strict=True):
+            shown = self.partners(np.abs(mix) * scale[active] / scale[i], stems, whole)
+            reasons[name] = reasons[name].format(shown)
         scaled = gram[np.ix_(active, active)] / np.outer(scale[active], scale[active])
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(scaled)[::-1], 0.0))
         return Identification(active, reasons, singular, scale)
 
-    def partners(
-        self, gram: Array, scale: Array, name: str, stems: Iterable[str], whole: str
-    ) -> str:
-        """The kept parameters that together move the points as one does, largest first."""
-        names, i = self.names.all, self.names.index(name)
-        chosen = np.flatnonzero(self.active)
-        mix = solve_normal(gram[np.ix_(chosen, chosen)], gram[chosen, i][:, None])[:, 0]
-        share = np.abs(mix) * scale[chosen] / scale[i]
+    def partners(self, share: Array, stems: Iterable[str], whole: str) -> str:
+        """The kept parameters that together move the points as one does, largest first.
+
+        share: (kept,) of the motion.
+        """
+        names, chosen = self.names.all, np.flatnonzero(self.active)
         shown = [names[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
         spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
         if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
@@ -188,8 +188,10 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
                 row = null[place[int(p)]]
                 if np.linalg.norm(row) > share:
                     # turn the null space so that one vector alone holds p; drop that vector
-                    reflect, _ = np.linalg.qr(row[:, None], mode="complete")
-                    null = null @ reflect[:, 1:]
+                    mirror = row.copy()
+                    mirror[0] += np.copysign(np.linalg.norm(row), row[0])
+                    turned = np.outer(null @ mirror, mirror) * (2.0 / (mirror @ mirror))
+                    null = (null - turned)[:, 1:]
                     gone.append(int(p))
     return gone
 

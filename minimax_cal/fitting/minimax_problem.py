@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.model import Model, moved
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.minimax import Linear
 
@@ -83,16 +84,21 @@ class MinimaxProblem:
     size: float
     form: str
 
-    @property
+    @cached_property
     def lower(self) -> Array:
         """Lower bounds of the scaled distance deviations."""
         count = len(self.distances.mean)
         return np.full(count, -1.0 if self.form == "two-sided" else -np.inf)
 
-    @property
+    @cached_property
     def upper(self) -> Array:
         """Upper bounds of the scaled distance deviations."""
         return np.ones(len(self.distances.mean))
+
+    @cached_property
+    def squared_scale(self) -> Array:
+        """(free, free): one divisor an entry, so that a quotient is as symmetric as what it was."""
+        return self.size * np.outer(self.scale, self.scale)
 
     def deviation(self, x: State) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
@@ -120,17 +126,21 @@ class MinimaxProblem:
         model = self.model
         at = self.first if x is self.start else PER[self.per][1](model, x)
         total, weight = model.counts.sum(), model.prior.weight[model.active]
-        off = (model.prior.mean - model.values(x))[model.active]
+        slope, held, known = at.jacobian, 0.0, bool(weight.any())
+        if known:
+            off = (model.prior.mean - model.values(x))[model.active]
+            slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
         c, normal = self.deviation(x)
 
         def curvature(weights: Array) -> Array:
-            both = at.curvature(weights) + 2.0 * weights.sum() * np.diag(weight) / total
-            # one divisor an entry: the quotient is as symmetric as what it came from
-            return np.asarray(both / (self.size * np.outer(self.scale, self.scale)))
+            both = at.curvature(weights)
+            if known:
+                both = both + 2.0 * weights.sum() * np.diag(weight) / total
+            return np.asarray(both / self.squared_scale)
 
         return Linear(
-            f=(at.f + prior_of(model, x)) / self.size,
-            jacobian=(at.jacobian - 2.0 * weight * off / total) / self.size / self.scale,
+            f=(at.f + held) / self.size,
+            jacobian=slope / self.size / self.scale,
             c=c,
             normal=normal,
             curvature=curvature,
@@ -138,9 +148,7 @@ class MinimaxProblem:
 
     def step(self, x: State, d: Array) -> State:
         """The state moved by a scaled step in the free parameters."""
-        full = np.zeros(self.model.names.count)
-        full[self.model.active] = d / self.scale
-        return x.step(full)
+        return moved(self.model, x, d / self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +180,7 @@ def target_sensitivity(model: Model, x: State) -> Sensitivity:
     return Sensitivity(
         normal.cost / counts,
         -2.0 * normal.gradient / counts[:, None],
-        lambda weights: 2.0 * np.einsum("k,kij->ij", weights / counts, normal.gram),
+        lambda weights: 2.0 * np.tensordot(weights / counts, normal.gram, 1),
     )
 
 

@@ -228,7 +228,8 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
     """Replicates of a minimax, each solved from the fit.  Returns as `stepped`."""
     options, estimator, state, train = fit.options, fit.estimator, fit.cell.state, fit.train
     qp, _ = solver_of(options.qp, QP_TOLERANCE)
-    active = estimator.model.active
+    settings, active = Sqp(hessian=options.hessian), estimator.model.active
+    mu = fit.minimax.multiplier if fit.minimax else minimax.EVEN
     part, _ = normal_parts(estimator.model, state, draws)
     good = determined(draws, part, estimator.model.prior.weight[active])
     change = np.zeros((len(good), int(active.sum())))
@@ -239,7 +240,7 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
         model = estimator.at(rows).model
         distances = measured_distances(train.take(rows), options.distance_tolerance)
         problem = minimax_problem(model, state, distances, options.distance, "target")
-        best = minimax.solve(problem, state, qp, Sqp(hessian=options.hessian))
+        best = minimax.solve(problem, state, qp, settings, mu=mu)
         good[number] = best.status is Status.CONVERGED
         change[number] = between(state, best.x)[active]
     return change, good

@@ -83,14 +83,15 @@ def shortest_tree(q: Array) -> Array:
 
     They are the heights at which single linkage joins.
     """
-    distance, outside = np.full(len(q), np.inf), np.ones(len(q), dtype=bool)
-    edges, at = [], 0
-    for _ in range(len(q) - 1):
-        outside[at] = False
-        distance = np.minimum(distance, np.linalg.norm(q - q[at], axis=1))
-        at = int(np.argmin(np.where(outside, distance, np.inf)))
-        edges.append(float(distance[at]))
-    return np.array(edges)
+    apart = sum((joint[:, None] - joint) ** 2 for joint in q.T)
+    distance, edges, at = np.full(len(q), np.inf), np.empty(len(q) - 1), 0
+    for step in range(len(edges)):
+        apart[:, at] = np.inf  # nothing leads there any more
+        distance = np.minimum(distance, apart[at])
+        distance[at] = np.inf
+        at = int(distance.argmin())
+        edges[step] = distance[at]
+    return np.sqrt(edges)
 
 
 def numbered_by_joints(group: Array, q: Array) -> Array:

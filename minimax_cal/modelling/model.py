@@ -91,7 +91,7 @@ class Model:
     fields: Array = field(default_factory=lambda: NO_FIELDS)
     moved: Array = field(default_factory=lambda: NO_MIX)
 
-    @property
+    @cached_property
     def counts(self) -> Array:
         """(k,) at how many poses each target was measured."""
         return np.asarray(np.count_nonzero(self.weight, axis=1))
@@ -340,6 +340,8 @@ class SumOfSquares:
 
 def arrays_of(state: State) -> tuple[Array, ...]:
     """A state, or a batch of them flattened, as the kernels ask for it."""
+    if state.mdh.ndim == 2:
+        return ready(*(part[None] for part in (*state.geometry, state.effects)))
     batch, (n, _), k = state.mdh.shape[:-2], state.mdh.shape[-2:], state.target_positions.shape[-2]
     count = math.prod(batch)
     effects = np.broadcast_to(state.effects, (*batch, state.effects.shape[-1]))
@@ -350,6 +352,12 @@ def arrays_of(state: State) -> tuple[Array, ...]:
         np.broadcast_to(state.target_positions, (*batch, k, 3)).reshape(count, k, 3),
         effects.reshape(count, -1),
     )
+
+
+def moved(model: Model, state: State, step: Array) -> State:
+    """A single state moved by a step of the free parameters."""
+    which = np.flatnonzero(model.active)
+    return State(*(part[0] for part in kernels().stepped(*arrays_of(state), which, step)))
 
 
 def in_base(state: State, y: Array) -> Array:

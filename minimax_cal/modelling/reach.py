@@ -12,15 +12,13 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 
 SLIDE = 0.5  # metres a slide may change by where a turning joint may by a radian [m/rad]
 PASSES, PATIENCE = 12, 6  # over the effects; those until sides are kept
 SETTLED = 1e-10  # change of a joint that no pass need follow [rad, m]
-# What moves the reflectors or the instrument, and not the flange of the arm.
-SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "session_jump", "target_shift", "target_offset"})
 TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 CORNERS = tuple(f"corner{i + 1}" for i in range(4))
 LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
@@ -253,7 +251,7 @@ def arm_of(cell: Cell) -> Cell:
     kept = [
         (term, value)
         for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term.effect not in SEEN_ONLY and term.place not in cell.target_names
+        if EFFECTS[term.effect].of_flange and term.place not in cell.target_names
     ]
     effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
     return replace(

@@ -305,7 +305,8 @@ def tool(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 def balancer(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """A tendon with a spring, where it pulls."""
-    if parts.arm.balance or values[0] >= 0.0:
+    upright = term.place == "J2" and abs(term.choice["zero"]) < 0.5 * np.pi
+    if parts.arm.balance or values[0] >= 0.0 or not upright:
         parts.mapped.append((term, values))  # a spring that pushes the arm down is none
         return
     choice = {key: float(term.choice[key]) for key in ("zero", "eye", "rest")}

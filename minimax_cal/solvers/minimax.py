@@ -27,6 +27,8 @@ Solver = Callable[[Problem], Solution]
 
 HESSIANS = ("gauss-newton", "bfgs")
 
+EVEN: Array = np.zeros(0)
+
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
 ROUNDING = 1e-12
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
@@ -154,9 +156,13 @@ def solve(
     qp: Solver,
     settings: Sqp = Sqp(),
     progress: Callable[[Step], None] = lambda step: None,
+    mu: Array = EVEN,
 ) -> Optimum[X]:
-    """Minimise max f from x.  qp: a QP solver whose answers are already verified."""
-    at = Iterate.begin(problem, x, settings)
+    """Minimise max f from x.  qp: a QP solver whose answers are already verified.
+
+    mu: (k,) multipliers of a similar problem, to begin with.
+    """
+    at = Iterate.begin(problem, x, settings, mu)
     status, tolerance = Status.ITERATION_LIMIT, settings.tolerance
     trace: list[Step] = []
     notes: list[str] = []
@@ -220,11 +226,11 @@ class Iterate(Generic[X]):
     idle: int = 0
 
     @staticmethod
-    def begin(problem: Minimax[X], x: X, settings: Sqp) -> Iterate[X]:
-        """The start, all functions sharing the multipliers evenly."""
+    def begin(problem: Minimax[X], x: X, settings: Sqp, mu: Array) -> Iterate[X]:
+        """The start; without mu all functions share the multipliers evenly."""
         here = problem.linearise(x)
         k, p = here.jacobian.shape
-        mu, lam = np.full(k, 1.0 / k), np.zeros(len(here.c))
+        mu, lam = mu if len(mu) else np.full(k, 1.0 / k), np.zeros(len(here.c))
         kkt = optimality(here, mu, lam, problem.lower, problem.upper)
         quasi = None if settings.hessian == "gauss-newton" else Bfgs.start(here, p)
         return Iterate(problem, x, here, mu, lam, kkt, quasi)
@@ -235,6 +241,8 @@ class Iterate(Generic[X]):
             matrix = self.here.curvature(np.maximum(self.mu, floor / len(self.mu)))
         else:
             matrix = self.quasi.matrix
+        if not self.damping:
+            return matrix
         return np.asarray(matrix + self.damping * np.diag(np.maximum(np.diag(matrix), 1e-8)))
 
     def subproblem(
@@ -376,9 +384,9 @@ def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
 def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
     """The KKT residuals at a point."""
     stationarity = here.jacobian.T @ mu + here.normal.T @ lam
-    with np.errstate(invalid="ignore"):
-        room = np.where(lam > 0, upper - here.c, here.c - lower)
-        slack = np.where(lam == 0, 0.0, np.abs(lam) * np.abs(room))
+    held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
+    room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
+    slack = np.abs(lam[held] * room)
     return Kkt(
         float(np.abs(stationarity).max(initial=0.0)),
         float(mu @ (here.f.max() - here.f) + slack.sum()),

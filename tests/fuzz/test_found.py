@@ -15,7 +15,10 @@ import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
 from minimax_cal.ground.files import json_of
 from minimax_cal.ground.records import Packed, packed, unpacked
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
+from qp_backends import Problem, child
+from qp_backends.problem import COLD
 
 from .material import material
 
@@ -196,3 +199,65 @@ def test_a_fleet_has_no_more_processes_than_cells_can_use(
 ) -> None:
     for jobs in ("0", "-2", "9" * 20):
         assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)
+
+
+@pytest.mark.slow
+def test_a_joint_zero_off_by_a_quarter_turn_is_found_by_whole_poses(tmp_path: Path) -> None:
+    """Several starts are compared there; two that end alike were a batch of two."""
+    path = tmp_path / "data.csv"
+    path.write_bytes(material()["data.csv"])
+    robot = mc.load_robot("irb120")
+    off = robot.with_mdh(robot.mdh + np.pi / 2 * np.eye(5)[2] * np.eye(6)[:, [2]])
+    found, right = (mc.calibrate(r, path, "pose", holdout=0.0) for r in (off, robot))
+    assert found.accuracy["train"].rms_mm == pytest.approx(right.accuracy["train"].rms_mm, rel=1e-3)
+
+
+def test_a_diagnosis_of_another_arm_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "data.csv"
+    path.write_bytes(material()["data.csv"])
+    run("diagnose", "irb2600", path, "--quick")
+    assert "check" in capsys.readouterr().err
+
+
+def test_a_fit_without_targets_is_told_in_our_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its lever was the root of a mean of nothing."""
+    targets = tmp_path / "targets.csv"
+    targets.write_bytes(material()["targets.csv"])
+    path = broken(tmp_path, "truth.json", lambda content: content.update(targets_mm={}))
+    capsys.readouterr()
+    assert run("compensate", path, targets, "--robot", "irb120", "--json") in (0, 1)
+    out, _ = capsys.readouterr()
+    assert all(np.isfinite(row["residual_mm"]) for row in json.loads(out)["targets"])
+
+
+def test_fifty_notices_are_enough(capsys: pytest.CaptureFixture[str]) -> None:
+    from minimax_cal.cli.options import Output
+
+    Output(None, False, None, False).notice(*map(str, range(20_000)))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "notice: 0"
+    assert lines[50:] == ["notice: and 19950 more, in the JSON"]
+
+
+def test_exact_measurements_are_a_success() -> None:
+    """Steps below rounding were called stalled."""
+    for objective in ("sum", "minimax", "point"):
+        made = simulate("irb120", 24, 3, 1, Truth(noise=0.0, noise_per_metre=0.0, compliance=0.0))
+        fit = mc.calibrate("irb120", made.data, objective, holdout=0.0)
+        assert fit.status == "converged", objective
+        assert fit.accuracy["train"].max_mm < 1e-6
+
+
+def test_a_backends_process_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A numpy.py that lies about would have run."""
+    (tmp_path / "numpy.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    problem = Problem(np.eye(2), -np.ones(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    found = child.run("qp_backends.via_qpsolvers", problem, "quadprog", 1e-8, 60.0, COLD)
+    np.testing.assert_allclose(found.x, 1.0, rtol=0, atol=1e-9)

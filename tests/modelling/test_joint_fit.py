@@ -103,6 +103,8 @@ def check_found(fit: mc.Fit, put: dict[str, list[float]], sigmas: float = 4.0) -
 MAP = 1e-3 * spread(2.0, 1.5, waves_over(1.5)) * np.random.default_rng(4).normal(size=29)
 CASES: dict[str, list[float]] = {
     "joint_compliance:J2": [6e-7],
+    "cross_compliance:J2:source=3": [8e-7],
+    "gravity_compensator:J3:zero=1.5:eye=0.4:rest=0.45": [2e-3],
     "gravity_compensator:J2:zero=0:eye=0.4:rest=0.45": [2e-3],
     "link_bending:L2": [3e-7],
     "base_flex:frame": [2e-7],
@@ -112,13 +114,18 @@ CASES: dict[str, list[float]] = {
     "encoder_gain:J1": [4e-4],
     "joint_error_map:J1:low=-1:high=0.5:length=2:size=0.001": MAP.tolist(),
     "joint_coupling:J5:source=4": [5e-4],
+    "axis_wobble:J1:turns=1": [2e-4, -3e-4],
+    "axis_wobble:J4:turns=2": [2e-4, -3e-4, 4e-4, 1e-4],
     "backlash:all": [2e-4, -1e-4, 3e-4, 2e-4, 4e-4, 5e-4],
     "settling:J3": [1e-3],
+    "settling:J3:limit=0.8": [1e-3],
     "thermal_growth:all:constant=0.5:apart=0": [4e-4],
     "thermal_growth:all:temperature=1:apart=0": [1.2e-5],
+    "thermal_growth:all:fast=0.15:slow=inf:apart=0": [4e-4, 2e-4],
     "frame_drift:frame:constant=0.5": [3e-4, -2e-4, 1e-4, 1e-4, -2e-4, 3e-4],
     "session_jump:frame:since=0.4": [3e-4, -2e-4, 1e-4, 1e-4, -2e-4, 3e-4],
     "target_shift:smr2:since=0.4": [1e-4, 2e-4, -3e-4],
+    "target_reseat:all:since=0.4:apart=0": [1e-4, 2e-4, -3e-4, 1e-3, -2e-3, 1e-3],
     "target_offset:smr1": [5e-4],
 }
 
@@ -426,6 +433,7 @@ def joined(texts: dict[str, list[float]]) -> tuple[mc.Measurements, tuple[Term, 
 
 LARGE = {
     "joint_compliance:all": [3e-6, 3e-6, 3e-6, 3e-5],
+    "thermal_growth:all:fast=0.15:slow=inf:apart=0": [4e-4, 2e-4],
     "frame_drift:frame:constant=0.5": [1e-3] * 6,
     "target_offset:smr2": [2e-3],
 }

@@ -10,6 +10,7 @@ import minimax_cal as mc
 from minimax_cal.diagnosing import curves
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.drivers import axis_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots import diagnosis, figures
@@ -130,7 +131,7 @@ def test_every_effect_has_something_to_be_drawn_against(name: str) -> None:
     place = effect.places(scene)[0]
     choices = effect.choices(scene, place) or ({"turns": 100.0},)
     for choice in choices:
-        label, values = curves.against(scene, Term(name, place, choice), 2)
+        label, values = axis_of(scene, Term(name, place, choice), 2)
         assert values.shape == (60,)
         assert np.isfinite(values).all()
         assert np.ptp(values) > 0.0

@@ -1,18 +1,11 @@
 """Who may ask: the right host, the page itself, the token; and what every answer carries."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from served import Served, serving
+from served import Served
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with serving(tmp_path_factory.mktemp("sessions")) as found:
-        yield found
 
 
 def test_the_token_opens_and_leaves_the_address(server: Served) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from conftest import run, shared
 from numpy.testing import assert_allclose
-from served import PATIENCE, Served, serving
+from served import PATIENCE, Served
 
 import minimax_cal as mc
 
@@ -66,12 +66,6 @@ def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def driver(downloads: Path) -> Iterator[Any]:
     with browsing(downloads) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with serving(tmp_path_factory.mktemp("sessions")) as found:
         yield found
 
 
@@ -188,7 +182,11 @@ def test_from_dropped_files_to_a_passed_report(
 
     until(lambda: one(driver, "#chart-workspace").get_attribute("data-drawn"), "no view")
     fill(driver, "#cell [name=most]", "0.001")
-    names = "return document.getElementById('chart-workspace').data.map(t => t.name)"
+    place = "return document.getElementById('chart-workspace')"
+    drawn = f"{place}.data.map(t => [t.x[0], t.y[0], t.z[0]])"
+    arrow, reflector, *_ = driver.execute_script(drawn)
+    assert arrow == reflector
+    names = f"{place}.data.map(t => t.name)"
     until(lambda: "beyond 0.001 mm" in str(driver.execute_script(names)), "no red")
     count = driver.execute_script("return document.querySelectorAll('tr.beyond').length")
     assert count > POSES * TARGETS / 2
@@ -210,20 +208,21 @@ def test_from_dropped_files_to_a_passed_report(
     assert asked(driver) == {f"http://127.0.0.1:{server.port}"}
 
 
-def test_an_unticked_point_is_out_of_the_next_fit(driver: Any, server: Served) -> None:
-    before = json.loads((session_of(driver, server) / "fit.json").read_text())
-    tick = one(driver, "[data-panel=points] input[data-point]")
-    name = tick.get_attribute("id")
-    click(driver, f"#{name}")
+def unticked(driver: Any) -> tuple[str, str]:
+    """Untick the worst point; its line and target."""
+    tick = one(driver, "[data-panel=points] input[data-point]").get_attribute("id")
+    click(driver, f"#{tick}")
     until(lambda: state(driver, "fit") == "old", "the choice did not arrive")
-    line, target = name.removeprefix("use-").split("-")
-    assert f"--leave-out={line}:{target}" in one(driver, "[data-said=fit]").text
-    do(driver, "fit", "#points")
-    after = json.loads((session_of(driver, server) / "fit.json").read_text())
-    row, column = after["poses"]["line"].index(int(line)), int(target.removeprefix("smr")) - 1
-    assert after["poses"]["measured_mm"][row][column] == [None, None, None]
-    assert before["poses"]["measured_mm"][row][column] != [None, None, None]
+    line, target = tick.removeprefix("use-").split("-")
+    return line, target
+
+
+def test_a_point_can_be_unticked_and_taken_back(driver: Any) -> None:
+    line, target = unticked(driver)
+    assert f"--leave-out={line}:{target} -o used.csv" in one(driver, "[data-said=fit]").text
     assert one(driver, "#points tr.out").get_attribute("id") == f"point-{line}-{target}"
+    click(driver, "#all-back")
+    until(lambda: state(driver, "fit") == "done", "the choice did not arrive")
     assert severe(driver) == []
 
 
@@ -281,6 +280,12 @@ def test_the_whole_work_in_two_browsers(
         folders = [session_of(browser, server) for browser in (left, right)]
         one_fit, other = (json.loads((f / "fit.json").read_text()) for f in folders)
         assert one_fit["parameters"] == other["parameters"]
+
+        line, target = unticked(left)
+        do(left, "fit", "#points")
+        poses = json.loads((folders[0] / "fit.json").read_text())["poses"]
+        row = poses["line"].index(int(line))
+        assert poses["measured_mm"][row][poses["targets"].index(target)] == [None, None, None]
 
         click(left, "[data-run=diagnose]")
         rung = "return document.querySelector('[data-panel=ladder] tbody th')?.textContent"

@@ -5,7 +5,6 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,6 @@ pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[ap
 POSES, TARGETS = 30, 2
 TOO_LARGE = str(2 << 30)
 STARTING = ("waiting for a free core", "diagnose")  # what a job says before its process does
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with serving(tmp_path_factory.mktemp("sessions")) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -82,6 +82,7 @@ LINK_BENDING = Effect(
     long_links,
     link_columns,
     positive=True,
+    follows="load",
 )
 
 
@@ -110,6 +111,8 @@ BASE_FLEX = Effect(
     lambda scene: ("frame",),
     base_columns,
     positive=True,
+    moves="foot",
+    follows="load",
 )
 
 
@@ -147,4 +150,6 @@ TOOL_FLEX = Effect(
     tool_columns,
     choices=lambda scene, place: ({"lever": 0.0}, {"lever": 1.0}, {"lever": 2.0}),
     typical=5e-3,
+    moves="tool",
+    follows="attitude",
 )

@@ -16,11 +16,13 @@ from minimax_cal.modelling.effects.scene import (
     mask_of,
     one_joint,
     principal,
+    turning,
     unmasked,
 )
 
 FELT = 1e-3  # share of the largest torque's variation below which a joint carries nothing
 GROUPS = ("upper arm", "forearm", "wrist")  # two links each
+ALIKE = 0.2  # share of a neighbour's torque that must differ from a joint's own
 WHOLE = 3  # stands for all links together
 
 
@@ -99,7 +101,53 @@ JOINT_COMPLIANCE = Effect(
     columns,
     choices=parts_of,
     positive=True,
+    follows="load",
 )
+
+
+def neighbours(scene: Scene, place: str) -> Sequence[Choice]:
+    """The loaded joints next to one, whose torques its own does not follow."""
+    j, heavy = joint_of(place), loaded(scene)
+    own = np.stack([np.ones(scene.poses), scene.gravity[j]])
+    basis = np.linalg.qr(own.T)[0]
+    out = []
+    for i in (j - 1, j + 1):
+        if i in heavy:
+            torque = scene.gravity[i]
+            rest = torque - basis @ (basis.T @ torque)
+            if np.linalg.norm(rest) > ALIKE * np.linalg.norm(torque - torque.mean()):
+                out.append({"source": i + 1.0})
+    return tuple(out)
+
+
+def crossed(scene: Scene, place: str, choice: Choice) -> Columns:
+    """dq_j = c tau_i, i = source."""
+    j, i = joint_of(place), int(choice["source"]) - 1
+    turn = one_joint(scene, j, scene.gravity[i][None])
+    shapes = principal(scene.gravity_parts[:, i])
+    doubt = np.concatenate([turn[:0], *(one_joint(scene, j, shape[None]) for shape in shapes)])
+    fixed = {"source_joint": i + 1.0}
+    return Columns((f"c{j + 1}{i + 1}",), ("rad/(N m)",), turn, doubt=(doubt,), fixed=fixed)
+
+
+CROSS_COMPLIANCE = Effect(
+    "cross_compliance",
+    "a joint gives way to the load of its neighbour",
+    "dq_j = c tau_i(q), i next to j",
+    lambda scene: (
+        tuple(f"J{j + 1}" for j in turning(scene) if neighbours(scene, f"J{j + 1}"))
+        if scene.known_masses or scene.measured_torques
+        else ()
+    ),
+    crossed,
+    needs=lambda scene: (
+        "" if scene.known_masses or scene.measured_torques
+        else "mass_kg and com_mm in the robot file, or columns tau1_Nm ..."
+    ),
+    choices=neighbours,
+    follows="load",
+    typical=1e-6,
+)  # fmt: skip
 
 
 def lean(scene: Scene) -> Array:
@@ -111,16 +159,18 @@ def lean(scene: Scene) -> Array:
 
 
 def spring(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_2 = k sin(b) (1 - s0 / s), s^2 = a^2 + L^2 - 2 a L cos b.
+    """dq_j = k sin(b) (1 - s0 / s), s^2 = a^2 + L^2 - 2 a L cos b.
 
-    b: lean of the upper arm less the spring's own zero.  Its eye sits at `eye` and its free length
-    is `rest`, both in units of the distance L from the joint to its anchor.
+    b: of joint 2 the lean of the upper arm, of another its own angle, less the spring's zero, where
+    its eye is nearest to its anchor.  The eye sits at `eye` and the free length is `rest`, both in
+    units of the distance L from the joint to its anchor.
     """
-    angle = lean(scene) - choice["zero"]
+    joint = joint_of(place)
+    angle = (lean(scene) if joint == 1 else scene.q[joint]) - choice["zero"]
     a, rest = choice["eye"], choice["rest"]
     length = np.sqrt(1.0 + a * a - 2.0 * a * np.cos(angle))
     pull = np.sin(angle) * (1.0 - rest / length)
-    return Columns(("k",), ("rad",), one_joint(scene, 1, pull[None]), fixed=dict(choice))
+    return Columns(("k",), ("rad",), one_joint(scene, joint, pull[None]), fixed=dict(choice))
 
 
 def springs(zeros: Sequence[float], eyes: Sequence[float], rests: Sequence[float]) -> list[Choice]:
@@ -137,20 +187,29 @@ def finer_spring(scene: Scene, choice: Choice) -> Sequence[Choice]:
 
 
 def spring_places(scene: Scene) -> tuple[str, ...]:
-    """Joint 2, where it swings in a vertical plane."""
-    if scene.joints < 3 or scene.robot.prismatic[1]:
+    """Joints 2 and 3, where they swing in a vertical plane."""
+    if scene.joints < 3:
         return ()
-    level = np.abs((scene.links.z[1] * scene.robot.up[:, None]).sum(axis=0)).max() < 0.5
-    return ("J2",) if level and np.ptp(lean(scene)) > 0.1 else ()
+    level = np.abs((scene.links.z[1:3] * scene.robot.up[:, None]).sum(axis=1)).max(axis=1) < 0.5
+    swing = np.ptp(lean(scene)) > 0.1, np.ptp(scene.q[2]) > SWING
+    turns = ~scene.robot.prismatic[1:3]
+    return tuple(f"J{i + 2}" for i in range(2) if turns[i] and level[i] and swing[i])
+
+
+# Where a spring is shortest: the arm upright, or hanging (its anchor on the other side); of another
+# joint than the second, which tells no direction by itself, all round.
+ZEROS = {True: (-0.25, 0.0, 0.25, np.pi), False: (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)}
+SWING = 0.5  # least range of a joint other than the second [rad]
 
 
 GRAVITY_COMPENSATOR = Effect(
     "gravity_compensator",
-    "the spring that balances the upper arm",
-    "dq_2 = k a L sin(q_2 - phi) (1 - s_0/s)",
+    "the spring that balances the upper arm, or the forearm",
+    "dq_j = k a L sin(q_j - phi) (1 - s_0/s)",
     spring_places,
     spring,
-    choices=lambda scene, place: springs((-0.25, 0.0, 0.25), (0.4, 0.55), (0.45, 0.65)),
+    choices=lambda scene, place: springs(ZEROS[place == "J2"], (0.4, 0.55), (0.45, 0.65)),
     finer=finer_spring,
     typical=1e-2,
+    follows="angle",
 )

@@ -73,6 +73,7 @@ GEAR_ERROR = Effect(
     ],
     lines=True,
     typical=5e-4,
+    follows="angle",
 )
 
 
@@ -93,6 +94,7 @@ GEAR_RIPPLE = Effect(
     choices=ratios,
     lines=True,
     typical=5e-4,
+    follows="wave",
 )
 
 
@@ -111,6 +113,8 @@ ENCODER_GAIN = Effect(
     gain,
     choices=lambda scene, place: [at_all(place, sweeping(scene))],
     typical=1e-3,
+    follows="angle",
+    linear=True,
 )
 
 
@@ -135,6 +139,8 @@ JOINT_COUPLING = Effect(
     coupling,
     choices=sources,
     typical=1e-2,
+    follows="source",
+    linear=True,
 )
 
 
@@ -175,12 +181,33 @@ BACKLASH = Effect(
     ),
     choices=lambda scene, place: [at_all(place, moved(scene, "approach"))],
     typical=1e-3,
+    follows="approach",
 )  # fmt: skip
 
 
 def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = e (q_n - q_(n-1)), or the same moves counted up to a limit."""
-    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
+    most = choice.get("limit", np.inf)
+    return turns_by(
+        scene, joints_at(place, choice), np.clip(scene.each("move"), -most, most), "e", "1"
+    )
+
+
+def limits(scene: Scene, place: str) -> Sequence[Choice]:
+    """Every move in full, or counted up to a limit, of which most moves are on either side."""
+    joints = moved(scene, "move")
+    each = [at_all(place, joints)]
+    if place != "all":
+        usual = float(np.median(np.abs(scene.each("move")[joint_of(place)])))
+        each += [{"limit": usual}] if usual > 0.0 else []
+    return each
+
+
+def shorter(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Limits near one that was chosen."""
+    if "limit" not in choice:
+        return ()
+    return tuple({**choice, "limit": choice["limit"] * f} for f in (0.5, 0.7, 1.4, 2.0))
 
 
 SETTLING = Effect(
@@ -192,6 +219,8 @@ SETTLING = Effect(
     needs=lambda scene: (
         "" if moved(scene, "move") else "the visit order (column order)" + scene.untold
     ),
-    choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
+    choices=limits,
+    finer=shorter,
     typical=1e-2,
+    follows="move",
 )

@@ -84,6 +84,7 @@ JOINT_ERROR_MAP = Effect(
     error_map,
     choices=usual,
     is_map=True,
+    follows="angle",
 )
 
 

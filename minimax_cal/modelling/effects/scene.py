@@ -259,6 +259,12 @@ Choice = Mapping[str, float]  # what picks one variant of a law, as {"turns": 2}
 PLAIN: tuple[Choice, ...] = ({},)
 
 
+MOVED = ("arm", "foot", "frame", "tool", "target", "instrument")
+DRIVERS = (  # "" stands for a joint's own value, whatever else there is
+    "", "angle", "wave", "source", "load", "approach", "move", "time", "attitude", "sight",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Effect:
     """A physical cause.
@@ -273,6 +279,13 @@ class Effect:
     typical: usual size of a parameter; far larger ones are believed less [SI].
     is_map: whether its parameters are those of a free curve, told by the curve; sought when causes
     with a formula are known.
+    moves: what it moves, one of MOVED: the arm itself, its foot with it, the arm's frame as the
+    instrument sees it, the tool or reflectors beyond the flange, or only what is read.
+    follows: what drives it, one of DRIVERS, by which its curve is drawn; `angle` and `wave` mean
+    the joint's own angle and nothing else.
+    linear: whether a constant turn belongs to what drives it, and is geometry.
+    against: label and (m,) values of the curve's axis, for a joint and a choice, where DRIVERS has
+    none that fits.
     """
 
     name: str
@@ -287,6 +300,25 @@ class Effect:
     lines: bool = False
     typical: float = np.inf
     is_map: bool = False
+    moves: str = "arm"
+    follows: str = ""
+    linear: bool = False
+    against: Callable[[Scene, int, Choice], tuple[str, Array]] | None = None
+
+    @property
+    def of_flange(self) -> bool:
+        """Whether the flange moves in the arm's own base, and not only what is seen of it."""
+        return self.moves in ("arm", "foot")
+
+    @property
+    def of_base(self) -> bool:
+        """Whether it moves the robot's foot."""
+        return self.moves in ("foot", "frame")
+
+    @property
+    def of_angle(self) -> bool:
+        """Whether it is a function of its joint's own angle."""
+        return self.follows in ("angle", "wave")
 
 
 def joint_of(place: str) -> int:

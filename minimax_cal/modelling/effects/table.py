@@ -13,7 +13,11 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
-from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.compliance import (
+    CROSS_COMPLIANCE,
+    GRAVITY_COMPENSATOR,
+    JOINT_COMPLIANCE,
+)
 from minimax_cal.modelling.effects.gears import (
     BACKLASH,
     ENCODER_GAIN,
@@ -23,20 +27,23 @@ from minimax_cal.modelling.effects.gears import (
     SETTLING,
 )
 from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
-from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
+from minimax_cal.modelling.effects.scene import DRIVERS, MOVED, Choice, Columns, Effect, Scene
 from minimax_cal.modelling.effects.time import (
     FRAME_DRIFT,
     SESSION_JUMP,
     TARGET_OFFSET,
+    TARGET_RESEAT,
     TARGET_SHIFT,
     THERMAL_GROWTH,
 )
+from minimax_cal.modelling.effects.wobble import AXIS_WOBBLE
 from minimax_cal.robots import kinematics
 
 EFFECTS: dict[str, Effect] = {
     effect.name: effect
     for effect in (
         JOINT_COMPLIANCE,
+        CROSS_COMPLIANCE,
         GRAVITY_COMPENSATOR,
         LINK_BENDING,
         BASE_FLEX,
@@ -46,12 +53,14 @@ EFFECTS: dict[str, Effect] = {
         ENCODER_GAIN,
         JOINT_ERROR_MAP,
         JOINT_COUPLING,
+        AXIS_WOBBLE,
         BACKLASH,
         SETTLING,
         THERMAL_GROWTH,
         FRAME_DRIFT,
         SESSION_JUMP,
         TARGET_SHIFT,
+        TARGET_RESEAT,
         TARGET_OFFSET,
     )
 }
@@ -60,10 +69,17 @@ EFFECTS: dict[str, Effect] = {
 def register(effect: Effect) -> Effect:
     """Add an effect of one's own to the library of this process.
 
-    effect: its law gives metres and radians per unit of each parameter.  Returns it.
+    effect: its law gives metres and radians per unit of each parameter.  Returns it.  Raises
+    OptionError for facts that are none.
 
     >>> mc.register(effect)
     """
+    for fact, known in (("moves", MOVED), ("follows", DRIVERS)):
+        if getattr(effect, fact) not in known:
+            told = ", ".join(filter(None, known))
+            raise OptionError(
+                f"effect {effect.name}: {fact} {getattr(effect, fact)!r}; choose {told}"
+            )
     EFFECTS[effect.name] = effect
     return effect
 
@@ -172,8 +188,11 @@ def terms(
     return tuple(out)
 
 
-FREE = frozenset({"turns", "constant", "since", "zero", "eye", "rest",
-                  "low", "high", "length", "size"})  # any number will do  # fmt: skip
+CONSTANTS = frozenset({"constant", "fast", "slow"})  # of time, above 0; infinite is straight
+FREE = frozenset({  # any number will do
+    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest", "limit",
+    "low", "high", "length", "size",
+})  # fmt: skip
 
 
 def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choice, ...]:
@@ -187,8 +206,8 @@ def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choic
         if key in known - FREE and value not in listed:
             offer = ", ".join(f"{number:g}" for number in listed)
             raise OptionError(f"effect {text!r}: no {key} {value:g}; choose {offer}")
-        low = 0.0 if key == "constant" else -np.inf
-        if not (value > low and (np.isfinite(value) or key == "constant")):
+        low = 0.0 if key in CONSTANTS else -np.inf
+        if not (value > low and (np.isfinite(value) or key in CONSTANTS)):
             raise OptionError(f"effect {text!r}: {key} {value:g} is not possible")
     fitting = [c for c in choices if given.keys() <= c.keys()] if choices else [{}]
     if not fitting:

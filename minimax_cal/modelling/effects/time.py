@@ -13,6 +13,7 @@ from minimax_cal.robots.kinematics import cross
 
 CONSTANTS = (0.15, 0.5, np.inf)  # of the session; infinite is a straight line
 FINER = np.array([0.5, 0.65, 0.8, 0.9, 1.1, 1.25, 1.5, 2.0])
+TWO = {"fast": 0.15, "slow": np.inf}  # two constants: one settles fast, the other slowly
 ROOM = 20.0  # temperature at which lengths are what they are called [C]
 STEPS = 12  # moments at which a nest may have moved
 
@@ -30,6 +31,13 @@ def course(scene: Scene, choice: Choice) -> Array:
         return np.where(np.isfinite(warm), warm, known.mean()) - ROOM
     clock, constant = scene.column("clock"), choice["constant"]
     return clock if np.isinf(constant) else np.asarray(1.0 - np.exp(-clock / constant))
+
+
+def paths(scene: Scene, choice: Choice) -> list[Array]:
+    """The course, or a fast and a slow one where a law has two constants."""
+    if "slow" not in choice:
+        return [course(scene, choice)]
+    return [course(scene, {"constant": choice[which]}) for which in ("fast", "slow")]
 
 
 def courses(scene: Scene, place: str) -> Sequence[Choice]:
@@ -64,11 +72,13 @@ def growth(scene: Scene, place: str, choice: Choice) -> Columns:
     a, d = scene.robot.mdh[:, 0], scene.robot.mdh[:, 1]
     along = np.stack([a[:, None, None] * scene.links.x, d[:, None, None] * scene.links.z], axis=1)
     size = np.stack([np.abs(a), np.abs(d)], axis=1)
-    grown = course(scene, choice) * along
     if not choice.get("apart"):
-        common = grown[size > 0.1 * scene.robot.reach()].sum(axis=0)
-        shift = np.broadcast_to(common, (1, *scene.points.shape))
-        return Columns(("strain",), ("1",), shift=shift, fixed=told(choice))
+        long = along[size > 0.1 * scene.robot.reach()].sum(axis=0)
+        parts = paths(scene, choice)
+        shift = np.stack([np.broadcast_to(one * long, scene.points.shape) for one in parts])
+        names = ("strain", "slow strain")[: len(parts)]
+        return Columns(names, ("1",) * len(parts), shift=shift, fixed=told(choice))
+    grown = course(scene, choice) * along
     chosen = sorted(np.argsort(-size.reshape(-1))[:3].tolist())
     names = tuple(f"strain {'ad'[i % 2]}{i // 2 + 1}" for i in chosen)
     parts = grown.reshape(-1, *grown.shape[2:])[chosen]
@@ -87,9 +97,11 @@ THERMAL_GROWTH = Effect(
         "" if courses(scene, "all") else "columns time_s, order or temperature_C" + scene.untold
     ),
     choices=lambda scene, place: tuple(
-        {**choice, "apart": apart} for choice in courses(scene, place) for apart in (0.0, 1.0)
+        [{**choice, "apart": apart} for choice in courses(scene, place) for apart in (0.0, 1.0)]
+        + ([{**TWO, "apart": 0.0}] if scene.has("clock") else [])
     ),
     typical=1e-3,
+    follows="time",
 )
 
 
@@ -105,9 +117,10 @@ def rigid(scene: Scene) -> Array:
 
 def drift(scene: Scene, place: str, choice: Choice) -> Columns:
     """The base moves and turns with time."""
-    return Columns(
-        RIGID, RIGID_UNITS, shift=course(scene, choice) * rigid(scene), fixed=told(choice)
-    )
+    parts = [one * rigid(scene) for one in paths(scene, choice)]
+    names = (*RIGID, *(f"slow {name}" for name in RIGID))[: 6 * len(parts)]
+    units = RIGID_UNITS * len(parts)
+    return Columns(names, units, shift=np.concatenate(parts), fixed=told(choice))
 
 
 FRAME_DRIFT = Effect(
@@ -118,8 +131,10 @@ FRAME_DRIFT = Effect(
     drift,
     finer=finer,
     needs=lambda scene: "" if scene.has("clock") else "column order or time_s" + scene.untold,
-    choices=lambda scene, place: tuple(c for c in courses(scene, place) if "constant" in c),
+    choices=lambda scene, place: (*(c for c in courses(scene, place) if "constant" in c), TWO),
     typical=1e-2,
+    moves="frame",
+    follows="time",
 )
 
 
@@ -157,6 +172,46 @@ TARGET_SHIFT = Effect(
     ),
     choices=moments,
     typical=5e-3,
+    moves="target",
+    follows="time",
+)
+
+
+def plate(scene: Scene, place: str, choice: Choice) -> Columns:
+    """All targets sit elsewhere from a moment on: the plate as a body, or (`apart`) each nest."""
+    after = (scene.column("clock") >= choice["since"]).astype(float)
+    axes, fixed = scene.links.axes, {"since": choice["since"]}
+    if choice["apart"]:
+        shift = np.zeros((scene.targets, 3, *scene.points.shape))
+        for target in range(scene.targets):
+            shift[target, :, target] = after * axes
+        names = tuple(f"{name} {axis}" for name in scene.data.target_names for axis in "xyz")
+        whole = shift.reshape(-1, *scene.points.shape)
+        return Columns(names, ("m",) * len(names), shift=whole, fixed=fixed)
+    moved = np.broadcast_to(axes[:, None], (3, *scene.points.shape))
+    arm = scene.points - scene.links.origin
+    turned = cross(moved, np.broadcast_to(arm, moved.shape))
+    return Columns(RIGID, RIGID_UNITS, shift=after * np.concatenate([moved, turned]), fixed=fixed)
+
+
+def reseats(scene: Scene, place: str) -> Sequence[Choice]:
+    """Moments, the plate as a body where the targets show its turn."""
+    apart = (0.0,) if scene.targets > 2 else (1.0,)
+    return tuple({**choice, "apart": a} for choice in moments(scene, place) for a in apart)
+
+
+TARGET_RESEAT = Effect(
+    "target_reseat",
+    "the plate of the reflectors, or all of them, seated anew during the session",
+    "all targets sit elsewhere on the flange after row k",
+    lambda scene: ("all",) if scene.has("clock") else (),
+    plate,
+    finer=finer,
+    needs=lambda scene: "" if scene.has("clock") else "column order or time_s" + scene.untold,
+    choices=reseats,
+    typical=5e-3,
+    moves="target",
+    follows="time",
 )
 
 
@@ -184,6 +239,8 @@ SESSION_JUMP = Effect(
     needs=lambda scene: "" if scene.has("clock") else "column order or time_s",
     choices=lambda scene, place: (),  # its moment is read off the errors: `faults.jumps`
     typical=1e-2,
+    moves="frame",
+    follows="time",
 )
 
 
@@ -204,4 +261,6 @@ TARGET_OFFSET = Effect(
     lambda scene: (*scene.data.target_names, "all") if scene.targets > 1 else ("all",),
     sight,
     typical=5e-3,
+    moves="instrument",
+    follows="sight",
 )

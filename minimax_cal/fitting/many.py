@@ -1,0 +1,61 @@
+"""Many calibrations at once: one process a core, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.optional import optional
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.robot import Robot, load_robot
+
+Data = Measurements | str | Path | tuple[ArrayLike, ArrayLike]
+INSTALL = "minimax-cal[experiments]"
+
+
+def calibrate_many(
+    robots: Robot | str | Path | Sequence[Robot | str | Path],
+    data: Sequence[Data],
+    *,
+    jobs: int = -1,
+    cluster: str = "",
+    **options: Any,
+) -> tuple[Fit | CalibrationError, ...]:
+    """Calibrate from many sets of measurements.
+
+    robots: one for all, or one for each set.  data: as `calibrate` takes each.  jobs: processes, -1
+    for one a core, 1 for this one alone.  cluster: address of a Dask scheduler, as
+    tcp://host:port, whose workers then do it.  options: of `calibrate`, for all.  Returns a fit for
+    each set in its order, or the error that says why there is none.  Raises OptionError.
+
+    >>> fits = mc.calibrate_many("irb120", ["monday.csv", "friday.csv"], objective="sum")
+    """
+    arms = [robots] * len(data) if isinstance(robots, Robot | str | Path) else list(robots)
+    if len(arms) != len(data):
+        raise CalibrationError(f"{len(arms)} robots for {len(data)} data sets; give one for each")
+    loaded = [arm if isinstance(arm, Robot) else load_robot(arm) for arm in arms]
+    if jobs == 1 and not cluster:
+        return tuple(one(arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True))
+    joblib = optional("joblib", "calibrate_many in several processes", INSTALL)
+    work = [
+        joblib.delayed(one)(arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True)
+    ]
+    if not cluster:
+        return tuple(joblib.Parallel(n_jobs=jobs)(work))
+    distributed = optional("distributed", "a Dask cluster", "minimax-cal[distributed]")
+    with distributed.Client(cluster), joblib.parallel_config(backend="dask"):
+        return tuple(joblib.Parallel()(work))
+
+
+def one(robot: Robot, data: Data, options: dict[str, Any]) -> Fit | CalibrationError:
+    """A fit, or the error that says why there is none."""
+    try:
+        return calibrate(robot, data, **options)
+    except CalibrationError as error:
+        return error
