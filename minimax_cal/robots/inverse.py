@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots import kinematics
@@ -36,6 +35,8 @@ def missing(
     counts as [m]; with 0 the place alone counts, r = 3, else r = 6.  spot: (3,) that shall be at
     the goal's origin, in the last frame [m].
     """
+    from scipy.spatial.transform import Rotation  # only who asks for joints waits for it
+
     links = kinematics.chain(mdh, q, prismatic)
     point = kinematics.points(links, spot[None])[0]
     slides = prismatic[:, None, None]

@@ -167,8 +167,3 @@ def shared_base(one: Array, other: Array) -> Array:
     stacked = np.vstack([eye - a[:3, :3] for a in one])
     rest = np.concatenate([a[:3, 3] - rotation @ b[:3, 3] for a, b in zip(one, other, strict=True)])
     return transform(rotation, np.linalg.lstsq(stacked, rest, rcond=1e-9)[0])
-
-
-def rotation_vector(rotation: Array) -> Array:
-    """Axis times angle of a rotation (3, 3) [rad]."""
-    return rotation_vector(rotation)

@@ -32,6 +32,7 @@ TEMPLATES = (
     "import tracker.csv -o out.csv --safe-cells",
     "compensate fit.json targets.csv -o out.csv",
     "compensate effects.json targets.csv --json",
+    "compensate fit.json weld.mod -o out.mod",
     "compensate truth.json targets.csv --robot ROBOT --safe-cells",
     "check fit.json data.csv --tolerance rms=0.3 --json",
     "check effects.json data.csv --tolerance max=5 -o out.json",

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.cli import main
@@ -80,6 +81,7 @@ def make() -> None:
     rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
     bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
     write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])
+    Path("weld.mod").write_text(module(robot, bent[:3]))
     semicolon = "\n".join(";".join(row).replace(".", ",") for row in rows)
     Path("tracker.csv").write_text(semicolon + "\n")
     rng = np.random.default_rng(0)
@@ -94,6 +96,19 @@ def make() -> None:
 def write(name: str, rows: list[list[str]]) -> None:
     """A CSV file."""
     Path(name).write_text("".join(",".join(row) + "\n" for row in rows))
+
+
+def module(robot: mc.Robot, joints: np.ndarray) -> str:
+    """A RAPID module that moves to some joints (m, n) as Cartesian targets."""
+    lines = ["MODULE Weld"]
+    for number, (place, q) in enumerate(zip(robot.pose(joints), joints, strict=True)):
+        x, y, z, w = Rotation.from_matrix(place[:3, :3]).as_quat()
+        parts = (1e3 * place[:3, 3], (w, x, y, z), np.floor(q[[0, 3, 5, 0]] / (0.5 * np.pi)))
+        told = ",".join(f"[{','.join(f'{v:.9g}' for v in part)}]" for part in parts)
+        lines.append(f"  CONST robtarget p{number}:=[{told},[9E9,9E9,9E9,9E9,9E9,9E9]];")
+    return "\n".join(
+        [*lines, "  PROC main()", "    MoveL p0,v100,fine,tool0;", "  ENDPROC", "ENDMODULE", ""]
+    )
 
 
 def toml(robot: dict[str, object]) -> str:

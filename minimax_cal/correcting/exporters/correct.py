@@ -15,6 +15,7 @@ import numpy as np
 from minimax_cal.correcting.exporters.job import Export, Job, is_identity, triple
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import (
     SAME,
@@ -23,7 +24,6 @@ from minimax_cal.robots.transforms import (
     from_rpy,
     inverse,
     link,
-    rotation_vector,
     shared_base,
     to_rpy,
     transform,

@@ -27,9 +27,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.robots.kinematics import hat
+from minimax_cal.robots.kinematics import hat, rotation_vector
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.transforms import rotation_vector
 from minimax_cal.solvers.least_squares import solve_normal
 
 LEVER = 0.1  # where nothing tells the ratio of the noises [m]

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.watched import Rows, Watched
+from minimax_cal.judging.watching.watched import PLENTY, Rows, Watched
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -116,7 +116,8 @@ def own_rows(fit: Fit, watched: Watched) -> Rows | None:
     if fit.data.poses < LEAST_OWN:
         return None
     everything = np.zeros(fit.known.names.count, dtype=bool)
-    own = replace(watched, cell=fit.cell, data=fit.data, foot=watched.foot[:0])
+    some = np.linspace(0, fit.data.poses - 1, min(fit.data.poses, PLENTY)).astype(int)
+    own = replace(watched, cell=fit.cell, data=fit.data.take(some), foot=watched.foot[:0])
     rows = own.rows(everything, fit.cell.state)
     return replace(rows, active=own.open)
 

@@ -15,7 +15,7 @@ from minimax_cal.judging.watching.watched import Rows, Watched
 from minimax_cal.solvers.least_squares import solve_normal
 
 OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases
-FEWEST = 2  # poses
+FEWEST, MOST = 2, 60  # poses among which is chosen
 TINY = 1e-30  # nothing is told
 
 
@@ -62,16 +62,18 @@ def prospects(watched: Watched, found: Search) -> tuple[dict[str, float], int | 
 def fewest(rows: Rows, zero: Array, wider: Array, level: float) -> int:
     """How many of the poses find SHIFT in every joint: those left out go one by one.
 
+    Of many, some are looked at; where those are not enough, it is all of them.
+
     The one without which the joint that is told least is told best goes first.
     """
-    gram, counts = rows.by_pose(zero)
+    gram, counts = rows.by_pose(zero, MOST)
     r, c = rows.latent.shape[1], len(zero)
     q = gram.shape[1] - c - 1  # what is free, and what was not known
     fixed = np.diag(np.pad(np.ones(r), (q - r, c + 1)))
     if foot := int(np.count_nonzero(rows.pose < 0)):
         last = replace(rows, pose=np.where(rows.pose < 0, 0, -1), error=np.zeros_like(rows.error))
         fixed = fixed + last.by_pose(zero)[0].sum(axis=0)
-    kept = np.arange(len(gram))
+    kept, many = np.arange(len(gram)), len(np.unique(rows.pose[rows.pose >= 0]))
     while len(kept) > FEWEST:
         without = fixed + gram[kept].sum(axis=0) - gram[kept]
         free, across = without[:, :q, :q], without[:, :q, q : q + c]
@@ -81,6 +83,6 @@ def fewest(rows: Rows, zero: Array, wider: Array, level: float) -> int:
         margin = np.array([critical(level, one) for one in dof]) + OF_POWER
         least = (margin[:, None] * wider / np.sqrt(np.maximum(told, TINY))).max(axis=1)
         if least.min() > SHIFT:
-            break
+            return len(kept) if len(kept) < len(gram) else many
         kept = np.delete(kept, np.argmin(least))
     return len(kept)

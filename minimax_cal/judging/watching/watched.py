@@ -24,6 +24,7 @@ from minimax_cal.modelling.model import Model, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.solvers import least_squares
 
+PLENTY = 500  # poses that tell what more would
 PLACINGS = 3  # passes that place an arm with effects
 
 
@@ -202,14 +203,16 @@ class Rows:
         rest = motion - basis @ (basis.T @ motion)
         return np.asarray(rest - basis @ (basis.T @ rest))  # twice is enough
 
-    def by_pose(self, columns: Array) -> tuple[Array, Array]:
+    def by_pose(self, columns: Array, most: int = PLENTY) -> tuple[Array, Array]:
         """Products of each pose's rows: (m, q, q), and its coordinates: (m,).
 
-        q: what is free, what was not known, some more parameters, and the error last.
+        q: what is free, what was not known, some more parameters, and the error last.  most: of
+        more poses so many are taken, evenly.
         """
         free, more = self.jacobian[:, self.active], self.jacobian[:, columns]
         every = np.concatenate([free, self.latent, more, self.error[:, None]], axis=1)
         poses = np.unique(self.pose[self.pose >= 0])
+        poses = poses[np.linspace(0, len(poses) - 1, min(len(poses), most)).astype(int)]
         parts = [every[self.pose == pose] for pose in poses]
         seen = [int(np.count_nonzero(part.any(axis=1))) for part in parts]
         return np.array([part.T @ part for part in parts]), np.array(seen, dtype=float)
