@@ -74,6 +74,8 @@ def probes(scene: Scene) -> Iterator[Probe]:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
         twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
+        fast = np.array([np.cos(np.pi * k * clock) for k in range(5, 13)])
+        yield Probe("the base to and fro", np.concatenate(twist[:2]), fast)
         yield Probe("the joints with time", scene.jacobian, np.array(course))
     yield from at_targets(scene, np.array(course))
 
