@@ -186,28 +186,8 @@ BACKLASH = Effect(
 
 
 def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = e (q_n - q_(n-1)), or the same moves counted up to a limit."""
-    most = choice.get("limit", np.inf)
-    return turns_by(
-        scene, joints_at(place, choice), np.clip(scene.each("move"), -most, most), "e", "1"
-    )
-
-
-def limits(scene: Scene, place: str) -> Sequence[Choice]:
-    """Every move in full, or counted up to a limit, of which most moves are on either side."""
-    joints = moved(scene, "move")
-    each = [at_all(place, joints)]
-    if place != "all":
-        usual = float(np.median(np.abs(scene.each("move")[joint_of(place)])))
-        each += [{"limit": usual}] if usual > 0.0 else []
-    return each
-
-
-def shorter(scene: Scene, choice: Choice) -> Sequence[Choice]:
-    """Limits near one that was chosen."""
-    if "limit" not in choice:
-        return ()
-    return tuple({**choice, "limit": choice["limit"] * f} for f in (0.5, 0.7, 1.4, 2.0))
+    """dq_j = e (q_n - q_(n-1))."""
+    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
 
 
 SETTLING = Effect(
@@ -219,8 +199,7 @@ SETTLING = Effect(
     needs=lambda scene: (
         "" if moved(scene, "move") else "the visit order (column order)" + scene.untold
     ),
-    choices=limits,
-    finer=shorter,
+    choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
     typical=1e-2,
     follows="move",
 )

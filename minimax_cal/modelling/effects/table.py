@@ -190,7 +190,7 @@ def terms(
 
 CONSTANTS = frozenset({"constant", "fast", "slow"})  # of time, above 0; infinite is straight
 FREE = frozenset({  # any number will do
-    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest", "limit",
+    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest",
     "low", "high", "length", "size",
 })  # fmt: skip
 
