@@ -43,8 +43,8 @@ autodoc_type_aliases = {"Array": "Array", "Matrix": "Matrix"}
 maximum_signature_line_length = 100
 toc_object_entries_show_parents = "hide"
 
-# Two examples are run at each build; what else lies beside them is not for the gallery.
-executed_examples = "calibrate_and_judge|diagnose_a_gap"
+# These examples are run at each build; what else lies beside them is not for the gallery.
+executed_examples = "calibrate_and_judge|diagnose_a_gap|tracker_to_report|papers_compared"
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "examples",

@@ -61,6 +61,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
     ),
+    "machine_gap": (
+        "experiments.machine_gap",
+        "The same on arms as shops have them: more makes, worse conditions, other forms of laws",
+    ),
     "relative": (
         "experiments.relative",
         "What lengths, closures and poses tell beside a tracker, and how true their positions are",
@@ -84,6 +88,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
     "coverage": (
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
+    ),
+    "watch": (
+        "experiments.watch",
+        "Is a shifted joint found by ten poses, and how often is one named that did not move",
     ),
     "errata": ("experiments.errata", "What is wrong in the papers as printed, by counter-example"),
     "simulator_gap": (

@@ -273,7 +273,7 @@ def pairing(truth: Sequence[Name], sets: Sequence[Sequence[Name]]) -> int:
 
 def score(case: Case, truth: Truth, said: Row) -> Row:
     """What an answer is worth, as plain data.  said: the JSON of a diagnosis."""
-    effects = said.get("effects", [])
+    effects = [effect for effect in said.get("effects", []) if effect.get("established", True)]
     names = [(str(e["effect"]), str(e["place"])) for e in effects]
     sets = [
         [name, *((str(a["effect"]), str(a["place"])) for a in e.get("alternatives", []))]

@@ -264,7 +264,7 @@ def twist(six: Array) -> Array:
 def frames(robot: Robot, q: Array, deviation: Deviation | None = None) -> Array:
     """Poses of all frames in the base, the base's own first: (m, n + 1, 4, 4) [m].
 
-    q: (m, n) [rad].  A deviation of joints, lengths and links is taken into account.
+    q: (m, n) [rad, m].  A deviation of joints, lengths and links is taken into account.
     """
     m = len(q)
     pose = np.broadcast_to(np.eye(4, dtype=q.dtype), (m, 4, 4))
@@ -273,8 +273,10 @@ def frames(robot: Robot, q: Array, deviation: Deviation | None = None) -> Array:
         dq = deviation.joints[:, i] if deviation else 0.0
         da, dd = deviation.lengths[:, i].T if deviation else (0.0, 0.0)
         zero = np.zeros(m)
-        step = np.stack([zero + a + da, zero, zero + d + dd], axis=-1)
-        link = turn(2, theta + robot.sign[i] * (q[:, i] + dq)) @ shift(step)
+        own = robot.sign[i] * (q[:, i] + dq)
+        turned, slid = (0.0, own) if robot.prismatic[i] else (own, 0.0)
+        step = np.stack([zero + a + da, zero, zero + d + dd + slid], axis=-1)
+        link = turn(2, zero + theta + turned) @ shift(step)
         pose = pose @ link @ turn(0, alpha) @ turn(1, beta)
         if deviation and deviation.links[:, i].any():
             pose = pose @ twist(deviation.links[:, i])
@@ -327,7 +329,8 @@ def jacobians(world: World) -> tuple[Array, Array]:
     turned, origin = pose[:, :, :3, :3], pose[:, :, :3, 3]
     points = np.einsum("mij,kj->mki", turned[:, -1], world.spots) + origin[:, -1, None]
     z, y = turned[:, :-1, :, 2], turned[:, 1:, :, 1]
-    across = turn(2, robot.mdh[:, 2] + robot.sign * world.q)[..., :3, 0]
+    turned_by = np.where(robot.prismatic, 0.0, robot.sign * world.q)
+    across = turn(2, robot.mdh[:, 2] + turned_by)[..., :3, 0]
     x = np.einsum("mnij,mnj->mni", turned[:, :-1], across)
 
     def about(axis: Array, through: Array) -> Array:
@@ -347,7 +350,8 @@ def jacobians(world: World) -> tuple[Array, Array]:
         own = np.zeros((len(points), k, 3, 3))
         own[:, target] = turned[:, -1]
         parts.append(own)
-    return np.concatenate(parts, axis=-1), theta * robot.sign
+    moved = np.where(robot.prismatic, along(z), theta)
+    return np.concatenate(parts, axis=-1), moved * robot.sign
 
 
 # ---- detectability -----------------------------------------------------------------------------

@@ -27,6 +27,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.judging.saved import evaluate
     from minimax_cal.judging.standard import iso9283
     from minimax_cal.judging.tradeoff import tradeoff
+    from minimax_cal.judging.watching.comparison import compare
+    from minimax_cal.judging.watching.health import check
     from minimax_cal.measuring import datasets
     from minimax_cal.measuring.importers import import_files
     from minimax_cal.measuring.measurements import (
@@ -39,6 +41,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
     from minimax_cal.planning.plan import plan
+    from minimax_cal.reporting.fleet.overview import fleet
     from minimax_cal.reporting.report import report
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
     from minimax_cal.simulators.commands import load_commands
@@ -69,11 +72,14 @@ __all__ = [
     "builtin_robots",
     "calibrate",
     "calibrate_many",
+    "check",
+    "compare",
     "compensate",
     "datasets",
     "diagnose",
     "evaluate",
     "export",
+    "fleet",
     "import_files",
     "iso9283",
     "load_cell",
@@ -124,6 +130,8 @@ MODULES = {  # name: where it is defined
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",
+    "check": "judging.watching.health",
+    "compare": "judging.watching.comparison",
     "iso9283": "judging.standard",
     "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",
@@ -135,6 +143,7 @@ MODULES = {  # name: where it is defined
     "SimulatorGap": "simulators.result",
     "load_commands": "simulators.commands",
     "simulator_gap": "simulators.ladder",
+    "fleet": "reporting.fleet.overview",
     "report": "reporting.report",
 }
 

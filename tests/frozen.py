@@ -32,7 +32,7 @@ SHARED = ROOT.parent / "shared" / "data"
 STORE = ROOT / "results" / "frozen"
 REAL = ("fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b")
 OBJECTIVES = ("minimax", "sum", "point", "pose", "smr:2")
-FORMATS = ("urdf", "ur-yaml", "ros-yaml", "dh-csv", "json", "moc", "mjcf")
+FORMATS = ("urdf", "ur-yaml", "ros-yaml", "ros2-control", "dh-csv", "json", "moc", "mjcf")
 TIMES = {"seconds", "versions", "date", "cpu_seconds"}  # keys that no two runs share
 ADDED = {"arrays", "widening", "size"}  # keys that only the later revision has
 RENAMED: dict[str, str] = {}  # words of the earlier revision that were renamed on purpose
@@ -103,6 +103,8 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
         "plan", arm, "--poses", "4", "--fit", "plain.json", "--candidates", "40",
         "--separate", "joint_compliance:J2", "link_bending:L2", "--json",
     ]  # fmt: skip
+    yield "check", ["check", "plain.json", poses, "--tolerance", "rms 0.5", "--json"]
+    yield "compare", ["compare", "plain.json", "base.json", "--json"]
     yield "tradeoff", ["tradeoff", arm, poses, "--steps", "3", "--json"]
     yield "effects", ["effects", arm, poses, "--json"]
     yield "robots", ["robots", "--json"]

@@ -2,10 +2,11 @@
 
     python tests/mutants.py minimax_cal/robots/kinematics.py tests/robots/test_kinematics.py
     python tests/mutants.py MODULE TEST... --count 20 --seed 1
+    python tests/mutants.py MODULE TEST... --line 88  # of the same sample, those of a line
 
 A seeded sample of changes: another comparison, sign, operation, number, truth value or extreme.
-Each is run in a copy of the project; a test that fails, or runs twenty times as long, has killed
-it.
+Each is run in a copy of the project; a test that fails, or runs six times as long, has killed
+it.  Processes fork from one that has the libraries loaded.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import multiprocessing
 import os
 import random
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,7 +25,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PATIENCE = 20.0  # times what the tests take without a fault
+PATIENCE = 6.0  # times what the tests take without a fault
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(
+    ["pytest", "_pytest.assertion.rewrite", "numpy.testing", "scipy.optimize",
+     "scipy.stats", "scipy.spatial", "scipy.cluster.vq", "pydantic", "click", "yaml", "daqp"]
+)  # fmt: skip
 COMPARISONS = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -113,19 +119,29 @@ def mutants(source: str) -> list[tuple[int, str, str]]:
     ]
 
 
-def noticed(tree: Path, tests: list[str], limit: float) -> str:
+def tested(tree: str, tests: list[str], keep: bool) -> None:
+    """Run tests of a tree in a process of their own.  keep: the compiled modules."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.chdir(tree)
+    os.environ |= {"PYTHONPATH": tree} | ({} if keep else {"PYTHONDONTWRITEBYTECODE": "1"})
+    sys.path.insert(0, tree)
+    sys.dont_write_bytecode = not keep
+    import pytest
+
+    sys.exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests])))
+
+
+def noticed(tree: Path, tests: list[str], limit: float, keep: bool = False) -> str:
     """'' if the tests pass in a tree, else how they noticed."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
-    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    place = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
-    try:
-        done = subprocess.run(
-            command, cwd=tree, env=os.environ | threads | place, timeout=limit,
-            capture_output=True, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
+    process = SERVER.Process(target=tested, args=(str(tree), tests, keep))
+    process.start()
+    process.join(limit)
+    if process.exitcode is None:
+        process.kill()
         return "time"
-    return "failed" if done.returncode else ""
+    return "failed" if process.exitcode else ""
 
 
 def main() -> None:
@@ -135,19 +151,22 @@ def main() -> None:
     parser.add_argument("tests", nargs="+")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--line", type=int, action="append", help="those of the sample alone")
     chosen = parser.parse_args()
     source = (ROOT / chosen.module).read_text()
     every = mutants(source)
     sample = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
+    sample = [each for each in sample if not chosen.line or each[0] in chosen.line]
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         shutil.copytree(
             ROOT, tree, ignore=shutil.ignore_patterns(".git", ".venv*", "results", "__pycache__")
         )
         began = time.perf_counter()
-        if said := noticed(tree, chosen.tests, 3600.0):
+        if said := noticed(tree, chosen.tests, 3600.0, keep=True):
             raise SystemExit(f"the tests {said} without any fault")
-        limit = PATIENCE * (time.perf_counter() - began)
+        limit = max(60.0, PATIENCE * (time.perf_counter() - began))
         survivors = []
         for line, what, mutated in sorted(sample):
             (tree / chosen.module).write_text(mutated)

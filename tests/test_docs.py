@@ -366,7 +366,7 @@ def chunks(text: str) -> Iterator[list[str]]:
     yield chunk
 
 
-RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md"]
+RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md"]
 
 
 @pytest.mark.parametrize("name", RUN)
@@ -418,3 +418,15 @@ def test_a_wrong_number_is_noticed() -> None:
     assert not same("2.59e-06", "2.59e-07")
     assert not same("33", "34")
     assert not printed(["RMS", "1.653"], ["RMS", "error", "1.653"])
+
+
+def test_every_picture_is_made_by_a_command() -> None:
+    """README's and the pages' pictures stand in `docs/pictures.py`; those of studies are theirs."""
+    scope = runpy.run_path(str(DOCS / "pictures.py"), run_name="pictures")
+    pages = "".join(page.read_text() for page in (*PAGES, ROOT / "README.md"))
+    shown = re.findall(r"!\[[^]]*\]\((?:[\w./]*/)?([\w.]+)\)", pages)
+    assert set(shown) == {*scope["OWN"], *scope["STUDIES"]}
+    for study, figure in scope["STUDIES"].values():
+        folder = figure.rpartition("/")[0]  # `papers` runs others, each in a folder of its name
+        for name in filter(None, (study, folder)):
+            assert (ROOT / "experiments" / f"{name}.py").exists(), name

@@ -21,6 +21,7 @@ FOLDERS = (
     "correcting",
     "simulators",
     "reporting",
+    "serving",
     "cli",
 )
 MODULES = sorted((ROOT / "minimax_cal").rglob("*.py"))

@@ -14,8 +14,12 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
+from minimax_cal.cli.commands import ENTRIES
+from tests.fuzz.material import CELLS, material
+
 pytestmark = pytest.mark.slow
 Ran = subprocess.CompletedProcess[str]
+known: set[str] = set()  # commands that were run
 
 
 def call(*command: object, folder: Path | None = None) -> Ran:
@@ -55,7 +59,14 @@ def installed(built: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Ca
     header = ",".join(f"q{joint}_deg" for joint in range(1, 7))
     (folder / "targets.csv").write_text(f"{header}\n20,30,-10,40,50,60\n-20,10,20,-40,60,10\n")
 
+    (folder / "wires.csv").write_bytes(material()["wires.csv"])
+    (folder / "cells.toml").write_text(
+        CELLS.replace("robot.json", "irb120").replace("data.csv", "poses.csv")
+    )
+    known.clear()
+
     def run(*arguments: object, code: int = 0) -> Ran:
+        known.add(str(arguments[0]))
         ended = call(place / "bin" / "minimax-cal", *arguments, folder=folder)
         assert "Traceback" not in ended.stderr, ended.stderr
         assert ended.returncode == code, ended.stderr
@@ -89,6 +100,10 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
     run("evaluate", "fit.json", "poses.csv")
     run("diagnose", "irb120", "poses.csv", "-o", "diagnosis.json")
     run("import", "poses.csv", "-o", "again.csv")
+    run("relative", "irb120", "wires.csv")
+    run("check", "fit.json", "poses.csv", "--tolerance", "rms 0.5")
+    run("compare", "fit.json", "fit.json")
+    run("fleet", "cells.toml", "--jobs", 1)
     run("compensate", "fit.json", "targets.csv")
     run("iso9283", "fit.json")
     run("map", "fit.json", "--samples", 1000, "--json")
@@ -105,11 +120,13 @@ def test_every_command_runs_or_names_its_extra(installed: Callable[..., Ran]) ->
         (("map", "fit.json", "-o", "a.png"), "[plot]"),
         (("report", "fit.json", "-o", "a.html"), "[report]"),
         (("gap", "arm.xml", "poses.csv"), "mujoco"),
+        (("serve", "--no-browser"), "[app]"),
     ):
         ended = run(*command, code=2)
         line = ended.stderr.strip()
         assert "\n" not in line, ended.stderr
         assert "pip install" in line
         assert extra in line
+    assert known - {"--version"} == set(ENTRIES)
     missing = run("calibrate", "irb120", "poses.csv", "--qp", "piqp").stderr
     assert "pip install minimax-cal[piqp]; daqp is used" in missing

@@ -24,6 +24,7 @@ PARTS = {
         "simulator",
         "compensate",
     ),
+    "Coming from": ("from_robodk", "from_ros2", "from_mujoco", "from_matlab"),
     "Extend": ("own_effect", "backends"),
     "Background": ("mathematics", "papers", "blind_study"),
     "Reference": ("api/cli", "api/minimax_cal", "api/parts", "api/qp_backends"),

@@ -10,7 +10,7 @@ from minimax_cal.ground.files import json_text
 from minimax_cal.ground.tables import Table
 
 
-@click.command(name="backends")
+@click.command(name="backends", cls=options.InGroups)
 @options.JSON
 def backends_command(as_json: bool) -> int:
     """The QP backends that are installed, with their versions."""

@@ -15,6 +15,7 @@ from minimax_cal.cli.options import (
     InGroups,
     Output,
     options_from,
+    plain_option,
     result_options,
 )
 from minimax_cal.fitting.calibrate import calibrate
@@ -33,7 +34,8 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 @DATA
 @options_from(Options)
 @ROWS
-@click.option(
+@plain_option(
+    "What is known",
     "--bootstrap",
     "replicates",
     type=int,

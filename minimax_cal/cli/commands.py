@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import UserDict
 from collections.abc import Callable
 from functools import wraps
@@ -35,6 +36,19 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         "evaluate": (
             "evaluate",
             "Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.",
+        ),
+        "check": (
+            "check",
+            "Whether the calibration FIT is still valid, and what moved, by a few new poses in "
+            "DATA.",
+        ),
+        "compare": (
+            "compare",
+            "What differs between two results A and B: before and after a repair, or two months.",
+        ),
+        "fleet": (
+            "fleet",
+            "Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.",
         ),
         "iso9283": (
             "iso9283",
@@ -92,6 +106,13 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "measurements.",
         ),
     },
+    "Work on a page": {
+        "serve": (
+            "serve",
+            "A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, "
+            "plan.",
+        ),
+    },
     "Look up": {
         "robots": ("robots", "The robots that come with the package."),
         "effects": (
@@ -107,7 +128,7 @@ ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.ite
 
 
 def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
-    """The command, refusing an output that is one of its inputs, or a file called -."""
+    """The command, refusing an output that is an input or another output, or a file called -."""
 
     @wraps(command)  # type: ignore[arg-type]
     def kept(*given: Any, **named: Any) -> Any:
@@ -119,11 +140,14 @@ def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
             for part in (value if isinstance(value, list | tuple) else [value])
             if isinstance(part, str | Path)
         ]
-        for path in map(Path, outputs):
+        inputs += [part.rpartition("#")[0] for part in map(str, inputs) if "#" in part]  # a link
+        for i, path in enumerate(map(Path, outputs)):
             if str(path) == "-":
                 raise OptionError("-o -: name a file; --json prints to stdout")
             if any(is_same(path, Path(part)) for part in inputs):
                 raise OptionError(f"{path}: is an input of this command; name another file")
+            if any(leads_with(path, Path(other)) for other in outputs[:i]):
+                raise OptionError(f"{path}: is to hold two results; name another file for one")
         return command(*given, **named)  # type: ignore[misc]
 
     return kept
@@ -148,6 +172,12 @@ def is_same(one: Path, other: Path) -> bool:
         return one.samefile(other)
     except (OSError, ValueError):
         return False
+
+
+def leads_with(one: Path, other: Path) -> bool:
+    """Whether two outputs lead to one place, other than a device such as /dev/null."""
+    place = os.path.realpath(one)
+    return place == os.path.realpath(other) and (os.path.isfile(place) or not os.path.exists(place))
 
 
 class Commands(UserDict[str, Any]):

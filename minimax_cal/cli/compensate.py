@@ -15,68 +15,116 @@ from minimax_cal.cli.options import (
     RUNG,
     SAFE_CELLS,
     WIDTH,
+    InGroups,
     Output,
     options_of,
+    plain_option,
     result_options,
 )
-from minimax_cal.correcting.compensate import compensate
+from minimax_cal.correcting.compensate import cells_of, compensate
+from minimax_cal.correcting.programs.program import is_program, read_program
 from minimax_cal.correcting.target_file import read_targets
-from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.words import visible
-from minimax_cal.robots.robot import load_robot
+from minimax_cal.robots.robot import Robot, load_robot
+
+HOW = "How targets are corrected"
 
 
-@click.command(name="compensate")
+@click.command(name="compensate", cls=InGroups)
 @FIT
 @click.argument("targets", type=PATH)
-@click.option(
-    "--robot", help="Nominal robot of the controller, file or name [default: that of the fit]."
+@plain_option(
+    HOW,
+    "--robot",
+    help="The nominal robot of the controller, file or name [default: that of the fit].",
 )
 @options_of(
     compensate,
     frame=Option(
         "Where the nominal arm stands: best-fit (base and reflectors as the calibration placed "
-        "them), flange (the base so, the flange as drawn), own (on the calibrated base)."
+        "them), flange (the base so, the flange as drawn), own (on the calibrated base).",
+        group=HOW,
     ),
-    tolerance=Option("What may remain of a target that counts as reached.", "mm"),
+    tolerance=Option("What may remain of a target that counts as reached.", "mm", group=HOW),
     most_change=Option(
-        "Most that a joint may change (a slide 8.7 mm per degree).", "deg", flag="--max-change"
+        "The most that a joint may change (a slide 8.7 mm per degree).",
+        "deg",
+        flag="--max-change",
+        group=HOW,
     ),
-    lever=Option("What a radian counts as [default: the targets' own].", "mm"),
-    clock=Option("Effects of time: as at this moment of the calibration's session, 0 to 1."),
+    lever=Option("What a radian counts as [default: the targets' own].", "mm", group=HOW),
+    clock=Option(
+        "Take effects of time as at this moment of the calibration's session, 0 to 1.", group=HOW
+    ),
+)
+@plain_option(
+    HOW,
+    "--tool",
+    default="",
+    metavar="FRAME",
+    help="The tool of a program: x,y,z,q1..q4, or a name.",
+)
+@plain_option(
+    HOW, "--wobj", default="", metavar="FRAME", help="The work object of a program, alike."
 )
 @SAFE_CELLS
 @RUNG
-@result_options("the targets (CSV)")
+@result_options("the targets (CSV, or the program)")
 def compensate_command(
-    fit: Path, targets: Path, robot: str | None, safe_cells: bool, to: Output, **chosen: Any
+    fit: Path,
+    targets: Path,
+    robot: str | None,
+    tool: str,
+    wobj: str,
+    safe_cells: bool,
+    to: Output,
+    **chosen: Any,
 ) -> int:
     """Correct the joint TARGETS (CSV) so that the robot of FIT goes where it is drawn to go.
 
-    FIT is what `calibrate -o` wrote.  Without -o the corrected file goes to stdout, its summary to
-    stderr.
+    FIT is what `calibrate -o` wrote.  TARGETS may be a whole program too: a RAPID module (.mod) or
+    KRL (.src, .dat), whose points alone are changed.  Without -o the corrected file goes to stdout,
+    its summary to stderr.
     """
-    given = read_targets(targets)
     nominal = None if robot is None else load_robot(robot)
-    found = compensate(fit, given.data, nominal, **chosen)
+    if is_program(targets):
+        drawn = nominal or nominal_of(fit, chosen["rung"])
+        program = read_program(targets, drawn, tool, wobj)
+        found = compensate(fit, program.data, nominal, **chosen)
+        text: str | bytes = program.corrected(found)
+    else:
+        if tool or wobj:
+            raise OptionError("--tool and --wobj go with a program (.mod, .src, .dat)")
+        given = read_targets(targets)
+        found = compensate(fit, given.data, nominal, **chosen)
+        text = to.cells(given.corrected(found), safe_cells)
     to.notice(*found.notices)
-    text = to.cells(given.corrected(found), safe_cells)
-    if to.path:
-        write_whole(to.path, text)
-        to.wrote(to.path)
+    to.write_rows(lambda: text, lambda: json_text(found.to_dict()))
     if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
     elif to.path:
         click.echo(found.summary(WIDTH))
     else:
-        click.echo(on_terminal(text) if sys.stdout.isatty() else text, nl=False)
+        if sys.stdout.isatty():
+            text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
+        click.echo(text, nl=False)
         if not to.quiet:
             click.echo(found.summary(WIDTH), err=True)
     if found.failed.any():
         click.echo(f"error: {found.complaint()}", err=True)
         return FAILED
     return 0
+
+
+def nominal_of(fit: Path, rung: int | None) -> Robot:
+    """The arm that the controller believes in.  Raises CalibrationError."""
+    _, robot, _ = cells_of(fit, rung)
+    if robot is None:
+        raise CalibrationError(f"{fit}: does not tell its nominal robot; give --robot")
+    return robot
 
 
 def on_terminal(text: str) -> str:

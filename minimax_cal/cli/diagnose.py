@@ -14,6 +14,7 @@ from minimax_cal.cli.options import (
     ROBOT,
     ROWS,
     SOME_DATA,
+    InGroups,
     Output,
     options_from,
     options_of,
@@ -27,10 +28,10 @@ from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
-from minimax_cal.reporting.tables import effects_list, effects_table, where_tables
+from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
 
 
-@click.command(name="diagnose")
+@click.command(name="diagnose", cls=InGroups)
 @ROBOT
 @DATA
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
@@ -41,8 +42,12 @@ from minimax_cal.reporting.tables import effects_list, effects_table, where_tabl
         metavar="EFFECT",
         flag="--without",
         many=tuple,
+        group="What is sought",
     ),
-    quick=Option("Leave no parts of the poses out in turn: no claim beyond the measured poses."),
+    quick=Option(
+        "Leave no parts of the poses out in turn: no claim beyond the measured poses.",
+        group="What is sought",
+    ),
 )
 @ROWS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")
@@ -53,12 +58,13 @@ def diagnose_command(robot: str, data: Path, in_rows: bool, to: Output, **chosen
     to.notice(*found.notices)
     if to.deliver(found.json):
         options.terminal().print(found.headline() + "\n", markup=False)
-        options.show(*found.tables(), *where_tables(found.where))
+        left = remainder_table(found)
+        options.show(*found.tables(), *([left] if left.rows else []), *where_tables(found.where))
     to.draw(save_diagnosis, found)
     return options.exit_code(found.status)
 
 
-@click.command(name="effects")
+@click.command(name="effects", cls=InGroups)
 @click.argument("robot", required=False)
 @SOME_DATA
 @ROWS

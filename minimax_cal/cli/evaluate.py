@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from minimax_cal.cli.options import DATA, FIT, RUNG, Output, result_options, show
+from minimax_cal.cli.options import DATA, FIT, RUNG, InGroups, Output, result_options, show
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.files import json_text
@@ -17,7 +17,7 @@ from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.modelling.cell import strangers
 
 
-@click.command(name="evaluate")
+@click.command(name="evaluate", cls=InGroups)
 @FIT
 @DATA
 @RUNG

@@ -6,22 +6,43 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, QUIET, RUNG, Output, options_of, output, with_output
+from minimax_cal.cli.options import (
+    PATH,
+    QUIET,
+    RUNG,
+    InGroups,
+    Output,
+    options_of,
+    output,
+    plain_option,
+    with_output,
+)
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.table import EXPORTERS
 from minimax_cal.ground.options import Option
 
+FORMAT = "The format"
 
-@click.command(name="export")
+
+@click.command(name="export", cls=InGroups)
 @click.argument("fit")
-@click.option("--to", "kind", required=True, metavar="FORMAT", help=", ".join(EXPORTERS) + ".")
-@click.option(
+@plain_option(
+    FORMAT,
+    "--to",
+    "kind",
+    required=True,
+    metavar="FORMAT",
+    help="The format: " + ", ".join(EXPORTERS) + ".",
+)
+@plain_option(
+    FORMAT,
     "--urdf",
     type=PATH,
     metavar="ORIGINAL",
     help="Correct the joint origins of this URDF; all else stays, byte for byte.",
 )
-@click.option(
+@plain_option(
+    FORMAT,
     "--mjcf",
     type=PATH,
     metavar="ORIGINAL",
@@ -29,8 +50,10 @@ from minimax_cal.ground.options import Option
 )
 @options_of(
     exported,
-    tip=Option("Last link of the chain in that file.", metavar="LINK"),
-    experimental=Option("Agree to a format whose frames its maker does not document (moc)."),
+    tip=Option("The last link of the chain in that file.", metavar="LINK", group=FORMAT),
+    experimental=Option(
+        "Agree to a format whose frames its maker does not document (moc).", group=FORMAT
+    ),
 )
 @RUNG
 @output("the robot")

@@ -8,21 +8,37 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import DATA, PATH, Output, options_from, options_of, result_options
+from minimax_cal.cli.options import (
+    DATA,
+    PATH,
+    InGroups,
+    Output,
+    options_from,
+    options_of,
+    plain_option,
+    result_options,
+)
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.options import Option
 from minimax_cal.reporting.plots.simulator import save_simulator_gap
 from minimax_cal.simulators.ladder import simulator_gap
 
+ARM = "The arm"
 
-@click.command(name="gap")
+
+@click.command(name="gap", cls=InGroups)
 @click.argument("model", type=PATH)
 @DATA
-@click.option("--fit", type=PATH, metavar="FIT", help="A calibration of this arm.")
-@click.option("--diagnosis", type=PATH, metavar="D", help="A diagnosis of this arm.")
+@plain_option(
+    ARM, "--fit", type=PATH, metavar="FIT", help="Correct by this calibration of the arm."
+)
+@plain_option(
+    ARM, "--diagnosis", type=PATH, metavar="D", help="Correct by this diagnosis of the arm."
+)
 @click.option("--write", type=PATH, metavar="XML", help="Write the corrected model to this MJCF.")
 @options_of(
-    simulator_gap, tip=Option("Last body of the arm, where there are several.", metavar="BODY")
+    simulator_gap,
+    tip=Option("The last body of the arm, where there are several.", metavar="BODY", group=ARM),
 )
 @options_from(Options, "holdout", "seed")
 @result_options("the gap (JSON)", figure="the ladder")

@@ -3,50 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from minimax_cal.cli.options import JSON, PATH, QUIET, SAFE_CELLS, Output, output, show, with_output
-from minimax_cal.ground.files import json_text, write_whole
-from minimax_cal.ground.words import visible
+from minimax_cal.cli.options import (
+    JSON,
+    PATH,
+    QUIET,
+    SAFE_CELLS,
+    InGroups,
+    Output,
+    can,
+    output,
+    plain_option,
+    show,
+    with_output,
+)
+from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import names_of
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
+from minimax_cal.measuring.left_out import left_out
 from minimax_cal.measuring.measurements import read_measurements
 
+TOLD = "What the files do not tell"
 
-@click.command(name="import")
+
+@click.command(name="import", cls=InGroups)
 @click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
-@click.option("--joints", type=PATH, help="File of joint values, where FILE holds points only.")
-@click.option(
+@plain_option(
+    TOLD, "--joints", type=PATH, help="The file of joint values, where FILE holds points only."
+)
+@plain_option(
+    TOLD,
     "--columns",
     default="",
     metavar="MAPPING",
     help="What the columns are, in order: smr1_mm,smr2_mm,smr3_mm,q_deg (skip*2 leaves two out), "
     "or by place: 1-3=smr1_mm,4-9=q_deg,Temp=temperature_C.",
 )
-@click.option(
+@plain_option(
+    TOLD,
     "--units",
     multiple=True,
     metavar="WHAT=UNIT",
-    help="Units that the files do not tell, as q=deg, smr=mm, u95=mm, time=dmy.",
+    help="The units that the files do not tell, as q=deg, smr=mm, u95=mm, time=dmy.",
 )
-@click.option(
+@plain_option(
+    TOLD,
     "--layout",
     type=click.Choice(["pose", "target"]),
-    help="Of a file with several points a pose: which of them follow each other.",
+    help="Which points follow each other, in a file with several a pose.",
 )
-@click.option("--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@plain_option(TOLD, "--decimal", type=click.Choice(["point", "comma"]), help="The decimal sign.")
+@plain_option(
+    TOLD,
+    "--leave-out",
+    default="",
+    metavar="POINTS",
+    help="The points to treat as if nobody had measured them: 12:smr2 is that of line 12, 12 all "
+    "of its pose; several with commas.",
+)
 @SAFE_CELLS
 @JSON
 @QUIET
-@output("the measurements (CSV)")
+@output("the measurements (CSV), or to a .json what was understood,")
 @with_output
+@can("rows")
 def import_command(
     files: Sequence[Path],
     joints: Path | None,
     layout: str | None,
     decimal: str | None,
+    leave_out: str,
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -56,16 +87,18 @@ def import_command(
     Without -o nothing is written.
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
-    if to.path:
-        write_whole(to.path, to.cells(csv_of(found), safe_cells))
+    found = replace(found, data=left_out(found.data, names_of([leave_out])))
+    to.write_rows(
+        lambda: to.cells(csv_of(found), safe_cells), lambda: json_text(content(found, to.path))
+    )
+    if to.path and to.path.suffix.lower() != ".json":
         read_measurements(to.path)  # what was written can be read
     to.notice(*found.data.notices)
     if to.as_json:
         click.echo(json_text(content(found, to.path)), nl=False)
         return 0
     show(found.files(), *found.columns())
-    wrote = f"wrote {visible(str(to.path))}" if to.path else "nothing written; add -o FILE"
-    click.echo(f"{found.headline()}\n{wrote}")
+    click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
     return 0
 
 

@@ -8,11 +8,23 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import FIT, RUNG, SOME_DATA, Output, options_of, result_options, show
+from minimax_cal.cli.options import (
+    FIT,
+    RUNG,
+    SOME_DATA,
+    InGroups,
+    Output,
+    options_of,
+    plain_option,
+    result_options,
+    show,
+)
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.judging.standard import iso9283
+
+WHAT = "What is judged"
 
 
 def point_of(text: str) -> str | Sequence[float]:
@@ -22,22 +34,24 @@ def point_of(text: str) -> str | Sequence[float]:
     try:
         return [1e-3 * float(part) for part in text.split(",")]
     except ValueError:
-        raise OptionError(f"--tcp {text!r}: give centroid, a target, or X,Y,Z in mm") from None
+        raise OptionError(f"tcp={text!r}: give centroid, a target, or X,Y,Z in mm") from None
 
 
-@click.command(name="iso9283")
+@click.command(name="iso9283", cls=InGroups)
 @FIT
 @SOME_DATA
 @options_of(
     iso9283,
-    nominal=Option("Robot before calibration, file or name [default: of the fit]."),
+    nominal=Option("The robot before calibration, file or name [default: of the fit].", group=WHAT),
     tcp=Option(
-        "centroid of the targets, one target (smr1), or X,Y,Z in mm in the last frame.",
+        "The tool centre point: centroid of the targets, one target (smr1), or X,Y,Z in mm in the "
+        "last frame.",
         metavar="POINT",
         read=point_of,
+        group=WHAT,
     ),
 )
-@click.option("--poses", is_flag=True, help="A row for every pose, too.")
+@plain_option(WHAT, "--poses", is_flag=True, help="Print a row for every pose, too.")
 @RUNG
 @result_options("the values (JSON)")
 def iso9283_command(fit: Path, data: Path | None, poses: bool, to: Output, **chosen: Any) -> int:

@@ -14,8 +14,10 @@ from minimax_cal.cli.options import (
     QUIET,
     RUNG,
     SOME_DATA,
+    InGroups,
     Output,
     options_from,
+    plain_option,
     show,
     with_output,
 )
@@ -33,16 +35,17 @@ def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str
     return predictor(saved.cells[AFTER], saved.uncertainty, frame), ()
 
 
-@click.command(name="map")
+@click.command(name="map", cls=InGroups)
 @FIT
 @SOME_DATA
 @options_from(Grid, "height", "slab")
-@click.option(
+@plain_option(
+    "The sections",
     "--frame",
     type=click.Choice(FRAMES),
     default=FRAMES[0],
     show_default=True,
-    help="In which positions are predicted; base leaves out where the base stands.",
+    help="The frame in which positions are predicted; base leaves out where the base stands.",
 )
 @options_from(Grid, "samples", "bins", "seed")
 @RUNG

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
@@ -45,18 +46,21 @@ ROWS = click.option(
     "--rows-in-visit-order",
     "in_rows",
     is_flag=True,
-    help="The file tells no order: its rows stand as the poses were visited.",
+    help="Take the rows as the poses were visited, where the file tells no order.",
 )
 RUNG = click.option(
     "--rung",
     type=int,
     metavar="N",
-    help="Of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: the last].",
+    help="Take this rung of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: "
+    "the last].",
 )
 JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
-QUIET = click.option("--quiet", "-q", is_flag=True, help="No notices and no progress on stderr.")
+QUIET = click.option(
+    "--quiet", "-q", is_flag=True, help="Print no notices and no progress on stderr."
+)
 SAFE_CELLS = click.option(
     "--safe-cells",
     is_flag=True,
@@ -87,6 +91,11 @@ def options_of(verb: Callable[..., object], **told: Option) -> Decorator:
     return stacked(*(option_of(name, known[name].default, each) for name, each in told.items()))
 
 
+def plain_option(group: str, *names: str, **more: Any) -> Decorator:
+    """An option that is no field and no argument of a function."""
+    return click.option(*names, cls=Grouped, group=group, **more)
+
+
 def stacked(*decorators: Decorator) -> Decorator:
     """Several decorators as one, the first on top."""
     return lambda command: reduce(lambda made, each: each(made), reversed(decorators), command)
@@ -95,7 +104,7 @@ def stacked(*decorators: Decorator) -> Decorator:
 def option_of(name: str, default: Any, told: Option) -> Decorator:
     """The click option of a field or argument, which is its default where it is not given."""
     flag = told.flag or "--" + name.replace("_", "-")
-    kind, shown, metavar, read = kind_of(default, told, flag)
+    kind, shown, metavar, read = kind_of(default, told, name)
 
     def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
         if told.many:
@@ -136,7 +145,8 @@ class InGroups(click.Command):
         """The options under their headings, in the order in which these come first."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for each in self.get_params(ctx):
-            if record := each.get_help_record(ctx):
+            record = each.get_help_record(ctx) if isinstance(each, click.Option) else None
+            if record:
                 groups.setdefault(getattr(each, "group", "") or RESULT, []).append(record)
         last = groups.pop(RESULT, [])
         for title, records in (*groups.items(), (RESULT, last)):
@@ -145,18 +155,34 @@ class InGroups(click.Command):
                     formatter.write_dl(records)
 
 
-def kind_of(default: Any, told: Option, flag: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
+def kind_of(default: Any, told: Option, name: str) -> tuple[type, Any, str, Callable[[Any], Any]]:
     """Type of what people give, its default and metavar, and what it is in SI."""
     scale = SI[told.unit]
     if isinstance(default, tuple) and default:
         low, high = (f"{end / scale:g}" for end in default)
-        return str, f"{low}:{high}", "LOW:HIGH", lambda text: pair(text, flag, scale)
+        return str, f"{low}:{high}", "LOW:HIGH", lambda text: pair(text, name, scale)
     if told.unit or isinstance(default, float):
         shown = None if default is None or isnan(default) else round(default / scale, 9)
         return float, shown, told.unit.upper(), lambda value: value * scale
     if isinstance(default, bool | int | str) and default != "":
         return type(default), default, "", told.read or type(default)
     return str, None, "", told.read or (tuple if told.values > 1 else str)
+
+
+NAMED = re.compile(r"(?<![\w-])(\w+)=(?:'([^']*)')?(?=(\S?))")
+
+
+def in_flags(text: str, command: click.Command) -> str:
+    """A message of Python, which calls an argument name=, with the command's --name."""
+    flags = {p.name: max(p.opts, key=len) for p in command.params if isinstance(p, click.Option)}
+
+    def flagged(found: re.Match[str]) -> str:
+        flag, value = flags.get(found[1]), found[2]
+        if flag is None:
+            return found[0]
+        return flag if value is None and found[3] in ",.;:)" else f"{flag} {value or ''}"
+
+    return NAMED.sub(flagged, text)
 
 
 # ---- results -----------------------------------------------------------------------------------
@@ -179,7 +205,8 @@ class Output:
         """Print notices on stderr, one a line."""
         shown = () if self.quiet else texts[:MOST_NOTICES]
         for text in shown:
-            click.echo(f"notice: {one_line(text)}", err=True)
+            command = click.get_current_context().command
+            click.echo(f"notice: {one_line(in_flags(text, command))}", err=True)
         if shown and len(texts) > MOST_NOTICES:
             click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
 
@@ -197,7 +224,13 @@ class Output:
         """Say on stderr which files were written."""
         for path in paths:
             if path and not self.quiet:
-                click.echo(f"written: {path}", err=True)
+                say_written(path)
+
+    def write_rows(self, csv: Callable[[], str | bytes], json: Callable[[], str]) -> None:
+        """Write a result that is rows: CSV, or JSON where the file's ending asks for it."""
+        if self.path:
+            write_whole(self.path, json() if self.path.suffix.lower() == ".json" else csv())
+            self.wrote(self.path)
 
     def draw(self, save: Callable[[Any, Path], object], result: Any) -> None:
         """Save the picture of a result where it was asked for."""
@@ -261,24 +294,31 @@ def by_ending(
         if figure:
             raise OptionError(f"{output}: the picture goes to {figure} already")
         return None, output
+    if output and output.suffix.lower() == ".csv" and not getattr(command, "rows", False):
+        raise OptionError(f"{output}: this command writes no CSV; write a .json")
     if figure and figure.suffix.lower() == ".json" and not output:
         return figure, None
     return output, figure
 
 
-def drawing(command: Command) -> Command:
-    """A command that can draw its result."""
-    command.draws = True  # type: ignore[attr-defined]
-    return command
+def can(what: str) -> Decorator:
+    """Mark a command that draws its result (draws), or whose result is rows of a CSV (rows)."""
+
+    def marked(command: Command) -> Command:
+        setattr(command, what, True)
+        return command
+
+    return marked
 
 
 def result_options(what: str, *, figure: str = "") -> Decorator:
     """The options of a result.  what: what -o writes.  figure: what --figure draws, if anything."""
     drawn = click.option("--figure", type=PATH, help=f"Draw {figure} to this PNG, SVG or PDF.")
-    if not figure:
-        return stacked(JSON, output(what), QUIET, with_output)
-    what = f"{what}, or by its ending the picture,"
-    return stacked(drawn, JSON, output(what), QUIET, with_output, drawing)
+    endings = [".csv or .json"] if "CSV" in what else [".json"]
+    endings += ["or the picture to a .png, .svg or .pdf"] if figure else []
+    told = (JSON, output(f"{what}, {', '.join(endings)},"), QUIET, with_output)
+    marks = (*((can("draws"),) if figure else ()), *((can("rows"),) if "CSV" in what else ()))
+    return stacked(*((drawn,) if figure else ()), *told, *marks)
 
 
 def output(what: str) -> Decorator:
@@ -290,6 +330,11 @@ def terminal() -> Console:
     """Stdout, as wide as the terminal, or 110 columns elsewhere."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
+def say_written(path: Path) -> None:
+    """Say on stderr that a file was written, whatever its name."""
+    click.echo(f"written: {one_line(str(path))}", err=True)
 
 
 def show(*tables: Table, headline: str = "") -> None:

@@ -7,9 +7,16 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import PATH, ROBOT, InGroups, Output, options_from, result_options
+from minimax_cal.cli.options import (
+    PATH,
+    ROBOT,
+    InGroups,
+    Output,
+    options_from,
+    plain_option,
+    result_options,
+)
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import write_whole
 from minimax_cal.planning.options import PlanOptions, limits_of
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.stops import ANGLES
@@ -19,15 +26,29 @@ from minimax_cal.robots.robot import load_robot
 
 @click.command(name="plan", cls=InGroups)
 @ROBOT
-@click.option("--poses", type=int, required=True, metavar="N", help="How many to measure.")
-@click.option("--fit", type=PATH, help="Calibration (JSON): robot, base, targets, its poses.")
-@click.option("--data", type=PATH, help="Measurements at hand (CSV); they count as known.")
+@plain_option(
+    "What the poses are for",
+    "--poses",
+    type=int,
+    required=True,
+    metavar="N",
+    help="How many poses to measure.",
+)
+@plain_option(
+    "What is known",
+    "--fit",
+    type=PATH,
+    help="A calibration (JSON): robot, base, targets, and its poses.",
+)
+@plain_option(
+    "What is known", "--data", type=PATH, help="Measurements at hand (CSV); they count as known."
+)
 @options_from(PlanOptions)
 @click.option(
     "--unit",
     default="deg",
     show_default=True,
-    help=f"Of joints in the file: {' or '.join(ANGLES)}.",
+    help=f"The unit of joints in the file: {' or '.join(ANGLES)}.",
 )
 @result_options("the poses (CSV)", figure="the poses and how accuracy grows with their number")
 def plan_command(robot: str, unit: str, to: Output, **chosen: Any) -> int:
@@ -39,9 +60,7 @@ def plan_command(robot: str, unit: str, to: Output, **chosen: Any) -> int:
     with to.stages() as progress:
         found = plan(arm, progress=progress, **chosen)
     to.notice(*found.notices)
-    if to.path:
-        write_whole(to.path, found.csv(unit))
-        to.wrote(to.path)
+    to.write_rows(lambda: found.csv(unit), found.json)
     to.draw(save_plan, found)
     if to.as_json:
         click.echo(found.json(), nl=False)

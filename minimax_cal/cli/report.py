@@ -8,12 +8,14 @@ from typing import Any
 
 import click
 
-from minimax_cal.cli.options import PATH, QUIET, RUNG, Output, options_of, with_output
+from minimax_cal.cli.options import PATH, QUIET, RUNG, InGroups, Output, options_of, with_output
 from minimax_cal.ground.options import Option
 from minimax_cal.reporting.report import Chosen, report, signed
 
+ASKED, SAID = "What is required", "What the page says"
 
-@click.command(name="report")
+
+@click.command(name="report", cls=InGroups)
 @click.argument("results", nargs=-1, required=True, type=PATH)
 @click.option(
     "-o", "--output", "path", type=PATH, default="report.html", show_default=True,
@@ -21,17 +23,28 @@ from minimax_cal.reporting.report import Chosen, report, signed
 )  # fmt: skip
 @options_of(
     report,
-    tolerance=Option('What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS"),
-    tolerance_for=Option("Of poses within or beyond the measured ones.", metavar="CLAIM"),
+    tolerance=Option(
+        'What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS", group=ASKED
+    ),
+    tolerance_for=Option(
+        "Whether that holds for poses within or beyond the measured ones.",
+        metavar="CLAIM",
+        group=ASKED,
+    ),
     facts=Option(
-        "TOML with serial_number, controller, tool, payload, temperature, instrument, "
+        "A TOML file with serial_number, controller, tool, payload, temperature, instrument, "
         "certificate, place, validity.",
         metavar="FILE",
+        group=SAID,
     ),
-    title=Option("Title [default: of the robot]."),
-    customer=Option("Who accepts the report.", metavar="NAME"),
-    author=Option("Who measured and evaluated.", metavar="NAME"),
-    date=Option("Date of the report [default: SOURCE_DATE_EPOCH, or today].", metavar="YYYY-MM-DD"),
+    title=Option("The title of the report [default: of the robot].", group=SAID),
+    customer=Option("Who accepts the report.", metavar="NAME", group=SAID),
+    author=Option("Who measured and evaluated.", metavar="NAME", group=SAID),
+    date=Option(
+        "The date of the report [default: SOURCE_DATE_EPOCH, or today].",
+        metavar="YYYY-MM-DD",
+        group=SAID,
+    ),
 )
 @RUNG
 @click.option("--pdf", type=PATH, metavar="FILE", help="Print it to this PDF as well.")

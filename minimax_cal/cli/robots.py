@@ -10,7 +10,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.robots.robot import builtin_robots, load_robot
 
 
-@click.command(name="robots")
+@click.command(name="robots", cls=options.InGroups)
 @options.JSON
 def robots_command(as_json: bool) -> int:
     """The robots that come with the package."""

@@ -38,7 +38,7 @@ def outcome(arguments: Sequence[str] | None) -> int:
             warnings.simplefilter("ignore", CalibrationWarning)  # the notices say the same
             code = cli.main(args=arguments, prog_name="minimax-cal", standalone_mode=False)
     except CalibrationError as error:
-        code = complain(str(error))
+        code = complain(said_by(error, arguments))
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         code = MISUSED
@@ -55,6 +55,14 @@ def outcome(arguments: Sequence[str] | None) -> int:
     except Exception as error:
         code = numerical(error)
     return code or 0
+
+
+def said_by(error: CalibrationError, arguments: Sequence[str] | None) -> str:
+    """What is wrong, with the options as the command that was asked for calls them."""
+    from minimax_cal.cli.options import in_flags
+
+    name = next(iter(sys.argv[1:] if arguments is None else arguments), "")
+    return in_flags(str(error), cli.commands[name]) if name in ENTRIES else str(error)
 
 
 def numerical(error: Exception) -> int:

@@ -8,17 +8,24 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import PATH, ROBOT, options_from, options_of
+from minimax_cal.cli.options import PATH, ROBOT, InGroups, options_from, options_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, write_whole
 from minimax_cal.ground.options import Option
 from minimax_cal.measuring.measurements import write_measurements
 from minimax_cal.modelling.simulate import Truth, simulate
 
+SESSION = "The session"
 
-@click.command(name="simulate")
+
+@click.command(name="simulate", cls=InGroups)
 @ROBOT
-@options_of(simulate, poses=Option(), targets=Option("Reflectors on the flange."), seed=Option())
+@options_of(
+    simulate,
+    poses=Option("The number of poses.", group=SESSION),
+    targets=Option("The number of reflectors on the flange.", group=SESSION),
+    seed=Option("The seed of all that is random.", group=SESSION),
+)
 @options_from(Truth)
 @click.option(
     "--truth", type=PATH, help="Write the true robot, base and targets to this file (JSON)."
@@ -36,6 +43,8 @@ def simulate_command(
     """Measurements of an imperfect copy of ROBOT, from a tracker at a random place."""
     if output is None:
         raise OptionError("simulate needs -o FILE for the measurements")
+    if output.suffix.lower() == ".json":
+        raise OptionError(f"{output}: the measurements are a CSV; write a .csv")
     options.writable(output, truth)
     made = simulate(robot, poses, targets, seed, Truth(**chosen))
     write_measurements(output, made.data)
@@ -44,5 +53,5 @@ def simulate_command(
         write_whole(truth, json_text(content))
     for path in (output, truth):
         if path:
-            click.echo(f"written: {path}", err=True)
+            options.say_written(path)
     return 0

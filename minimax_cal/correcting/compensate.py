@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.correcting.reach import Outcome, Reach, bent, motion, seen
 from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -24,17 +23,12 @@ from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
-from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.reach import Outcome, Reach, arm_of, bent, lever_of, motion, seen
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 FRAMES = ("best-fit", "flange", "own")
-# What moves the reflectors or the instrument, and not the flange of the arm.
-SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "session_jump", "target_shift", "target_offset"})
-TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
-CORNERS = tuple(f"corner{i + 1}" for i in range(4))
-LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
 SAMPLE = 200  # poses that place a nominal base where no calibration did
 
 
@@ -212,13 +206,6 @@ def check_choices(
         raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
 
 
-def lever_of(cell: Cell) -> float:
-    """What a radian counts as with the targets of a cell [m]."""
-    away = np.linalg.norm(cell.target_positions, axis=1)
-    own = rms(away) if len(away) else 0.0
-    return own if own > LEAST_LEVER else USUAL_LEVER
-
-
 def cells_of(source: Result, rung: int | None) -> tuple[Cell, Robot | None, Cell | None]:
     """The calibrated cell; the nominal robot, and its cell, where the result tells them."""
     known = open_result(source, rung)
@@ -274,26 +261,6 @@ def path_of(
     check_joints(robot, data)
     data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
-
-
-def arm_of(cell: Cell) -> Cell:
-    """The calibrated arm in its own base, seen by four points about its targets' centre.
-
-    They tell the flange's pose.  Of the effects those that move the flange.
-    """
-    middle = cell.target_positions.mean(axis=0) if len(cell.target_positions) else np.zeros(3)
-    kept = [
-        (term, value)
-        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term.effect not in SEEN_ONLY and term.place not in cell.target_names
-    ]
-    effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
-    return replace(
-        cell,
-        target_names=CORNERS,
-        target_positions=middle + USUAL_LEVER * TETRAHEDRON,
-        effects=effects,
-    )
 
 
 def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:

@@ -31,13 +31,13 @@ def export(
     """The robot of a calibration in a format that other programs load.
 
     fit: a calibration, its cell, a diagnosis, a relative calibration or a robot, or the file or
-    name of one.  to: urdf, ur-yaml, ros-yaml, dh-csv, json, moc or mjcf.  path: written to as well,
-    where given.  urdf: a file whose joint origins are corrected, all else left as it is; mjcf: one
-    whose bodies, gains and springs are.  tip: last link of the chain in that file.
-    experimental: agree to a format whose frames its maker does not document (moc).  rung: of a
-    diagnosis, the last unless given.  notify: called
-    with what the format cannot hold and other notices.  Lengths and angles are in the units of the
-    format.  Raises CalibrationError for wrong input.
+    name of one.  to: urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.  path:
+    written to as well, where given.  urdf: a file whose joint origins are corrected, all else left
+    as it is; mjcf: one whose bodies, gains and springs are.  tip: last link of the chain in that
+    file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of
+    a diagnosis, the last unless given.  notify: called with what the format cannot hold and other
+    notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong
+    input.
 
     >>> text = mc.export(fit, to="urdf", path="arm.urdf")
     """
@@ -78,7 +78,7 @@ def written(made: Export, path: Path | None) -> None:
     """Write a file and those beside it.  Raises OptionError where these have no place."""
     if path is None and made.beside:
         raise OptionError(
-            f"the file needs another beside it (*{', *'.join(made.beside)}); name it with -o"
+            f"the file needs another beside it (*{', *'.join(made.beside)}); name where to write it"
         )
     if path is not None:
         for ending, content in made.beside.items():

@@ -7,21 +7,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of, structure
+from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
+from minimax_cal.diagnosing.established import judged_again
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
-from minimax_cal.evidence.alternatives import ENOUGH, alternatives
+from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.limits import ENOUGH, EXACT
+from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.table import Term
 
-LEVEL = 0.01  # chance that noise alone is called structure
-MATTERS = 0.015  # share of what was explained below which more structure is of no account
-OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
 
@@ -32,7 +34,8 @@ class Causes:
     faults: of the data.  library: what could be tested, and ripple:
     whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
     weightiest first.
-    traces: of what they leave.  untestable: effects, and what the data lack for them.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.  maps: of
+    joints, sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -42,6 +45,7 @@ class Causes:
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
+    maps: Mapped = NO_MAPS
 
 
 def causes_of(
@@ -54,14 +58,33 @@ def causes_of(
     if read_back:  # what is left of a move looks like play in the gears
         lib, choice = chosen(study, (*exclude, "backlash"))
     progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known)
-    if choice.noise.variance < selection.EXACT**2:
+    traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
+    if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = "gear_ripple" not in exclude
+    effects = judged_again(effects, choice, study.data, lib, ripple)
     return Causes(
         (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
     )
+
+
+def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
+    """Traces of what effects and maps leave together."""
+    maps = [term.columns(study.scene).displacement(study.scene) for term in causes.maps.terms]
+    known = np.concatenate([causes.choice.known, *map(study.rows.of, maps)], axis=1)
+    noise = restricted(study.rows, known)
+    return structure(study.scene, study.rows, noise, known, named_in(causes.choice))
+
+
+def named_in(choice: Choice) -> list[Named]:
+    """The effects selected with their motions: of few parameters each its own, else together."""
+    out = []
+    for one in choice.fits:
+        motion = choice.library.columns[:, one.candidate.main].T
+        motion = motion if len(motion) <= FEW else (one.value @ motion)[None]
+        out.append(Named(one.candidate.term, motion))
+    return out
 
 
 def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
@@ -168,9 +191,9 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
 def merged(findings: Sequence[Finding]) -> list[Finding]:
     """Lines of one joint are one effect: their parameters together, the strongest first."""
     out: dict[tuple[str, str], Finding] = {}
-    for found in findings:
-        key = (found.term.effect, found.term.place)
-        if found.term.effect == "gear_ripple":
+    keys = [(found.term.effect, found.term.place) for found in findings]
+    for key, found in zip(keys, findings, strict=True):
+        if found.term.effect == "gear_ripple" or keys.count(key) > 1:
             turns = found.fixed["waves_per_turn"]
             names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
@@ -192,43 +215,6 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
             fixed={**first.fixed, **found.fixed},
         )
     return list(out.values())
-
-
-def judged(
-    findings: Sequence[Finding], traces: Sequence[Trace], explained: float
-) -> tuple[str, tuple[str, float]]:
-    """The verdict; where what remains has structure, and the probability of that by chance.
-
-    explained: weighed square that the effects explain; structure far below it is of no account.
-    """
-    worst = min(traces, key=lambda trace: trace.p)
-    p = min(1.0, worst.p * len(traces))
-    loud = [t for t in traces if t.p * len(traces) < LEVEL and t.excess > MATTERS * explained]
-    if loud:
-        return "unknown", (min(loud, key=lambda t: t.p).name, p)
-    if patched(findings):
-        return "unknown", ("two laws for one joint may stand for one that is not known", p)
-    if not findings:
-        return "none", (worst.name, p)
-    several = any(found.alternatives for found in findings)
-    return ("one_of" if several else "named"), (worst.name, p)
-
-
-def explained(study: Study, choice: Choice) -> float:
-    """Weighed square that the effects explain."""
-    none = np.zeros((len(study.rows.error), 0))
-    without, left = (
-        rest_of(study.rows, choice.noise, known).total for known in (none, choice.known)
-    )
-    return without - left
-
-
-def patched(findings: Sequence[Finding]) -> bool:
-    """Whether one joint needs two laws of its own angle: likely one law that is not known."""
-    by_angle = [f.term for f in findings if f.term.effect in OF_ANGLE]
-    joints = [t.place for t in by_angle if t.place != "all"]
-    twice = len(set(joints)) < len(joints)
-    return twice or (bool(joints) and any(t.place == "all" for t in by_angle))
 
 
 def fault_findings(faults: Sequence[Fault]) -> list[Finding]:

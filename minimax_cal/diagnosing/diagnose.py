@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import Causes, causes_of, explained, fault_findings, judged
+from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings
+from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
@@ -24,13 +25,15 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.result import Diagnosis, Step
-from minimax_cal.diagnosing.sentences import reasons
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
+from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
+from minimax_cal.evidence.limits import WEAK
 from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
@@ -137,13 +140,22 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     progress("gap ladder")
-    ladder = climbed(study, [finding.terms for finding in causes.effects])
-    steps = steps_of(asked, study, judges, causes, ladder)
+    spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
+    ladder = climbed(study, [finding.terms for finding in spoken.effects])
+    if "joint_error_map" not in options.exclude:
+        progress("error maps of joints")
+        spoken, ladder = with_maps(spoken, ladder)
+        causes = spoken if spoken.maps.terms else causes
+    steps = steps_of(asked, study, judges, spoken, ladder)
+    for step in steps:
+        progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, judges, floor, options.seed)
-    effects = valued(causes.effects, ladder)
+    effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
-    verdict, structure_left = judged(findings, causes.traces, explained(study, causes.choice))
+    progress("remainder")
+    rest = remainder(ladder.last, floor)
+    verdict, structure_left = judged(findings, causes, study, ladder, rest)
     if verdict == "none" and shaky(floor, noise, steps[-1]):
         verdict = "not_repeatable"
     beyond = NOT_ASKED
@@ -155,7 +167,6 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         robot=robot.name,
         status=study.fit.status,
         verdict=verdict,
-        reasons=reasons(verdict, steps, floor, findings, share, interval, structure_left, beyond),
         findings=tuple(findings),
         ladder=tuple(steps),
         floor=floor,
@@ -182,7 +193,19 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         held=~np.isin(clean.data.line, train.line),
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
+        remainder=rest,
     )
+
+
+def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:
+    """The causes and the ladder with the error maps that joints have besides."""
+    maps, study = error_maps(ladder.last), ladder.last.study
+    if not maps.terms:
+        return causes, ladder
+    effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
+    causes = replace(causes, effects=tuple(effects), maps=maps)
+    causes = replace(causes, traces=beside_maps(study, causes))
+    return causes, climbed(study, [finding.terms for finding in effects])
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -9,7 +9,6 @@ import numpy as np
 from minimax_cal.diagnosing.causes import Causes, effects_of
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.beyond import Beyond, Errors, without
 from minimax_cal.fitting.options import Progress
@@ -19,15 +18,15 @@ from minimax_cal.measuring.grouping import parts
 from minimax_cal.modelling.parameters import State
 
 
-def fold_of(study: Study, library: Library, rows: Array, state: State, ripple: bool) -> Ladder:
-    """Effects sought and fitted on some rows only.
+def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
+    """Effects sought and fitted on some rows only; maps of joints only fitted.
 
-    library: of all rows, whose products serve every fold.  rows: (m,) True for those used.  state:
-    the geometry that was fitted to them.  ripple: whether lines of gears are looked for.
+    causes: of all rows; the products of their library serve every fold.  rows: (m,) True for those
+    used.  state: the geometry that was fitted to them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
-    choice = select(library.only(rows), ripple=ripple)
-    return climbed(small, effects_of(choice))
+    choice = select(causes.library.only(rows), ripple=causes.ripple)
+    return climbed(small, causes.maps.beside(effects_of(choice)))
 
 
 def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:
@@ -44,7 +43,7 @@ def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) 
         if state is None:
             continue
         progress(f"part {number + 1} of {len(found)} left out: {part.name}")
-        fits = fold_of(study, causes.library, ~mask, state, causes.ripple).fits
+        fits = fold_of(study, causes, ~mask, state).fits
         rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
     return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")

@@ -18,8 +18,9 @@ from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.maps import curve_of
+from minimax_cal.modelling.effects.scene import Scene, joint_of
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.parameters import State
 
 SHAKY = 3.0  # times what the instrument alone would show between visits
@@ -38,10 +39,12 @@ class Ladder:
 
     taken: numbers of the effects that the ladder took.  With the others groups of poses that were
     left out, or the training poses themselves, are met no better.
+    parts: masks (m,) of those groups.
     """
 
     fits: tuple[Joint, ...]
     taken: tuple[int, ...]
+    parts: tuple[Array, ...]
 
     @property
     def last(self) -> Joint:
@@ -61,15 +64,14 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
-    square = fits[0].cross_validated(spared)
     for number, terms in enumerate(effects):
         wide = joint(study, (*fits[-1].terms, *terms))
-        new = wide.cross_validated(spared)
+        told = wide.spared(spared)
+        square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
             taken.append(number)
-            square = new
-    return Ladder(tuple(fits), tuple(taken))
+    return Ladder(tuple(fits), tuple(taken), tuple(spared))
 
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
@@ -83,8 +85,24 @@ def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
         at = own.stop
         values, sure = last.state.effects[own].tolist(), sigma[own].tolist()
         motion = motions(ladder.last.study.scene, finding)
-        out.append(replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion))
+        new = replace(finding, values=tuple(values), sigmas=tuple(sure), motion=motion)
+        covers = slice(geometric + own.start, geometric + own.stop)
+        out.append(replace(new, curve=drawn(new, last, covers)))
     return out
+
+
+def drawn(finding: Finding, fit: Joint, own: slice) -> Array:
+    """(3, g) the curve of an error map, as `curve_of`; (3, 0) of another effect.
+
+    own: of its parameters among those of the fit.
+    """
+    term = finding.term
+    if not (term.effect in EFFECTS and EFFECTS[term.effect].is_map):
+        return np.zeros((3, 0))
+    sign = float(fit.study.robot.sign[joint_of(term.place)])
+    return curve_of(
+        term.choice, sign, np.array(finding.values), fit.uncertainty.covariance[own, own]
+    )
 
 
 def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:

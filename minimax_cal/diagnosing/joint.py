@@ -121,7 +121,8 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
     for _ in range(PASSES):
         model, state = extended(base, robot, data, state, terms) if terms else (base, state)
         poses = Poses.of(Estimator(model, np.ones(len(model.y))), state)
-        pull, room = poses.score.sum(axis=0), np.full((poses.jacobian.shape[-1], 2), np.inf)
+        pull = poses.score.sum(axis=0) + poses.prior * poses.off
+        room = np.full((len(pull), 2), np.inf)
         room[:, 0] = -np.inf
         room[len(room) - len(allowed) :] = allowed - state.effects[:, None]
         step = bounded(poses.bread, pull, *room.T)
@@ -139,7 +140,11 @@ def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
     """(e, 2) between which the parameters of effects must lie: of compliances not below 0."""
     out = [np.zeros((0, 2))]
     for term in terms:
-        fields = term.columns(scene).displacement(scene)
+        columns = term.columns(scene)
+        if len(columns.ridge):  # a prior holds them
+            out.append(np.full((len(columns.names), 2), np.inf) * [-1.0, 1.0])
+            continue
+        fields = columns.displacement(scene)
         size = np.sqrt((fields**2).sum(axis=2)).max(axis=(1, 2))
         most = FARTHEST * scene.robot.reach() / np.maximum(size, 1e-300)
         least = np.zeros_like(most) if EFFECTS[term.effect].positive else -most
@@ -150,9 +155,18 @@ def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
 def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
     """The step x (p,) that minimises x'Hx - 2 g'x between bounds."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    root = np.linalg.cholesky(gram * np.outer(scale, scale) + RIDGE * np.eye(len(gram)))
-    target = np.linalg.solve(root, pull * scale)
-    if np.isinf(low).all() and np.isinf(high).all():
-        return np.asarray(scale * np.linalg.solve(root.T, target))
-    found = lsq_linear(root.T, target, (low / scale, high / scale), method="bvls", tol=1e-12)
-    return np.asarray(scale * found.x)
+    unit = gram * np.outer(scale, scale) + RIDGE * np.eye(len(gram))
+    free = np.isinf(low) & np.isinf(high)
+    x = np.linalg.solve(unit, pull * scale)
+    if np.all((x >= low / scale) & (x <= high / scale)):
+        return np.asarray(scale * x)
+    # of the others what the free ones do not take over, and then the free ones
+    across = np.linalg.solve(unit[np.ix_(free, free)], unit[np.ix_(free, ~free)])
+    rest = unit[np.ix_(~free, ~free)] - unit[np.ix_(~free, free)] @ across
+    root = np.linalg.cholesky(0.5 * (rest + rest.T))
+    target = np.linalg.solve(root, (pull * scale)[~free] - across.T @ (pull * scale)[free])
+    room = (low / scale)[~free], (high / scale)[~free]
+    held = lsq_linear(root.T, target, room, method="bvls", tol=1e-12).x
+    x[free] += across @ (x[~free] - held)
+    x[~free] = held
+    return np.asarray(scale * x)

@@ -15,10 +15,11 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
-from minimax_cal.evidence.noise import Noise, Rows
+from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.effects.scene import Scene, turning
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.robots.kinematics import cross
 
@@ -143,13 +144,14 @@ class Rest:
     """What is left, white under the null hypothesis.
 
     rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
-    the weights.  dof: degrees of freedom.
+    the weights.  dof: degrees of freedom.  group: (N,) of rows at the same pose, from 0.
     """
 
     rows: Array
     basis: Array
     root: Array
     dof: int
+    group: Array
 
     @property
     def total(self) -> float:
@@ -165,13 +167,43 @@ def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
     basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
     rest = rows.error * root
     rest = rest - basis @ (basis.T @ rest)
-    return Rest(rest, basis, root, rows.count - basis.shape[1])
+    return Rest(rest, basis, root, rows.count - basis.shape[1], rows.group)
 
 
-def structure(scene: Scene, rows: Rows, noise: Noise, known: Array) -> tuple[Trace, ...]:
+@dataclass(frozen=True, eq=False)
+class Named:
+    """An effect that was named.  motion: (d, N) rows of its motion, as fitted or in its parts."""
+
+    term: Term
+    motion: Array
+
+
+def doubted(scene: Scene, named: Named) -> Iterator[tuple[str, Array]]:
+    """Questions to a name: whether its motion still varies with what its law does not know.
+
+    Each with its functions (f, m).
+    """
+    place, name = named.term.place, named.term.label
+    joints = [int(place[1:]) - 1] if place[:1] in "JL" and place[1:].isdigit() else []
+    angles = [j for j in joints or range(min(scene.joints, 3)) if j in turning(scene)]
+    if angles:
+        yield f"{name} with angle", np.concatenate([wave(scene.q[j], 1) for j in angles])
+    load, move, side = scene.gravity, scene.each("move"), scene.each("approach")
+    felt = [unit(load[j]) for j in joints if load[j].any()]
+    led = [part for j in joints if side[j].any() for part in (side[j], np.abs(unit(move[j])))]
+    if felt or led:
+        yield f"{name} with load or move", np.array([*felt, *led])
+    clock = scene.column("clock")
+    if np.ptp(clock) > 0.0:
+        yield f"{name} with time", np.array([np.cos(np.pi * k * clock) for k in (1, 2)])
+
+
+def structure(
+    scene: Scene, rows: Rows, noise: Noise, known: Array, names: Sequence[Named] = ()
+) -> tuple[Trace, ...]:
     """What is left, question by question.
 
-    known: (N, q) columns fitted beside the geometry.
+    known: (N, q) columns fitted beside the geometry.  names: effects that these belong to.
     """
     rest = rest_of(rows, noise, known)
     found = []
@@ -181,6 +213,11 @@ def structure(scene: Scene, rows: Rows, noise: Noise, known: Array) -> tuple[Tra
         spread = np.repeat(probe.feature.T, r, axis=0)
         features = (moved[:, :, None] * spread[:, None, :]).reshape(len(moved), -1)
         found.append(Trace(probe.name, *share(features, rest)))
+    for one in names:
+        for name, functions in doubted(scene, one):
+            spread = np.repeat(functions, r, axis=1) * rest.root
+            features = (one.motion[:, None] * spread).reshape(-1, len(rest.root)).T
+            found.append(Trace(name, *share(features, rest)))
     found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
     found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
     return tuple(found)
@@ -196,8 +233,11 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     values, vectors = np.linalg.eigh(features.T @ features)
     most = max(int(SHARE * rest.dof), 1)
     kept = np.flatnonzero(values > 1e-6 * max(float(values[-1]), 1e-4))[::-1][:most]
-    pull = (vectors[:, kept].T @ (features.T @ rest.rows)) / np.sqrt(values[kept])
-    inside, d = float(pull @ pull), len(kept)
+    unit = vectors[:, kept] / np.sqrt(values[kept])
+    pull = unit.T @ (features.T @ rest.rows)
+    d = len(kept)
+    wide = inflation(features @ (unit @ pull), rest.rows, rest.group, rest.dof)
+    inside = float(pull @ pull) / wide
     outside = max(rest.total - inside, 1e-300)
     if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.alternatives import ENOUGH
+from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -32,6 +32,7 @@ COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
 LOAD = 0.03  # payload that is proposed, as a share of the arm's mass
 FOOT = 0.2  # radius of the reflectors on the foot, as a share of the reach
+HELPFUL = 0.5  # share of `ENOUGH` below which nothing is proposed
 NOTHING = 0.01  # power that no proposal exceeds where a rival includes the effect
 SAME = 1e-6  # relative change of a field below which a proposal does not concern an effect
 
@@ -482,7 +483,10 @@ def separate_with(site: Site, pair: Pair) -> str:
     best = max(advices, key=lambda advice: advice.power)
     if pair.one.effect == pair.other.effect and best.power < NOTHING:
         return "no measurement can: one includes the other; more poses show what it has besides"
-    return f"{best.text}; that raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
+    raises = f"raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
+    if best.power < HELPFUL * ENOUGH:
+        return f"no measurement considered is enough: the best {raises}"
+    return f"{best.text}; that {raises}"
 
 
 # ---- in words ----------------------------------------------------------------------------------

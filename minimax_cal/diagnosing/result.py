@@ -8,13 +8,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
+from minimax_cal.evidence.limits import BAND, ENOUGH, FIRM, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.files import finite, json_text, number, write_whole
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy
@@ -26,7 +29,11 @@ from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.solvers.status import Status
 
+if TYPE_CHECKING:
+    from minimax_cal.diagnosing.remainder import Remainder
+
 SCHEMA = 1
+CURVE = ("q_rad", "turn_rad", "sigma_rad")
 SURE = 1e-15  # a smaller chance is as good as none
 SHOWN_LINES = 12  # lines of a fault that are told one by one
 FAULTS = {
@@ -34,7 +41,12 @@ FAULTS = {
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
 }
+PEOPLES = {  # how people read a unit of the file
+    "rad": (1e3, "mrad"),
+    "rad/(N m)": (1e3, "mrad/(N m)"),
+}
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
+NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -54,6 +66,11 @@ class Alternative:
     loss: float
     separate_with: str = ""
 
+    @property
+    def helps(self) -> bool:
+        """Whether a measurement was found that is worth its while."""
+        return bool(self.separate_with) and not self.separate_with.startswith(NONE_HELPS)
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return dict(vars(self))
@@ -69,7 +86,8 @@ class Finding:
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
-    told; empty otherwise.
+    told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
+    was found again.  curve: (3, g) of an error map: joint value, turn, sigma [rad].
     """
 
     terms: tuple[Term, ...]
@@ -86,6 +104,13 @@ class Finding:
     fixed: Mapping[str, float] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
+    again: float = 1.0
+    curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
+
+    @property
+    def established(self) -> bool:
+        """Whether it was found again whichever poses were left out."""
+        return self.again >= FIRM
 
     @property
     def term(self) -> Term:
@@ -101,21 +126,16 @@ class Finding:
     @property
     def at(self) -> str:
         """Where, in words."""
-        place = self.term.place
-        if place == "all":
-            return "of the whole arm"
-        return {"J": f"at joint {place[1:]}", "L": f"at link {place[1:]}"}.get(
-            place[0] if place[1:].isdigit() else "", f"at {place}"
-        )
+        return in_words(self.term.place)
 
     @property
-    def place(self) -> str:
-        """Where, and the lines of the file that a fault of the data concerns."""
+    def lines(self) -> str:
+        """The lines of the file that a fault of the data concerns."""
         if not self.rows:
-            return self.at
+            return ""
         more = len(self.rows) - SHOWN_LINES
         named = ", ".join(map(str, self.rows[:SHOWN_LINES]))
-        return f"{self.at} (line {named}{f' and {more} more' if more > 0 else ''})"
+        return f" (line {named}{f' and {more} more' if more > 0 else ''})"
 
     @property
     def chance(self) -> str:
@@ -128,6 +148,8 @@ class Finding:
 
         Where masses are not told, by the largest motion that it makes: mrad, or mm.
         """
+        if self.curve.size:
+            return of_curve(self.curve)
         scale, units = [1e3 if unit == "m" else 1.0 for unit in self.units], self.units
         units = tuple("mm" if unit == "m" else unit for unit in units)
         if self.motion:
@@ -150,15 +172,33 @@ class Finding:
         return {
             "effect": self.term.effect,
             "place": self.term.place,
+            "established": self.established,
+            "found_again": self.again,
             "share": finite(self.share),
             "lambda": finite(self.size),
             "chance": finite(self.p_value),
             "parameters": self.parameters(),
             "fixed": {key: finite(value) for key, value in self.fixed.items()},
+            **(
+                {"curve": dict(zip(CURVE, plain(self.curve), strict=True))}
+                if self.curve.size
+                else {}
+            ),
             "holdout_rms_mm": {"before": finite(self.before), "after": finite(self.after)},
             "alternatives": [other.to_dict() for other in self.alternatives],
             "lines": list(self.rows),
         }
+
+
+def of_curve(curve: Array) -> list[dict[str, Any]]:
+    """An error map in two numbers, for JSON.  curve: as `Finding.curve`."""
+    _, turn, sigma = curve
+    most = int(np.argmax(np.abs(turn)))
+    told = {"RMS": (rms(turn), rms(sigma)), "largest": (abs(turn[most]), sigma[most])}
+    return [
+        {"name": name, "value": float(value), "sigma": finite(float(sure)), "unit": "rad"}
+        for name, (value, sure) in told.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -178,8 +218,7 @@ class Step:
 class Diagnosis:
     """What is still wrong with a calibrated robot.
 
-    status: of the geometric fit.  verdict: one of VERDICTS.  reasons: one sentence each, why.
-    findings: by share of the gap.
+    status: of the geometric fit.  verdict: one of VERDICTS.  findings: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     sought anew without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, with its interval.
@@ -187,13 +226,13 @@ class Diagnosis:
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
+    remainder: what free functions still predict, None in an old file.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
     robot: str
     status: Status
     verdict: str
-    reasons: tuple[str, ...]
     findings: tuple[Finding, ...]
     ladder: tuple[Step, ...]
     floor: Floor
@@ -215,6 +254,7 @@ class Diagnosis:
     stated_errors: tuple[Array, Array] | None = None
     stated_curves: Mapping[str, Curve] | None = None
     nominal: Cell | None = None
+    remainder: Remainder | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -223,6 +263,21 @@ class Diagnosis:
         """For a notebook."""
         tables = "\n".join(table.html() for table in self.tables())
         return f"<p>{escape(self.headline())}</p>\n{tables}"
+
+    @cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """The verdict and why, in sentences."""
+        from minimax_cal.diagnosing.sentences import reasons
+
+        return reasons(self)
+
+    @property
+    def by_rung(self) -> list[Finding]:
+        """The findings in the order of the ladder, faults of the data first."""
+        rungs = [step.name for step in self.ladder]
+        names = [f"+ {f.term.effect} {f.term.place}" for f in self.findings]
+        at = [rungs.index(name) if name in rungs else 0 for name in names]
+        return [self.findings[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
@@ -281,6 +336,7 @@ class Diagnosis:
                     for step in self.ladder
                 ],
             },
+            "remainder": self.remainder.to_dict() if self.remainder else None,
             "noise": {
                 "instrument_mm": finite(1e3 * self.noise),
                 "joint_jitter_mrad": finite(1e3 * self.jitter),
@@ -342,30 +398,33 @@ class Diagnosis:
         )
 
     def effects_table(self) -> Table:
-        """The effects found, with what each does for held-out poses."""
-        rows = tuple(
-            (f.term.effect, f.place, f.cause, 100.0 * f.share + 0.0, f.before, f.after, f.chance)
-            for f in self.findings
-        )
-        header = (
-            "effect",
-            "place",
-            "cause",
-            "share of gap %",
-            "before mm",
-            "after mm",
-            "by chance",
-        )
-        return Table("effects found, the largest first; held-out RMS before and after", header,
-                     rows, ("", "", "", ".0f", ".4f", ".4f", ""))  # fmt: skip
+        """The effects found, with what each does for held-out poses; tentative ones last."""
+        found = sorted(self.by_rung, key=lambda f: not f.established)
+        rows: list[tuple[TableCell, ...]] = [
+            (f"{f.term.effect} {f.term.place}{f.lines}",
+             "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
+             100.0 * f.share + 0.0, f.before, f.after, f.chance,
+             "established" if f.established else "tentative")
+            for i, f in enumerate(found)
+        ]  # fmt: skip
+        title = f"effects found, rung by rung; by chance, {LEVEL:g} is rare enough"
+        header = ("effect", "cause", "share of gap %", "before mm", "after mm", "by chance",
+                  "evidence")  # fmt: skip
+        formats = ("", "", ".0f", ".4f", ".4f", "", "")
+        shown = len(header) - all(
+            f.established for f in found
+        )  # without the column that says one thing
+        return Table(title, header[:shown], tuple(row[:shown] for row in rows), formats[:shown])
 
     def parameter_table(self) -> Table:
-        """The parameters of every effect found."""
+        """The parameters of every effect found: millimetres and milliradians."""
         rows = tuple(
-            (f.term.effect, f.term.place, p["name"], p["value"], number(p["sigma"]), p["unit"])
-            for f in self.findings
+            (f.term.effect, f.term.place, p["name"], scale * p["value"],
+             scale * number(p["sigma"]), unit)
+            for f in self.by_rung
             for p in f.parameters()
-        )
+            for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
+        )  # fmt: skip
         header = ("effect", "place", "parameter", "value", "sigma", "unit")
         return Table("parameters of the effects", header, rows, ("", "", "", ".4g", ".2g", ""))
 
@@ -374,12 +433,16 @@ class Diagnosis:
         rows = tuple(
             (f"{f.term.effect} {f.term.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
              a.separate_with or "no measurement considered would")
-            for f in self.findings
+            for f in self.by_rung
             for a in f.alternatives
         )  # fmt: skip
         header = ("named", "or rather", "likeness", "power", "fits worse by",
                   "what to measure next")  # fmt: skip
-        return Table("rivals that these data do not rule out", header, rows,
+        title = (
+            f"rivals that these data do not rule out; likeness 1 is the same motion, power "
+            f"{ENOUGH:.0f} tells apart, worse by {BAND:.0f} is much"
+        )
+        return Table(title, header, rows,
                      ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
 
     def untestable_table(self) -> Table:
@@ -399,6 +462,14 @@ class Diagnosis:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+
+def in_words(place: str) -> str:
+    """A place, as at joint 2."""
+    if place == "all":
+        return "of the whole arm"
+    kind = {"J": "joint", "L": "link"}.get(place[:1]) if place[1:].isdigit() else None
+    return f"at {kind} {place[1:]}" if kind else f"at {place}"
 
 
 def load_diagnosis(path: Path | str) -> Diagnosis:

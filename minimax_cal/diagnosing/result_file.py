@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, Step
+from minimax_cal.diagnosing.remainder import Remainder
+from minimax_cal.diagnosing.result import CURVE, Alternative, Diagnosis, Finding, Step
+from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
     EARLIER,
@@ -29,6 +32,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
+BELOW = math.nextafter(FIRM, 0.0)  # what was tentative when it was written stays so
 
 
 class FallPart(Part):
@@ -51,6 +55,9 @@ class FindingPart(Part):
     holdout_rms_mm: FallPart = FallPart()
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
+    established: bool = True
+    found_again: Number = math.nan
+    curve: dict[str, list[Number]] = Field(default_factory=dict)
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -70,7 +77,30 @@ class FindingPart(Part):
             after=self.holdout_rms_mm.after,
             fixed=self.fixed,
             rows=self.lines,
+            again=1.0 if self.established else min(self.found_again, BELOW),
+            curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
+
+
+class PlacePart(Part):
+    """A share of what is still predictable."""
+
+    place: str
+    share: Number
+
+
+class RemainderPart(Part):
+    """What free functions still predict."""
+
+    predictable_mm: Number
+    where: tuple[PlacePart, ...] = ()
+    unpredictable_mm: Number
+    floor_mm: Ends | None = None
+
+    def remainder(self) -> Remainder:
+        """As the code has it."""
+        where = tuple((one.place, one.share) for one in self.where)
+        return Remainder(self.predictable_mm, where, self.unpredictable_mm, self.floor_mm)
 
 
 class RungPart(Part):
@@ -152,9 +182,9 @@ class DiagnosisPart(Part):
     robot: str
     status: Status
     verdict: Literal["none", "named", "one_of", "unknown", "not_repeatable"]
-    reasons: tuple[str, ...]
     effects: tuple[FindingPart, ...]
     gap: GapPart
+    remainder: RemainderPart | None = None
     noise: NoisePart = NoisePart()
     structure: StructurePart = StructurePart()
     where: dict[str, Any] = Field(default_factory=dict)
@@ -173,14 +203,14 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
             "minimax-cal"
         )
     if content.get("kind") != "diagnosis":
-        raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose -o")
+        raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose")
     part = checked(DiagnosisPart, content, source)
     key = "rungs" if content.get("rungs") else "cells"  # an earlier version kept two of them
     cells = tuple(
         cell_from_dict(cell, f"{source}: {key}[{i}]") for i, cell in enumerate(content.get(key, ()))
     )
     if len({(cell.robot.joints, cell.target_names) for cell in cells}) > 1:
-        raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose -o")
+        raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose")
     if key == "cells":
         return assembled(content, source, part, cells)
     return replace(assembled(content, source, part, cells[1:]), nominal=cells[0])
@@ -196,7 +226,6 @@ def assembled(
         robot=part.robot,
         status=part.status,
         verdict=part.verdict,
-        reasons=part.reasons,
         findings=tuple(finding.finding(fitted) for finding in part.effects),
         ladder=tuple(rung.rung() for rung in part.gap.ladder),
         floor=Floor(
@@ -217,6 +246,7 @@ def assembled(
         data=data,
         held=held,
         cells=cells,
+        remainder=part.remainder.remainder() if part.remainder else None,
         stated_errors=errors,
         stated_curves={name: curve.curve() for name, curve in part.curves.items()},
     )

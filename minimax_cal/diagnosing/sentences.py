@@ -1,104 +1,159 @@
-"""A diagnosis in words: each sentence states numbers that stand in the JSON."""
+"""A diagnosis in words: the verdict first, each number one that stands in the JSON."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-import numpy as np
+from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
+from minimax_cal.evidence.limits import STRUCTURE
 
-from minimax_cal.diagnosing.result import Finding, Step
-from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.measuring.floor import Floor
+NOTHING_MM = 5e-4  # of a length that is told to three digits
+SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
+NO_CHANCE = f"below {STRUCTURE:g} is no accident"
+VERDICTS = {  # what stands first
+    "none": "Verdict: none. Nothing beyond geometry and noise is established.",
+    "named": "Verdict: named, and no rival explains the errors as well.",
+    "one_of": "Verdict: one of several: these data leave more than one name for a cause.",
+    "unknown": "Verdict: unknown.",
+    "not_repeatable": "Verdict: not repeatable. The arm does not return to the same place when a "
+    "pose is repeated, and no known effect of time, load or approach explains it.",
+}
 
 
-def opening(ladder: Sequence[Step], floor: Floor) -> str:
-    """What geometry alone does."""
-    nominal, geometric = ladder[0].holdout, ladder[1].holdout
-    known = (
+def reasons(found: Diagnosis) -> tuple[str, ...]:
+    """Verdict, established causes, share, remainder, next measurement; then what is tentative."""
+    causes = [f for f in found.by_rung if f.established]
+    tentative = [f for f in found.by_rung if not f.established]
+    large = [f for f in causes if not f.share < SMALL] or causes[:1]
+    small = [f for f in causes if f not in large]
+    return tuple(
+        sentence
+        for sentence in (
+            verdict(found, causes),
+            listed("Cause", large, rivals=True),
+            listed(f"Small, each below {100 * SMALL:.0f} % of the gap", small),
+            shrunk(found),
+            remaining(found),
+            away(found),
+            next_measurement(causes),
+            listed("Tentative, and no cause yet", tentative),
+        )
+        if sentence
+    )
+
+
+# ---- the sentences -----------------------------------------------------------------------------
+
+
+def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
+    """The verdict, and of an unknown one why."""
+    text = VERDICTS[found.verdict]
+    if found.verdict != "unknown":
+        return text
+    what = "the causes below leave" if causes else "geometry leaves"
+    guess = "these names are a best guess" if causes else "the cause is unknown"
+    if not found.structure < STRUCTURE:  # it is the names that do not hold
+        return f"{text} {found.structure_in[:1].upper()}{found.structure_in[1:]}: {guess}."
+    return (
+        f"{text} What {what} is not noise ({found.structure_in}: by chance {found.structure:.1g}, "
+        f"{NO_CHANCE}), and no known effect explains it: {guess}."
+    )
+
+
+def listed(title: str, findings: Sequence[Finding], *, rivals: bool = False) -> str:
+    """Effects in the order of the ladder, those of one kind together; with their rivals."""
+    kinds: dict[str, list[Finding]] = {}
+    for finding in findings:
+        kinds.setdefault(finding.term.effect, []).append(finding)
+    parts = []
+    for effect, same in kinds.items():
+        why = f" ({same[0].cause})" if rivals else ""
+        parts.append(f"{effect} {together([f.at for f in same])}{why}{lines_of(same[0])}")
+        others = {f"{a.effect} {in_words(a.place)}" for f in same for a in f.alternatives}
+        if rivals and others:
+            parts[-1] += f", or else {' or '.join(sorted(others))}"
+    many = "s" if title == "Cause" and len(findings) > 1 else ""
+    return f"{title}{many}: {'; '.join(parts)}." if parts else ""
+
+
+def together(places: Sequence[str]) -> str:
+    """Several places in a few words, as at joint 2, 1 and 3."""
+    kinds = [place.rpartition(" ")[0] for place in places]
+    if len(places) > 1 and len(set(kinds)) == 1:
+        numbers = [place.rpartition(" ")[2] for place in places]
+        return f"{kinds[0]} {', '.join(numbers[:-1])} and {numbers[-1]}"
+    return ", ".join(places)
+
+
+def lines_of(finding: Finding) -> str:
+    """Of joints that were read back: how much of the rest it explains."""
+    share = dict(zip(finding.names, finding.values, strict=True)).get("explained", math.nan)
+    if math.isfinite(finding.before) or not math.isfinite(share):
+        return ""
+    return f", with {100.0 * share:.0f} % of the rest along the last moves"
+
+
+def shrunk(found: Diagnosis) -> str:
+    """How far the error falls on poses that no fit has seen."""
+    nominal, geometric, last = (found.ladder[i].holdout for i in (0, 1, -1))
+    text = (
+        f"RMS error on poses that no fit has seen: nominal robot {nominal.rms_mm:.3f} mm, "
+        f"calibrated geometry {geometric.rms_mm:.3f} mm (largest {geometric.max_mm:.3f} mm)"
+    )
+    if len(found.ladder) < 3:
+        return f"{text}."
+    text += f", whole model {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm)"
+    if not math.isfinite(found.closed):
+        return f"{text}."
+    low, high = (100.0 * end for end in found.closed_ci)
+    ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
+    return f"{text}; {100.0 * found.closed:.0f} % of the gap to the noise is closed{ends}."
+
+
+def remaining(found: Diagnosis) -> str:
+    """What is left: what could be predicted, what could not, what noise alone would leave."""
+    floor = found.floor
+    noise = (
         f"{floor.value:.3f} mm ({floor.source})"
         if floor.certain
-        else (f"at most {floor.value:.3f} mm, the noise of the fit")
+        else f"at most {floor.value:.3f} mm, the noise of the fit"
     )
+    left = found.remainder
+    if left is None:
+        return f"Noise alone would leave {noise}."
+    if left.predictable_mm < NOTHING_MM:
+        return f"What remains follows nothing known; noise alone would leave {noise}."
+    where = ", ".join(f"{in_words(place)} {100.0 * share:.0f} %" for place, share in left.where[:3])
+    told = f" ({where})" if where else ""
     return (
-        f"On poses that no fit has seen, the nominal robot misses by {nominal.rms_mm:.3f} mm RMS, "
-        f"the geometrically calibrated one by {geometric.rms_mm:.3f} mm (largest "
-        f"{geometric.max_mm:.3f} mm); noise alone would leave {known}."
+        f"Of what remains, {left.predictable_mm:.3f} mm follow the pose{told}, "
+        f"{left.unpredictable_mm:.3f} mm follow nothing known; noise alone would leave {noise}."
     )
 
 
-def named(finding: Finding) -> str:
-    """One effect."""
-    if not np.isfinite(finding.before):
-        amounts = dict(zip(finding.names, finding.values, strict=True))
-        share = amounts.get("explained", float("nan"))
-        seen = f"; {100.0 * share:.0f} % of the rest lies along the last moves"
-        seen = seen if np.isfinite(share) else ""
-        return f"{finding.term.effect}: {finding.cause}{seen}."
-    text = (
-        f"{finding.term.effect} {finding.at} ({finding.cause}) takes the "
-        f"error from {finding.before:.3f} to {finding.after:.3f} mm"
-    )
-    if finding.alternatives:
-        others = ", ".join(f"{a.effect} {a.place}" for a in finding.alternatives)
-        text += f"; these data cannot tell it from {others}"
-    return text + "."
-
-
-def advice(finding: Finding) -> list[str]:
-    """What to measure next."""
-    by_text: dict[str, list[str]] = {}
-    for a in finding.alternatives:
-        if a.separate_with:
-            by_text.setdefault(a.separate_with, []).append(f"{a.effect} {a.place}")
-    return [f"To tell it from {' and '.join(names)}: {text}." for text, names in by_text.items()]
-
-
-def reasons(
-    verdict: str,
-    ladder: Sequence[Step],
-    floor: Floor,
-    findings: Sequence[Finding],
-    closed: float,
-    interval: tuple[float, float],
-    structure: tuple[str, float],
-    beyond: Beyond,
-) -> tuple[str, ...]:
-    """The verdict and why, in sentences.  structure: where most of it is, and its probability."""
-    out = [opening(ladder, floor)]
-    final = ladder[-1].holdout
-    if findings:
-        steps = sorted(findings[:4], key=lambda f: -f.before if np.isfinite(f.before) else -np.inf)
-        out += [named(finding) for finding in steps]
-        if len(findings) > 4:
-            out.append(f"{len(findings) - 4} smaller effects follow in the table.")
-        share = f"{100.0 * closed:.0f} %" if np.isfinite(closed) else "an unknown share"
-        bounds = (
-            f" (95 % interval {100.0 * interval[0]:.0f} to {100.0 * interval[1]:.0f} %)"
-            if np.isfinite(interval[0])
-            else ""
+def away(found: Diagnosis) -> str:
+    """How the model does on whole parts that were left out."""
+    beyond = found.beyond
+    text = beyond.sentence()
+    if beyond.worst and beyond.typical_mm > beyond.geometric_typical_mm:
+        text = text.removesuffix(".") + (
+            f"; geometry alone does better beyond them ({beyond.geometric_typical_mm:.3f} mm), so "
+            "that the effects do not carry over to places that were not measured."
         )
-        out.append(f"Together they close {share} of the gap{bounds}: {final.rms_mm:.3f} mm remain.")
-    where, p = structure
-    if verdict == "none":
-        out.append("Nothing beyond geometry and noise was found; no effect is named.")
-    elif verdict == "unknown":
-        what = "The rest" if findings else "What geometry leaves"
-        out.append(
-            f"{what} is not noise ({where}, p = {p:.1g}) and no known effect explains it: "
-            + ("the names above are a best guess." if findings else "the cause is unknown.")
-        )
-    elif verdict == "not_repeatable":
-        out.append(
-            "The arm does not return to the same place when a pose is repeated, and no known "
-            "effect of time, load or approach explains it."
-        )
-    if beyond.worst:
-        out.append(beyond.sentence())
-        if beyond.typical_mm > beyond.geometric_typical_mm:
-            out.append(
-                f"There geometry alone does better ({beyond.geometric_typical_mm:.3f} mm): the "
-                "effects do not carry over to places that were not measured."
-            )
-    for finding in findings:
-        out += advice(finding)
-    return tuple(out)
+    return text
+
+
+def next_measurement(causes: Sequence[Finding]) -> str:
+    """The one measurement that tells most rivals apart; empty where none would."""
+    by_text: dict[str, list[tuple[Finding, Alternative]]] = {}
+    for finding in causes:
+        for other in finding.alternatives:
+            if other.helps:
+                by_text.setdefault(other.separate_with, []).append((finding, other))
+    if not by_text:
+        return ""
+    text, pairs = max(by_text.items(), key=lambda entry: len(entry[1]))
+    named = " and ".join(dict.fromkeys(f"{f.term.effect} {f.at}" for f, _ in pairs))
+    others = " and ".join(dict.fromkeys(f"{a.effect} {in_words(a.place)}" for _, a in pairs))
+    return f"Next measurement: {text}, to tell {named} from {others}."

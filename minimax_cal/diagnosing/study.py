@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from minimax_cal.evidence.noise import Rows, linearised
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
@@ -55,4 +56,5 @@ def studied(robot: Robot, data: Measurements, fit: Solved) -> Study:
     if fit.effects.terms:
         model, _ = extended(model, robot, data, state, fit.effects.terms)
     scene = scene_of(robot, data, model, state)
-    return Study(robot, data, model, fit, scene, linearised(model, state, scene.jacobian))
+    rows = replace(linearised(model, state, scene.jacobian), poses=groups(data))
+    return Study(robot, data, model, fit, scene, rows)

@@ -6,13 +6,9 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.limits import BAND, ENOUGH, LIGHT, LUCK
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.selection import LEVEL
 from minimax_cal.ground.arrays import Array
-
-LIGHT = 4.0  # of fit, in the same sense
-ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
-BAND = 12.0  # of evidence: what fits worse by less may be the truth
 
 
 def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
@@ -23,7 +19,7 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
     """
     out, seen = [], {one.candidate.key, *(c.key for c in table.chosen)}
     for other in table.everyone:
-        if other.candidate.key in seen or other.evidence <= 0.0 or table.p_value(other) > LEVEL:
+        if other.candidate.key in seen or other.evidence <= 0.0:
             continue
         close = near(one, other)
         alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one

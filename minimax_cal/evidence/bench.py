@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Library
-from minimax_cal.evidence.noise import Noise
+from minimax_cal.evidence.noise import Noise, inflation
 from minimax_cal.evidence.products import within
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import EFFECTS
@@ -183,12 +183,25 @@ class Bench:
             out.append(Added(c, up, worth, ratio, variance, value[at, i], sigma))
         return out
 
-    def p_value(self, one: Added) -> float:
-        """Probability that a candidate without effect gains so much, the best of all tries."""
-        d = len(one.candidate.main)
+    def p_value(self, one: Added, wide: float = 1.0) -> float:
+        """Probability that a candidate without effect gains so much, the best of all tries.
+
+        wide: by how much the rows are noisier along it than all together, as `inflation`.
+        """
+        d = len(one.candidate.main) + one.candidate.shapes
         free = max(self.dof - d, 1)
-        ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d
+        ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d / wide
         return float(min(1.0, fdtrc(d, free, ratio) * self.tries * one.candidate.tries))
+
+    def improbable(self, one: Added, level: float) -> bool:
+        """Whether a gain is less probable than a level, by all rows and by groups of them."""
+        return self.p_value(one) < level and self.p_value(one, self.wide(one)) < level
+
+    def wide(self, one: Added) -> float:
+        """By how much rows are noisier along a candidate than all together."""
+        at = int(np.argmax(self.settings.ratios == one.ratio))
+        field, rest = self.fixed.white(self.library.fields(one.candidate)[: len(one.value)], at)
+        return inflation(one.value @ field, rest, self.library.rows.group, self.dof)
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -238,6 +251,16 @@ class Fixed:
         part = solve_triangular(self.factors[at], self.rows @ own.T, lower=True)
         return np.asarray(own @ columns.T - part.T @ part)
 
+    def white(self, columns: Array, at: int) -> tuple[Array, Array]:
+        """Columns (d, N) and the error (N,), projected, their rows of the same variance."""
+        both = np.concatenate([columns, self.error[None]]) * self.weights[at]
+        part = solve_triangular(self.factors[at], self.rows @ both.T, lower=True)
+        back = solve_triangular(self.factors[at], self.rows, lower=True)
+        left = (both / np.maximum(self.weights[at], 1e-300) - part.T @ back) * np.sqrt(
+            self.weights[at]
+        )
+        return left[:-1], left[-1]
+
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
         part = np.stack([
@@ -250,7 +273,7 @@ class Fixed:
 
 def occam(c: Candidate, gain: float) -> float:
     """What d free parameters must gain to be worth it: d (1 + log of the gain of each)."""
-    d = len(c.main)
+    d = len(c.main) + c.shapes
     return d * (1.0 + float(np.log(max(gain / d, 1.0)))) + 2.0 * float(np.log(c.tries))
 
 

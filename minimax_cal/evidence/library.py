@@ -11,9 +11,10 @@ from minimax_cal.evidence.noise import Rows
 from minimax_cal.evidence.products import Columns, Products
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
 
 GONE = 1e-8  # share of a field that poses must show
+SHAPES = FREE - {"turns", "since"}  # found by a search whose tries are counted
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 
 
@@ -30,6 +31,14 @@ class Candidate:
     doubt: Array
     owner: Array
     tries: float = 1.0
+
+    @property
+    def shapes(self) -> int:
+        """Numbers of its law that are tuned, and cost as parameters do: not those that `tries`
+        counts.
+        """
+        tuned = (value for name, value in self.term.choice.items() if name in SHAPES)
+        return int(sum(np.isfinite(value) for value in tuned))
 
     @property
     def key(self) -> tuple[str, str]:
@@ -184,7 +193,7 @@ def library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:
     """Every effect at every place in every variant that the data can test."""
     terms, untestable = [], []
     for name, effect in EFFECTS.items():
-        if name in exclude:
+        if name in exclude or effect.is_map:  # maps are sought when the rest is known
             continue
         if missing := effect.needs(scene):
             untestable.append((name, missing))

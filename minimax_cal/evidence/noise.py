@@ -10,7 +10,7 @@ Thompson 1971].
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,7 @@ class Rows:
     variance_ratio: (N,) variance of a row per variance of the joints, relative to its mean.
     size: the mean [m^2/rad^2].  count: rows that were measured.
     turn: (m, r, r) the rotations, r = 3k.  weight: (m, r) square roots of the points' weights.
+    poses: (m,) a number, from 0, of each pose, of repeats the same.
     """
 
     error: Array
@@ -41,6 +42,12 @@ class Rows:
     count: int
     turn: Array
     weight: Array
+    poses: Array
+
+    @property
+    def group(self) -> Array:
+        """(N,) the pose of each row."""
+        return np.repeat(self.poses, self.weight.shape[1])
 
     def of(self, fields: Array) -> Array:
         """(N, D) displacement fields (D, k, 3, m) as rows."""
@@ -70,10 +77,11 @@ def rows_of(error: Array, jacobian: Array, joint_jacobian: Array, weight: Array)
     spread = np.maximum(spread, 0.0).reshape(-1)
     count = 3 * int(np.count_nonzero(weight))
     size = float(spread.sum() / count)
-    bare = Rows(np.zeros(0), np.zeros((0, 0)), spread / size, size, count, turn, root)
+    alone = np.arange(m)
+    bare = Rows(np.zeros(0), np.zeros((0, 0)), spread / size, size, count, turn, root, alone)
     matrix = bare.of(np.moveaxis(jacobian, 1, 0))
     rest = bare.of(np.where(weight[:, None] > 0, error, 0.0)[None])[:, 0]
-    return Rows(rest, orthonormal(matrix), spread / size, size, count, turn, root)
+    return replace(bare, error=rest, basis=orthonormal(matrix))
 
 
 def linearised(model: Model, state: State, joint_jacobian: Array) -> Rows:
@@ -105,6 +113,23 @@ def told_apart(gram: Array) -> Array:
     values, vectors = np.linalg.eigh(gram)
     kept = values > RANK**2 * values[-1] if len(values) else np.zeros(0, dtype=bool)
     return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def inflation(field: Array, rest: Array, group: Array, dof: int) -> float:
+    """How much noisier rows are along a field than all together, as groups of them tell it, >= 1.
+
+    By the jackknife, no group judging itself: wrong points, an instrument whose directions differ,
+    and groups whose rows err alike give a field no more weight than they deserve.  field: (N,) as
+    fitted, and rest: (N,) without it, both white.  group: (N,) from 0.
+    """
+    own = np.bincount(group, field * field)
+    whole = float(own.sum())
+    if whole <= 0.0:
+        return 1.0
+    rest = rest - field
+    pull = np.bincount(group, field * rest) / np.maximum(1.0 - own / whole, 0.1)
+    variance = max(float(rest @ rest) / max(dof, 1), 1e-300)
+    return max(float(pull @ pull) / (whole * variance), 1.0)
 
 
 @dataclass(frozen=True)

@@ -14,20 +14,23 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
 from minimax_cal.evidence.library import Candidate, Library
+from minimax_cal.evidence.limits import (
+    CONTENDERS,
+    EXACT,
+    LEAST_DOF,
+    LEVEL,
+    MOST,
+    NEAR,
+    REFINED,
+    TIE,
+    TUNINGS,
+)
 from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
-LEVEL = 0.005  # chance of any false name on data without an effect
-EXACT = 1e-8  # noise below which data were computed, not measured [m]
-TIE = 2.0  # of evidence that a replacement must gain
-SMALL, PLENTY = 0.02, 2000.0  # of degrees of freedom beyond so many: less gain is no matter
-REFINED = 6  # effects among which each is compared anew with all others
-NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
-TUNINGS = 3  # rounds of a finer search
-LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -65,11 +68,12 @@ class Choice:
         return remaining(rows, weight, self.known)
 
 
-def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
+def select(lib: Library, most: int = MOST, *, ripple: bool = True, level: float = LEVEL) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
-    at.  most: effects at most.  ripple: whether to look for lines of gears besides.
+    at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
+    of a false name on data without an effect.
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
@@ -85,10 +89,10 @@ def select(lib: Library, most: int = 20, *, ripple: bool = True) -> Choice:
         if table.dof < LEAST_DOF:
             break
         tables[tuple(id(c) for c in table.chosen)] = table
-        lib, best = addition(lib, table)
+        lib, best = addition(lib, table, level)
         if not best:
             break
-        lib, fits = refined(lib, [*fits, *best])
+        lib, fits = refined(lib, [*fits, *best], level)
         noise = noise_beside(lib, fits)
     benches = []
     for i, one in enumerate(fits):
@@ -118,34 +122,32 @@ def without(fits: Sequence[Added], number: int) -> tuple[list[Candidate], list[A
 
 
 def repeated(c: Candidate, chosen: Sequence[Candidate]) -> bool:
-    """Whether an effect is at a place already; lines may be many."""
+    """Whether an effect is at a place already; lines of one cause may be several."""
     same = [other for other in chosen if other.key == c.key]
-    return any(c.tries == 1.0 or other is c for other in same)
+    several = EFFECTS[c.term.effect].lines and c.term.place != "all"
+    return any(not several or other.term.text == c.term.text for other in same)
 
 
-def addition(lib: Library, table: Bench) -> tuple[Library, list[Added]]:
+def addition(lib: Library, table: Bench, level: float) -> tuple[Library, list[Added]]:
     """The candidate that adds most evidence and passes the gate; none if none does.
 
     The best few are tuned before they are compared.
     """
-    ranked = [one for one in table.everyone if one.evidence > 0.0]
-    open_ones = [
-        one for one in ranked
-        if not repeated(one.candidate, table.chosen)
-        and table.p_value(one) < LEVEL
-        and one.gain > SMALL * (table.dof - PLENTY)
-    ]  # fmt: skip
-    if not open_ones:
-        return lib, []
-    best = open_ones[0]
+    best: Added | None = None
     seen: set[tuple[str, str]] = set()
-    for one in open_ones:
-        close = one.evidence > open_ones[0].evidence - max(NEAR, 0.2 * open_ones[0].gain)
-        if close and one.candidate.key not in seen and len(seen) < CONTENDERS:
+    for one in (one for one in table.everyone if one.evidence > 0.0):
+        if best and one.evidence < best.evidence - max(NEAR, 0.2 * best.gain):
+            break
+        if one.candidate.key in seen or repeated(one.candidate, table.chosen):
+            continue
+        if table.improbable(one, level):
             seen.add(one.candidate.key)
-            better = tuned(table, one)
-            lib, better = adopted(lib, better, one.candidate)
-            best = better if better.evidence > best.evidence or one is best else best
+            lib, better = adopted(lib, tuned(table, one), one.candidate)
+            best = better if not best or better.evidence > best.evidence else best
+        if len(seen) == CONTENDERS:
+            break
+    if not best:
+        return lib, []
     lib, stored = lib.stored(best.candidate)
     return lib, [replace(best, candidate=stored)]
 
@@ -175,7 +177,7 @@ def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Adde
     return replace(lib, candidates=kept), replace(one, candidate=found)
 
 
-def refined(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
+def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, list[Added]]:
     """Replace each effect by any that does better, and drop what is no longer needed."""
     if len(fits) == 1:
         return lib, fits
@@ -191,8 +193,8 @@ def refined(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True
-            elif table.p_value(own) > LEVEL:
-                return refined(lib, others)
+            elif table.p_value(own) > level:
+                return refined(lib, others, level)
             else:
                 fits[number] = own
         if not changed:

@@ -164,7 +164,7 @@ def needed(poses: Poses, part: Array) -> bool:
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     whole, rest = (
         np.sqrt(np.maximum(np.linalg.eigvalsh(one / np.outer(scale, scale)), 0.0))
-        for one in (gram, gram - poses.gram[part].sum(axis=0))
+        for one in (gram, gram - poses.gram_of(part))
     )
     condition = whole[-1] / max(whole[0], 1e-300)
     return bool(rest[0] <= RANK * rest[-1] or rest[-1] > WORSE * condition * rest[0])
@@ -173,7 +173,7 @@ def needed(poses: Poses, part: Array) -> bool:
 def step_without(poses: Poses, part: Array) -> Array:
     """(p,) the step of the free parameters once some poses are left out.  part: mask (m,)."""
     pull = poses.score[~part].sum(axis=0) + poses.prior * poses.off
-    return solve_normal(poses.bread - poses.gram[part].sum(axis=0), pull[:, None])[:, 0]
+    return solve_normal(poses.bread - poses.gram_of(part), pull[:, None])[:, 0]
 
 
 def without(estimator: Estimator, state: State, parts: Sequence[Array]) -> list[State | None]:

@@ -92,6 +92,7 @@ def calibrate(
     instrument: str | None = None,
     fix: str | Sequence[str] = (),
     free: str | Sequence[str] = (),
+    only: str = "",
     priors: Mapping[str, float | str] | None = None,
     method: str = AUTO,
     lever: float | None = None,
@@ -113,7 +114,8 @@ def calibrate(
     ...) or region, whose poses are held out together.  instrument: u95 of a coordinate, as
     10um+2.5um/m, where the data do not say.  cv: judge every pose by a fit without it, which is
     done anyway where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list
-    or a text with commas. priors: sigma of a parameter's deviation from nominal, by name [m, rad],
+    or a text with commas.  only: offsets, for the joints' zero positions alone.
+    priors: sigma of a parameter's deviation from nominal, by name [m, rad],
     or a text as 0.5mm.  method: of the least squares.  lever: what a radian counts as in the pose
     objective [m], the targets' own unless given.  hessian: gauss-newton or bfgs.  distance: form of
     the distance constraints, two-sided, squared or off; distance_tolerance: theirs [m], as measured
@@ -136,6 +138,7 @@ def calibrate(
         instrument=instrument,
         fix=listed(fix),
         free=listed(free),
+        only=only,
         priors=sigmas_of(priors or {}),
         method=method,
         lever=lever,

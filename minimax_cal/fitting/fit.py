@@ -24,7 +24,7 @@ from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
@@ -32,8 +32,11 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
+from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, saved_content
+from minimax_cal.modelling.effects.scene import joint_of
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
 from minimax_cal.robots.robot import Robot
@@ -429,6 +432,14 @@ class Fit:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m]."""
         return self.cell.predict(q)
 
+    def inverse(self, pose: Array, near: Array | None = None) -> Array:
+        """Joints (..., n) that bring the flange to poses in the base, effects counted.
+
+        pose: (..., 4, 4) [m].  near: joints to start from, (n,) or (..., n), which choose among the
+        ways of the arm [rad, m].  More: `Cell.inverse`; without effects: `Robot.inverse`.
+        """
+        return self.cell.inverse(pose, near)
+
     def plot(self) -> Any:
         """Errors before and after, as a matplotlib figure.  Raises OptionError without it."""
         # reporting stands below; what it needs is imported when a picture is asked for
@@ -479,14 +490,25 @@ class Fit:
         return parameter_table(p for p in self.parameters if not p.of_effect)
 
     def effect_table(self) -> Table:
-        """The parameters of effects beyond geometry, as in the files; empty without any."""
-        rows = tuple(
+        """The parameters of effects beyond geometry, as in the files; empty without any.
+
+        A curve with many is one row: its RMS as the poses show it.
+        """
+        maps = [term for term in self.cell.effects.terms if EFFECTS[term.effect].is_map]
+        labels = tuple(f"{term.label}." for term in maps)
+        rows: list[tuple[TableCell, ...]] = [
             (p.name, p.written[1], p.value * p.written[0], p.sigma * p.written[0], p.why_not)
             for p in self.parameters
-            if p.of_effect
-        )
+            if p.of_effect and not p.name.startswith(labels)
+        ]
+        if maps:
+            scene, effects = self.cell.scene(with_history(self.data)), self.cell.effects
+            for term in maps:
+                own = effects.values[effects.terms.index(term)]
+                turn = Fitted((term,), (own,)).turn(scene)[:, joint_of(term.place)]
+                rows.append((f"{term.label} RMS", "rad", rms(turn), math.nan, ""))
         header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
-        return Table("effects beyond geometry", header, rows, ("", "", ".4g", ".2g", ""))
+        return Table("effects beyond geometry", header, tuple(rows), ("", "", ".4g", ".2g", ""))
 
     def headline(self) -> str:
         """The result in a sentence or two."""

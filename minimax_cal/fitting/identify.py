@@ -148,7 +148,8 @@ def identify(
     kept = kept.without(redundant(plain, kept.active & geometric, order, RANK), SAME_MOTION)
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
-    return kept.identification(gram, scale, names.target_names, "all targets moved together")
+    curves = gram + np.diag(np.where(known & ~geometric, np.diag(gram), 0.0))  # a prior holds them
+    return kept.identification(curves, scale, names.target_names, "all targets moved together")
 
 
 def gram_of(model: Model, state: State) -> Array:

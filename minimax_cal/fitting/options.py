@@ -23,6 +23,7 @@ from minimax_cal.solvers.least_squares import AUTO, METHODS
 from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 
+OFFSETS = "offsets"  # what `only` may ask for
 FALLBACK = "daqp"  # a required package
 FUNCTION = "function "  # before the name of a QP solver that is none of the backends
 TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
@@ -73,7 +74,7 @@ class Options:
     region; None for poses that repeat each other or stand in a cluster.
     cv: judge every pose by a fit without it, however many are held out.
     instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
-    fix, free: names or patterns as ``beta*``.
+    fix, free: names or patterns as ``beta*``.  only: offsets, for the joints' zero positions alone.
     priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
     method: of the least squares.  hessian: gauss-newton or bfgs.  distance: form of the
     distance constraints, two-sided, squared or off.  distance_tolerance: [m], None for the
@@ -129,11 +130,18 @@ class Options:
         many=tuple,
         group="What is fitted",
     )
+    only: str = option(
+        "",
+        "Fit the joints' zero positions alone: offsets.",
+        metavar="offsets",
+        group="What is fitted",
+    )
     instrument: str | None = option(
         None,
         "u95 of a coordinate, where the data have no column for it: it weighs the points and tells "
         "the noise floor.",
         metavar="10um+2.5um/m",
+        group="What is known",
     )
     priors: Mapping[str, float] = option(
         dict,
@@ -230,6 +238,8 @@ def check_options(options: Options) -> None:
     ):
         if value not in choices:
             raise OptionError(f"no {name} {value!r}; choose {', '.join(choices)}")
+    if options.only not in ("", OFFSETS):
+        raise OptionError(f"only {options.only!r}: the only choice is {OFFSETS}")
     check_robust(options.loss, options.trim)
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")

@@ -14,7 +14,7 @@ from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
-from minimax_cal.fitting.options import Options, Progress, objective_of, silent, solver_of
+from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.fitting.stations import steps_of, turned_in
@@ -150,24 +150,25 @@ class Task:
             np.concatenate([np.arange(count, count + more), self.order]),
             allowed=np.pad(self.allowed, (0, more), constant_values=True),
             reference=self.reference,
-            known=np.pad(np.isfinite(self.sigma), (0, more)),
+            known=np.concatenate([np.isfinite(self.sigma), model.prior.weight[count:] > 0.0]),
             resolution=self.options.resolution,
         )
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
-        if not np.isfinite(self.sigma).any():
+        sigma, own = self.sigma, model.prior.weight[len(self.sigma) :]
+        if not np.isfinite(sigma).any():
             return model, nearby(model, begin, self.options.method)
-        sigma = np.pad(self.sigma, (0, len(model.fields)), constant_values=np.inf)
         points = float(model.counts.sum())
         mean_square = self.frame.mean_square / 3.0
         for _ in range(PRIOR_ROUNDS):
-            model = model.with_prior(Prior(model.prior.mean, mean_square / sigma**2))
+            weight = np.concatenate([mean_square / sigma**2, own])
+            model = model.with_prior(Prior(model.prior.mean, weight))
             found = nearby(model, begin, self.options.method)
             state = found.x.take(np.array(0))
             _, _, gram = SumOfSquares(model).normal(state)
-            weight = np.diag(model.prior.weight[model.active])
-            paid = np.trace(solve_normal(gram, gram - weight))  # parameters the data pay for
+            known = np.diag(weight[model.active])
+            paid = np.trace(solve_normal(gram, gram - known))  # parameters the data pay for
             previous = mean_square
             dof = max(3.0 * points - paid, 1.0)
             mean_square = max(float(model.cost(state).sum()) / dof, LEAST_NOISE**2)
@@ -281,6 +282,10 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     """What the user asked of the parameters: allowed (p,), order to give up, prior sigma (p,)."""
     names = model.names
     allowed = ~names.match(options.fix, "fix")
+    if options.only == OFFSETS:
+        n, zeros = robot.joints, np.zeros(names.count, dtype=bool)
+        zeros[np.arange(n) + np.where(robot.prismatic, n, 2 * n)] = True
+        allowed &= zeros | ~names.links
     order = identify.drop_order(robot, names)
     kept = names.match(options.free, "free")
     if (kept & ~allowed).any():

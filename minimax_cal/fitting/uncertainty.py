@@ -21,6 +21,7 @@ from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, row
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
 from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
@@ -92,6 +93,7 @@ class Poses:
     arm: (m, r, n) motion of the points per unit of each joint.
     weighted: (m, r, p) A times `jacobian`.
     off, prior: (p,) how far the parameters are from the prior's mean, and its weights.
+    beside: (p,) variance beside which a prior was weighed, 0 for a typical coordinate [m^2].
     seen: (k, m) which points were measured.
     """
 
@@ -101,6 +103,7 @@ class Poses:
     weighted: Array
     off: Array
     prior: Array
+    beside: Array
     seen: Array
 
     @staticmethod
@@ -120,6 +123,7 @@ class Poses:
             weighted = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * jacobian
         joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
         off = (model.prior.mean - model.values(state))[model.active]
+        geometric = model.names.geometric
         return Poses(
             error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
             jacobian=jacobian,
@@ -127,6 +131,9 @@ class Poses:
             weighted=weighted,
             off=off,
             prior=model.prior.weight[model.active],
+            beside=np.repeat([0.0, BESIDE**2], [geometric, model.names.count - geometric])[
+                model.active
+            ],
             seen=model.seen,
         )
 
@@ -143,10 +150,10 @@ class Poses:
         count = 3.0 * np.count_nonzero(self.seen)
         return float((self.error**2).sum()) / max(count - paid, 1.0)
 
-    @cached_property
-    def gram(self) -> Array:
-        """(m, p, p) J'A J of each pose."""
-        return np.asarray(np.swapaxes(self.jacobian, -1, -2) @ self.weighted)
+    def gram_of(self, part: Array) -> Array:
+        """(p, p) J'A J of some poses.  part: mask (m,)."""
+        p = self.jacobian.shape[-1]
+        return np.asarray(self.jacobian[part].reshape(-1, p).T @ self.weighted[part].reshape(-1, p))
 
     @cached_property
     def score(self) -> Array:
@@ -279,35 +286,39 @@ def by_poses(poses: Poses, group: Array) -> Array:
     """The jackknife over poses: (p, p) of the free parameters [SI].
 
     (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
-    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  group: (m,) rows with the same
-    number are one pose.  NaN where the fit needs one of the poses.
+    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  With C = H^-1 and L = J C J'A it is
+    C J'A (1 - L)^-1 e.  group: (m,) rows with the same number are one pose.  NaN where the fit
+    needs one of the poses.
     """
-    _, member = np.unique(group, return_inverse=True)
-    count, p = int(member.max()) + 1, poses.jacobian.shape[-1]
-    gram, score = summed(poses.gram, member, count), summed(poses.score, member, count)
-    try:
-        np.linalg.cholesky((1.0 - ALONE) * poses.bread - gram)
-    except np.linalg.LinAlgError:
-        return np.full((p, p), np.nan)
-    change = solve_normal(poses.bread - gram, score[..., None])[..., 0]
+    member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
+    order, count, p = (
+        np.argsort(member.reshape(-1), kind="stable"),
+        len(sizes),
+        poses.bread.shape[0],
+    )
+    cover, ends = solve_normal(poses.bread, np.eye(p)), np.cumsum(sizes)
+    total = np.zeros((p, p))
+    for size in np.unique(sizes):  # groups of as many rows at once
+        rows = order[(ends[sizes == size] - size)[:, None] + np.arange(size)]
+        jacobian, weighted = (
+            part[rows].reshape(len(rows), -1, p) for part in (poses.jacobian, poses.weighted)
+        )
+        back = cover @ np.swapaxes(weighted, 1, 2)
+        lever = jacobian @ back
+        if not (np.linalg.eigvals(lever).real < 1.0 - ALONE).all():
+            return np.full((p, p), np.nan)
+        error = poses.error[rows].reshape(len(rows), -1, 1)
+        change = (back @ np.linalg.solve(np.eye(lever.shape[1]) - lever, error))[..., 0]
+        total += change.T @ change
     prior = sandwich(poses, np.zeros((p, p)))
-    return np.asarray((count - 1) / count * change.T @ change + prior)
-
-
-def summed(values: Array, member: Array, count: int) -> Array:
-    """(count, ...) sums over the rows (m, ...) with the same number.  member: (m,)."""
-    out = np.zeros((count, *values.shape[1:]))
-    if count == len(member):  # each alone
-        out[member] = values
-    else:
-        np.add.at(out, member, values)
-    return out
+    return np.asarray((count - 1) / count * total + prior)
 
 
 def sandwich(poses: Poses, meat: Array) -> Array:
-    """H^-1 F H^-1.  A prior is rows as noisy as a typical one: its weight times their variance."""
+    """H^-1 F H^-1.  A prior is rows as noisy as what it was weighed beside."""
     if poses.prior.any():
-        meat = meat + poses.mean_square * np.diag(poses.prior)
+        variance = np.where(poses.beside > 0.0, poses.beside, poses.mean_square)
+        meat = meat + np.diag(variance * poses.prior)
     half = solve_normal(poses.bread, meat)
     return np.asarray(solve_normal(poses.bread, half.T))
 
@@ -409,7 +420,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     """From the JSON of a calibration: its key `covariance`.  Raises CalibrationError."""
     if "covariance" not in content:
         raise CalibrationError(
-            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate -o"
+            f"{source}: does not hold a covariance; write it again with minimax-cal calibrate"
         )
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)

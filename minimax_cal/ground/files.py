@@ -16,6 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
+MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
 
 
 def write_whole(path: Path | str, content: str | bytes) -> None:
@@ -88,8 +89,21 @@ def json_text(content: object) -> str:
 
 
 def json_of(text: str | bytes) -> Any:
-    """JSON whose every key stands once.  Raises ValueError: NaN and Infinity are no JSON either."""
-    return json.loads(text, parse_constant=refuse, object_pairs_hook=once)
+    """JSON whose every key stands once, of numbers to reckon with; NaN and Infinity are no JSON.
+
+    Raises ValueError.
+    """
+    return json.loads(
+        text, parse_constant=refuse, object_pairs_hook=once, parse_float=within, parse_int=within
+    )
+
+
+def within(text: str) -> float:
+    """A number, an integer where it is one.  Raises ValueError beyond MOST."""
+    value = float(text)
+    if not abs(value) <= MOST:
+        raise ValueError(f"the number {text[:20]} cannot be; at most {MOST:g}")
+    return int(text) if text.lstrip("-").isdigit() else value
 
 
 def refuse(constant: str) -> float:

@@ -64,19 +64,19 @@ def number(text: str) -> float:
         return math.nan
 
 
-def triple(text: str, flag: str) -> tuple[float, ...]:
+def triple(text: str, name: str) -> tuple[float, ...]:
     """Three lengths in millimetres, in metres.  Raises OptionError."""
     parts = [number(part) for part in text.split(",")]
     if len(parts) != 3 or not all(map(math.isfinite, parts)):
-        raise OptionError(f"{flag} {text!r}: give x,y,z in mm, as 3000,0,500")
+        raise OptionError(f"{name}={text!r}: give x,y,z in mm, as 3000,0,500")
     return tuple(1e-3 * part for part in parts)
 
 
-def pair(text: str, flag: str, scale: float) -> tuple[float, float]:
+def pair(text: str, name: str, scale: float) -> tuple[float, float]:
     """LOW:HIGH in SI.  Raises OptionError."""
     parts = [scale * number(part) for part in text.split(":")]
     if len(parts) != 2 or any(map(math.isnan, parts)):
-        raise OptionError(f"{flag} {text!r}: give low:high, as 0.5:20")
+        raise OptionError(f"{name}={text!r}: give low:high, as 0.5:20")
     if not parts[0] < parts[1]:
-        raise OptionError(f"{flag} {text!r}: the limits are reversed; give low:high")
+        raise OptionError(f"{name}={text!r}: the limits are reversed; give low:high")
     return parts[0], parts[1]

@@ -23,6 +23,7 @@ from pydantic_core.core_schema import no_info_before_validator_function
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
+from minimax_cal.ground.files import MOST
 
 AGAIN = "write it again with minimax-cal"
 FAULTS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -124,6 +125,8 @@ def unpacked(part: Packed) -> Array:
     raw = np.frombuffer(base64.b64decode(part.float64, validate=True), dtype="<f8")
     if raw.size != math.prod(part.shape):
         raise ValueError(f"{raw.size} numbers in place of {math.prod(part.shape)}")
+    if np.any(np.abs(raw[np.isfinite(raw)]) > MOST):
+        raise ValueError(f"holds a number beyond {MOST:g}")
     return np.array(raw.reshape(part.shape), dtype=float)
 
 

@@ -64,11 +64,25 @@ class Grid:
     median height of the samples and a fifth of the arm's reach [m].
     """
 
-    samples: int = option(100_000)
-    bins: int = option(40, "Along the wider side of a section.")
-    height: float = option(np.nan, "Of the horizontal section [default: the median].", "mm")
-    slab: float = option(np.nan, "Its thickness [default: a fifth of the reach].", "mm")
-    seed: int = option(0, "Of the samples.")
+    samples: int = option(
+        100_000, "The number of arm postures that are predicted.", group="The sections"
+    )
+    bins: int = option(
+        40, "The number of bins along the wider side of a section.", group="The sections"
+    )
+    height: float = option(
+        np.nan,
+        "The height of the horizontal section [default: the median].",
+        "mm",
+        group="The sections",
+    )
+    slab: float = option(
+        np.nan,
+        "How thick a section is [default: a fifth of the reach].",
+        "mm",
+        group="The sections",
+    )
+    seed: int = option(0, "The seed of the samples.", group="The sections")
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,11 @@ class Floor:
         return self.source != AT_MOST
 
     @property
+    def ends(self) -> tuple[float, float] | None:
+        """Between which it is [mm], where it is known by more than what the fit leaves."""
+        return (self.low, self.high) if self.certain else None
+
+    @property
     def least(self) -> float:
         """The floor to take off where the gap is not to be told too small [mm]."""
         return self.value if self.certain else 0.0

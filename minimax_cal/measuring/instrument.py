@@ -34,7 +34,7 @@ def instrument_of(text: str) -> Instrument:
     except ValueError:
         base, more = 0.0, 0.0
     if not 0.0 < base < 1.0 or more > 1e-2:
-        raise OptionError(f"--instrument {text!r}: write u95 as 10um+2.5um/m, or as 0.05mm")
+        raise OptionError(f"instrument={text!r}: write u95 as 10um+2.5um/m, or as 0.05mm")
     return Instrument(base, more)
 
 
@@ -47,7 +47,7 @@ def with_instrument(data: Measurements, text: str | None) -> Measurements:
         return data
     told = instrument_of(text)
     if "u95" in data.columns:
-        said = f"{data.source}: column u95_mm is used, not --instrument {text}"
+        said = f"{data.source}: column u95_mm is used, not instrument={text!r}"
         return replace(data, notices=(*data.notices, said))
     reach = np.linalg.norm(data.y, axis=-1)
     far = np.where(np.isfinite(reach), reach, 0.0).sum(axis=1) / np.maximum(data.seen.sum(1), 1)

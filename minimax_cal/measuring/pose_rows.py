@@ -67,6 +67,6 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
     except (KeyError, TypeError, ValueError, AttributeError, DataError) as error:
         raise DataError(
             f"{source}: its list of poses cannot be read ({said(error)}); write the file "
-            "again with minimax-cal calibrate -o"
+            "again with minimax-cal calibrate"
         ) from error
     return Measurements(data.q, data.y, names, sliding, line, columns, source=source), held

@@ -20,7 +20,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted_from_list
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import rotation, rotation_vector
-from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.robot import Robot, checked_poses, robot_from_dict, told_missing
 
 LATE = 0.1  # of a session: so far beyond its ends, effects of time are not extrapolated silently
 
@@ -77,6 +77,19 @@ class Cell:
         pose = self.base @ self.robot.pose(q)
         turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.target_positions)
         return np.asarray(turned + pose[:, None, :3, 3])
+
+    def inverse(self, pose: Array, near: Array | None = None) -> Array:
+        """Joints (..., n) that bring the flange to poses in the base, effects counted.
+
+        pose: (..., 4, 4) [m].  near: joints to start from, (n,) or (..., n), which choose among the
+        ways of the arm [rad, m]; without it any way will do.  Effects are those of an arm at rest,
+        and of them those that move the flange.  What cannot be reached ends nearby, with a
+        CalibrationWarning.  Raises RobotError for what is no pose.
+        """
+        from minimax_cal.modelling.reach import joints_at
+
+        given = checked_poses(pose, near, self.robot.joints)
+        return told_missing(*joints_at(self, *given))
 
     def placed(self, data: Measurements) -> Measurements:
         """The data in the first frame of the fit's sessions, with the fit's clock."""
@@ -200,7 +213,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(
             f"{source}: is not a saved calibration (robot, base, targets_mm: {said(error)}); "
-            "write one with minimax-cal calibrate -o"
+            "write one with minimax-cal calibrate"
         ) from error
     if not np.abs(spots).max(initial=0.0) <= FARTHEST:
         raise CalibrationError(f"{source}: targets are not plausible numbers")

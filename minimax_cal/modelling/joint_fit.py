@@ -11,7 +11,14 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import Fitted, Term, fields_of, names_of, of_sessions
+from minimax_cal.modelling.effects.table import (
+    Fitted,
+    Term,
+    fields_of,
+    names_of,
+    of_sessions,
+    ridge_of,
+)
 from minimax_cal.modelling.model import Model, Prior, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State
@@ -55,9 +62,11 @@ def extended(
         fields=fields,
         moved=moved,
         active=np.concatenate([model.active[:count], np.ones(more, dtype=bool)]),
-        prior=Prior(*(np.concatenate([part[:count], np.zeros(more)])
-                      for part in (prior.mean, prior.weight))),
-    ), replace(state, effects=values)  # fmt: skip
+        prior=Prior(
+            np.concatenate([prior.mean[:count], np.zeros(more)]),
+            np.concatenate([prior.weight[:count], ridge_of(terms, scene)]),
+        ),
+    ), replace(state, effects=values)
 
 
 def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:

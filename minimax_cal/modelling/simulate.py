@@ -32,17 +32,31 @@ class Truth:
     """
 
     length: float = option(
-        0.5e-3, "Standard deviation of the errors of a and d.", "mm", flag="--length-error"
+        0.5e-3,
+        "The standard deviation of the errors of a and d.",
+        "mm",
+        flag="--length-error",
+        group="The arm",
     )
     angle: float = option(
         1.0e-3,
-        "Standard deviation of the errors of theta, alpha, beta.",
+        "The standard deviation of the errors of theta, alpha, beta.",
         "mrad",
         flag="--angle-error",
+        group="The arm",
     )
-    compliance: float = option(3.0e-7, "Turn of each joint under gravity's torque.", "urad/Nm")
-    noise: float = option(10e-6, "Standard deviation of a coordinate at the instrument.", "um")
-    noise_per_metre: float = option(2.5e-6, "Its growth with range.", "um/m")
+    compliance: float = option(
+        3.0e-7, "How far each joint turns under gravity's torque.", "urad/Nm", group="The arm"
+    )
+    noise: float = option(
+        10e-6,
+        "The standard deviation of a coordinate at the instrument.",
+        "um",
+        group="The instrument",
+    )
+    noise_per_metre: float = option(
+        2.5e-6, "How that noise grows with range.", "um/m", group="The instrument"
+    )
     distance: float = 3.0
     circle: float = 0.1
     span: float = np.pi

@@ -81,7 +81,7 @@ def limits_of(
         names = ", ".join(str(i + 1) for i in open_ones)
         notices.append(
             f"{robot.name} has no limits for joint {names}: +-180 deg are taken (slides +-500 mm); "
-            "narrow them with --joint"
+            "narrow them with joints="
         )
     return lower, upper, tuple(notices)
 
@@ -168,13 +168,13 @@ def judged(
 
 
 MENDS = {
-    "floor": "give --floor where it is lower",
-    "volume": "make --volume larger",
-    "self-collision": "give a thinner body with --body",
-    "acceptance": "give another --tracker, --normals or a wider --acceptance",
-    "range": "give another --tracker or --range",
-    "elevation": "give another --tracker or --elevation",
-    "line of sight": "give another --tracker or a thinner body with --body",
+    "floor": "give floor= where it is lower",
+    "volume": "make volume= larger",
+    "self-collision": "give a thinner body as body=",
+    "acceptance": "give another tracker=, normals= or a wider acceptance=",
+    "range": "give another tracker= or reach=",
+    "elevation": "give another tracker= or elevation=",
+    "line of sight": "give another tracker= or a thinner body as body=",
 }
 
 

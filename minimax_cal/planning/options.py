@@ -27,8 +27,8 @@ def box(text: str) -> tuple[tuple[float, ...], ...]:
     """LOW:HIGH of x, y and z in millimetres, as corners in metres.  Raises OptionError."""
     axes = text.split(",")
     if len(axes) != 3:
-        raise OptionError(f"--volume {text!r}: give x, y and z, as 700:1700,-500:500,300:1300")
-    limits = [pair(axis, "--volume", 1e-3) for axis in axes]
+        raise OptionError(f"volume={text!r}: give x, y and z, as 700:1700,-500:500,300:1300")
+    limits = [pair(axis, "volume", 1e-3) for axis in axes]
     return tuple(low for low, _ in limits), tuple(high for _, high in limits)
 
 
@@ -49,43 +49,76 @@ class PlanOptions:
     """
 
     criterion: str = option(
-        "I", "; ".join(f"{name}: {said}" for name, said in MEANINGS.items() if name != POWER) + "."
+        "I",
+        "What is made small: "
+        + "; ".join(f"{name}, {said}" for name, said in MEANINGS.items() if name != POWER)
+        + ".",
+        group="What the poses are for",
     )
     effects: Sequence[str] = option(
         (),
-        "Fitted too, as with `calibrate --effects`; unknown until then.",
+        "Effects that the calibration will fit too; they are unknown until then.",
         metavar="NAME:PLACE",
         many=tuple,
+        group="What the poses are for",
     )
     separate: Sequence[str] = option(
         (),
-        "Instead: poses that tell two effects apart, as joint_compliance:J2 link_bending:L2.",
+        "Choose poses that tell two effects apart instead, as joint_compliance:J2 link_bending:L2.",
         metavar="EFFECT RIVAL",
         values=2,
+        group="What the poses are for",
     )
     tracker: Sequence[float] = option(
         (),
-        "Where it stands, in base axes, mm [default: 3 m before the arm].",
+        "Where the tracker stands, in base axes, mm [default: 3 m before the arm].",
         metavar="X,Y,Z",
-        read=partial(triple, flag="--tracker"),
+        read=partial(triple, name="tracker"),
+        group="What the instrument sees",
     )
-    targets: int = option(3, "Reflectors on a circle of 100 mm radius about the flange's axis.")
+    targets: int = option(
+        3,
+        "The number of reflectors on a circle of 100 mm radius about the flange's axis.",
+        group="What the instrument sees",
+    )
     spots: Sequence[Sequence[float]] = option(
         (),
-        "A reflector in the flange's frame, mm; once for each.",
+        "The place of a reflector in the flange's frame, mm; given once for each.",
         flag="--target",
         metavar="X,Y,Z",
-        read=partial(triple, flag="--target"),
+        read=partial(triple, name="spots"),
         many=tuple,
+        group="What the instrument sees",
     )
-    normals: str = option("flange", f"Where reflectors look: {' or '.join(NORMALS)}.")
+    normals: str = option(
+        "flange",
+        f"Where the reflectors look: {' or '.join(NORMALS)}.",
+        group="What the instrument sees",
+    )
     acceptance: float = option(
-        np.radians(30.0), "Half angle of a reflector's cone; 180: seen from anywhere.", "deg"
+        np.radians(30.0),
+        "The half angle of a reflector's cone; 180 is seen from anywhere.",
+        "deg",
+        group="What the instrument sees",
     )
-    whole: bool = option(False, "Only poses at which all are seen.", flag="--all-targets")
-    reach: tuple[float, float] = option((0.5, 50.0), "Of the tracker, m.", "m", flag="--range")
+    whole: bool = option(
+        False,
+        "Take only poses at which all reflectors are seen.",
+        flag="--all-targets",
+        group="What the instrument sees",
+    )
+    reach: tuple[float, float] = option(
+        (0.5, 50.0),
+        "From how near to how far the tracker measures, m.",
+        "m",
+        flag="--range",
+        group="What the instrument sees",
+    )
     elevation: tuple[float, float] = option(
-        (np.radians(-50.0), np.radians(75.0)), "Of the tracker, deg.", "deg"
+        (np.radians(-50.0), np.radians(75.0)),
+        "How far down and up the tracker looks, deg.",
+        "deg",
+        group="What the instrument sees",
     )
     joints: Mapping[int, tuple[float, float]] = option(
         dict,
@@ -94,41 +127,56 @@ class PlanOptions:
         metavar="J2=LOW:HIGH",
         read=str,  # their unit depends on the robot: see `limits_of`
         many=tuple,
+        group="What the arm may do",
     )
     volume: Sequence[Sequence[float]] = option(
         (),
-        "Box in base axes that the flange must stay in, mm.",
+        "The box in base axes that the flange must stay in, mm.",
         metavar="X0:X1,Y0:Y1,Z0:Z1",
         read=box,
+        group="What the arm may do",
     )
-    floor: float = option(0.0, "Height of the floor above the base's origin.", "mm")
+    floor: float = option(
+        0.0, "The height of the floor above the base's origin.", "mm", group="What the arm may do"
+    )
     body: float | None = option(
-        None, "Radius of the arm's links [default: 4 % of its reach].", "mm"
+        None,
+        "The radius of the arm's links [default: 4 % of its reach].",
+        "mm",
+        group="What the arm may do",
     )
     noise: float | None = option(
-        None, f"Of a coordinate [default: as the data show it, else {1e6 * USUAL.noise:g}].", "um"
+        None,
+        f"The noise of a coordinate [default: as the data show it, else {1e6 * USUAL.noise:g}].",
+        "um",
+        group="How exact things are",
     )
     per_metre: float | None = option(
         None,
-        f"Its growth with range [default: {1e6 * USUAL.per_metre:g}].",
+        f"How that noise grows with range [default: {1e6 * USUAL.per_metre:g}].",
         "um/m",
         flag="--noise-per-metre",
+        group="How exact things are",
     )
     jitter: float | None = option(
         None,
-        f"Of a joint that stops [default: as the data show it, else {1e6 * USUAL.jitter:g}].",
+        "How far a joint stops from where it should [default: as the data show it, else "
+        f"{1e6 * USUAL.jitter:g}].",
         "urad",
+        group="How exact things are",
     )
-    revisit: int = option(0, "Go back to so many of the poses.", metavar="K")
+    revisit: int = option(0, "Go back to so many of the poses.", metavar="K", group="Visits")
     approach: str = option(
-        "none", f"{' or '.join(EFFORTS)}: come to a revisited pose from its other side."
+        "none",
+        f"From which side to come to a revisited pose: {' or '.join(EFFORTS)}.",
+        group="Visits",
     )
-    candidates: int = option(2000)
-    seed: int = option(0, "Of candidates and starts.")
+    candidates: int = option(2000, "The number of poses to choose among.", group="The search")
+    seed: int = option(0, "The seed of candidates and starts.", group="The search")
 
 
 def limits_of(texts: Sequence[str], robot: Robot) -> dict[int, tuple[float, float]]:
-    """Limits by joint index, from what --joint was given.  Raises OptionError."""
+    """Limits by joint index, from texts as J2=-30:60.  Raises OptionError."""
     return dict(joint(text, robot) for text in texts)
 
 
@@ -136,52 +184,50 @@ def joint(text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
     """J2=LOW:HIGH in degrees, slides in millimetres.  Raises OptionError."""
     match = JOINT.fullmatch(text)
     if not match:
-        raise OptionError(f"--joint {text!r}: write J2=-30:60, in degrees (slides: mm)")
+        raise OptionError(f"joints={text!r}: write J2=-30:60, in degrees (slides: mm)")
     index = int(match[1]) - 1
     if not 0 <= index < robot.joints:
-        raise OptionError(f"--joint {text!r}: {robot.name} has joints 1 to {robot.joints}")
+        raise OptionError(f"joints={text!r}: {robot.name} has joints 1 to {robot.joints}")
     scale = 1e-3 if robot.prismatic[index] else SI["deg"]
-    return index, pair(match[2], f"--joint {text.partition('=')[0]}", scale)
+    return index, pair(match[2], "joints", scale)
 
 
 def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
     """Raise OptionError for options that make no sense."""
     if not 1 <= poses <= MOST_POSES:
-        raise OptionError(f"--poses {poses}: give 1 to {MOST_POSES}")
+        raise OptionError(f"poses={poses}: give 1 to {MOST_POSES}")
     if not poses <= options.candidates <= MOST_CANDIDATES:
         raise OptionError(
-            f"--candidates {options.candidates}: give at least as many as poses, at most "
+            f"candidates={options.candidates}: give at least as many as poses, at most "
             f"{MOST_CANDIDATES}"
         )
     if options.seed < 0:
         raise OptionError(f"seed {options.seed}: give a whole number, 0 or more")
     if not 0 <= options.revisit <= poses:
-        raise OptionError(f"--revisit {options.revisit}: give 0 to {poses}, the number of poses")
+        raise OptionError(f"revisit={options.revisit}: give 0 to {poses}, the number of poses")
     if options.approach not in EFFORTS:
-        raise OptionError(f"--approach {options.approach!r}: choose {' or '.join(EFFORTS)}")
+        raise OptionError(f"approach={options.approach!r}: choose {' or '.join(EFFORTS)}")
     if options.approach == "both" and not options.revisit:
-        raise OptionError("--approach both is about revisits: give their number with --revisit")
+        raise OptionError("approach='both' is about revisits: give their number as revisit=")
     if not 1 <= options.targets <= MOST_TARGETS:
-        raise OptionError(f"--targets {options.targets}: give 1 to {MOST_TARGETS}")
+        raise OptionError(f"targets={options.targets}: give 1 to {MOST_TARGETS}")
     if not options.acceptance > 0.0:
-        raise OptionError(
-            "--acceptance: give an angle above 0, 180 for a target seen from anywhere"
-        )
-    for name, (low, high) in (("range", options.reach), ("elevation", options.elevation)):
+        raise OptionError("acceptance=: give an angle above 0, 180 for a target seen from anywhere")
+    for name, (low, high) in (("reach", options.reach), ("elevation", options.elevation)):
         if not low < high:
-            raise OptionError(f"--{name}: the limits are reversed; give low:high")
+            raise OptionError(f"{name}=: the limits are reversed; give low:high")
     for low, high in zip(*options.volume, strict=True) if len(options.volume) else ():
         if not low < high:
-            raise OptionError("--volume: the limits of an axis are reversed; give low:high")
+            raise OptionError("volume=: the limits of an axis are reversed; give low:high")
     for name in ("noise", "per_metre", "jitter", "body"):
         value = getattr(options, name)
         if value is not None and not 0.0 <= value < np.inf:
-            raise OptionError(f"{name} {value:g} must be a finite number, 0 or more")
+            raise OptionError(f"{name}={value:g} must be a finite number, 0 or more")
     strange = [joint for joint in options.joints if not 0 <= joint < robot.joints]
     if strange:
-        raise OptionError(f"--joint: {robot.name} has no joint {strange[0] + 1}")
+        raise OptionError(f"joints=: {robot.name} has no joint {strange[0] + 1}")
     if len(options.separate) not in (0, 2):
-        raise OptionError("--separate: name two effects, as joint_compliance:J2 link_bending:L2")
+        raise OptionError("separate=: name two effects, as joint_compliance:J2 link_bending:L2")
 
 
 def settings_of(options: PlanOptions, poses: int) -> dict[str, object]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.evidence.alternatives import ENOUGH
+from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.ground.arrays import Array
 from minimax_cal.planning import separating
 from minimax_cal.planning.candidates import Poses, rarest

@@ -72,7 +72,7 @@ def question(
         for name, place in asked:
             if term.effect == name and "all" in (term.place, place or "all"):
                 raise OptionError(
-                    f"--separate: the fit holds {term.label}, and {name}:{place or 'all'} is part "
+                    f"separate=: the fit holds {term.label}, and {name}:{place or 'all'} is part "
                     "of the same: ask about that, or give a fit without it"
                 )
     data = with_history(data)
@@ -87,9 +87,9 @@ def question(
     (other,) = terms_of(scene, pair[1:], partial(best_variant, scene, rows))
     one, value = fitted.terms[-1], fitted.values[-1]
     if one.text == other.text:
-        raise OptionError(f"--separate: {pair[0]} and {pair[1]} are the same effect")
+        raise OptionError(f"separate=: {pair[0]} and {pair[1]} are the same effect")
     if not np.any(value):
-        raise OptionError(f"--separate: the data show no {one.label}; name another")
+        raise OptionError(f"separate=: the data show no {one.label}; name another")
     known = tuple(zip(fitted.terms[:-1], fitted.values[:-1], strict=True))
     return Question(Site(scene, model, state, noise, seed), Pair(one, value, other, known))
 

@@ -65,11 +65,13 @@ def ground_of(
         )
     if own and not cells:
         cells = [calibrate(robot, own[0], "sum", holdout=0.0).cell]
-        notices.append("the poses at hand were calibrated first, geometry alone: give --fit else")
+        notices.append(
+            "the poses at hand were calibrated first, geometry alone; fit= takes another model"
+        )
     if cells:
         if len(options.tracker) or len(options.spots):
             raise OptionError(
-                "the fit tells where tracker and targets are: leave --tracker and --target out"
+                "the fit tells where tracker and targets are: leave tracker= and spots= out"
             )
         for one in own:
             check_joints(robot, one)
@@ -77,7 +79,7 @@ def ground_of(
             if strange:
                 raise OptionError(f"{one.source}: target {strange[0]} is not one of the fit's")
         if not own:
-            notices.append("the fit tells no poses: none count as measured; give --data")
+            notices.append("the fit tells no poses: none count as measured; give data=")
         noise, text = shown_noise(cells[0], own, options)
         return Ground(cells[0], own, noise, (*notices, text))
     cell, text = assumed(robot, options)
@@ -97,7 +99,7 @@ def assumed(robot: Robot, options: PlanOptions) -> tuple[Cell, str]:
     away = max(APART, robot.reach())
     place = front(cell, away)
     where = ", ".join(f"{1e3 * value:.0f}" for value in place)
-    text = f"the tracker is taken to stand at {where} mm in base axes; say where with --tracker"
+    text = f"the tracker is taken to stand at {where} mm in base axes; say where with tracker="
     return cell_ahead(cell, place), text
 
 

@@ -99,8 +99,8 @@ def asked_of(robot: Robot, ground: Ground, options: PlanOptions) -> tuple[Questi
         return ()
     if not ground.measured:
         raise OptionError(
-            "--separate: how large the effects are is not known; give measurements with --data, "
-            "or a --fit that holds its poses"
+            "separate= needs to know how large the effects are: give measurements as data=, or a "
+            "calibration that holds its poses as fit="
         )
     return (
         separating.question(robot, ground.measured[0], ground.cell, options.separate, options.seed),

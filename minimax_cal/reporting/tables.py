@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from minimax_cal.diagnosing.result import Diagnosis, in_words
 from minimax_cal.diagnosing.where import triage_table
 from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
@@ -16,6 +18,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import load_robot
 
+LEVEL = 0.01  # chance of a pattern below which it is one
 NOWHERE = "poses or joints at which it would show"
 
 
@@ -43,8 +46,8 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
         for name, value in where["by_direction"].items()
     )
     regions = tuple(
-        (cell["region"], *(1e-3 * number(v) for v in (*cell["radius_mm"], *cell["height_mm"])),
-         cell["points"], number(cell["rms_mm"]))
+        (cell["region"], *map(number, (*cell["radius_mm"], *cell["height_mm"])), cell["points"],
+         number(cell["rms_mm"]))
         for cell in where["by_region"]["cells"]
     )  # fmt: skip
     trends = tuple(
@@ -55,19 +58,38 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
     parts = (
         ("by target", ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
          targets, ("", "d", ".4f", ".4f", "+.4f")),
-        ("as turns of each joint",
-         ("joint", "unit", "RMS", "share that its own value explains", "p"),
+        (f"as turns of each joint; by chance, {LEVEL:g} is rare enough",
+         ("joint", "unit", "RMS", "share that its own value explains", "by chance"),
          joints, ("", "", ".4f", ".2f", ".1g")),
         ("by direction", ("direction", "RMS mm"), directions, ("", ".4f")),
-        ("by region", ("region", "from the base axis m", "to m", "height from m", "to m", "points",
-                       "RMS mm"), regions, ("", ".2f", ".2f", ".2f", ".2f", "d", ".4f")),
-        ("trends", ("against", "share explained", "p"), trends, ("", ".2f", ".1g")),
+        ("by region", ("region", "from the base axis mm", "to mm", "height from mm", "to mm",
+                       "points", "RMS mm"), regions, ("", ".0f", ".0f", ".0f", ".0f", "d", ".4f")),
+        (f"trends; by chance, {LEVEL:g} is rare enough", ("against", "share explained",
+         "by chance"), trends, ("", ".2f", ".1g")),
     )  # fmt: skip
     left = [Table(f"what geometry leaves, {by}", *rest) for by, *rest in parts]
     shown = tuple(table for table in (triage_table(where["triage"]), *left) if table.rows)
     for table in shown:
         table.cells()  # an entry that is no number is found here, where its file is known
     return shown
+
+
+def remainder_table(found: Diagnosis) -> Table:
+    """What the last rung leaves: what follows the pose, and where; what follows nothing known."""
+    left, rows = found.remainder, []
+    if left:
+        ends = zip(("at least", "at most"), left.floor_mm or (), strict=False)
+        rows = [
+            ("follows the pose, and could be predicted", left.predictable_mm, math.nan),
+            *(
+                (f"  of it {in_words(place)}", math.nan, 100.0 * share)
+                for place, share in left.where
+            ),
+            ("follows nothing known", left.unpredictable_mm, math.nan),
+            *((f"noise alone, {name}", end, math.nan) for name, end in ends),
+        ]
+    header = ("what remains", "RMS mm", "share %")
+    return Table("what the last rung leaves", header, tuple(rows), ("", ".4f", ".0f"))
 
 
 def bare_scene() -> Scene:

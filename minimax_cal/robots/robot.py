@@ -6,6 +6,7 @@ import difflib
 import json
 import math
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,9 +19,10 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import RobotError
+from minimax_cal.ground.errors import CalibrationWarning, RobotError
 from minimax_cal.ground.files import json_text, once, read_text, write_whole
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
@@ -29,6 +31,8 @@ METRES = {"mm": 1e-3, "m": 1.0}
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+LEVER = 0.1  # of the reach: what a radian counts as
+TURNING = 1e-6  # how far a rotation may be from one
 LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
 Vector = tuple[Finite, Finite, Finite]
 
@@ -127,6 +131,27 @@ class Robot:
         pose = kinematics.forward(self.mdh, flat * self.sign, self.prismatic)
         return pose.reshape(*q.shape[:-1], 4, 4)
 
+    def inverse(self, pose: Array, near: Array | None = None) -> Array:
+        """Joints (..., n) that bring the last frame to poses in the base, within the limits.
+
+        pose: (..., 4, 4) [m].  near: joints to start from, (n,) or (..., n), which choose among the
+        ways of the arm [rad, m]; without it any way will do.  What cannot be reached ends nearby,
+        with a CalibrationWarning.  Raises RobotError for what is no pose.
+        """
+        lever = LEVER * self.reach()
+
+        def find(goal: Array, begin: Array) -> tuple[Array, Array]:
+            def look(rows: Array, q: Array) -> tuple[Array, Array]:
+                signs = self.sign
+                return missing(self.mdh, q * signs, self.prismatic, signs, goal[rows], lever)
+
+            box = (np.broadcast_to(end, begin.shape) for end in (self.lower, self.upper))
+            q = nearest(look, begin, *box)
+            return q, np.linalg.norm(look(np.arange(len(q)), q)[0], axis=1)
+
+        given = checked_poses(pose, near, self.joints)
+        return told_missing(*at_poses(find, *given, self.lower, self.upper))
+
     def reach(self) -> float:
         """Length of the stretched arm without its slides, at least 0.1: a scale for errors [m]."""
         return max(0.1, float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum()))
@@ -169,6 +194,41 @@ class Robot:
     def with_mdh(self, mdh: Array) -> Robot:
         """The same robot with another geometry."""
         return replace(self, mdh=np.array(mdh))
+
+
+def checked_poses(pose: Array, near: Array | None, joints: int) -> tuple[Array, Array | None]:
+    """Poses (..., 4, 4) and joints to start from, if they are some.  Raises RobotError."""
+    try:
+        pose = np.asarray(pose, dtype=float)
+        near = None if near is None else np.asarray(near, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise RobotError("inverse: pose and near must be numbers") from error
+    if pose.shape[-2:] != (4, 4) or not np.isfinite(pose).all():
+        raise RobotError(f"inverse: pose must be finite, of shape (..., 4, 4); it is {pose.shape}")
+    turn = pose[..., :3, :3]
+    apart = np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)).max(initial=0.0)
+    if apart > TURNING or np.any(np.linalg.det(turn) < 0.0):
+        raise RobotError("inverse: the upper left 3 x 3 of a pose must be a rotation")
+    if near is not None:
+        fits = near.shape[-1:] == (joints,) and near.shape[:-1] in ((), pose.shape[:-2])
+        if not (fits and np.isfinite(near).all()):
+            raise RobotError(
+                f"inverse: near must be finite, of shape ({joints},) or a row for each pose; it is "
+                f"{near.shape}"
+            )
+    return pose, near
+
+
+def told_missing(q: Array, left: Array) -> Array:
+    """The joints found; a CalibrationWarning where they do not reach their poses."""
+    if count := int(np.count_nonzero(left > NEAR)):
+        warnings.warn(
+            f"{count} of {left.size} poses are not reached, by {1e3 * left.max():.3g} mm at worst: "
+            "out of reach, beyond a limit, or another way of the arm (near)",
+            CalibrationWarning,
+            stacklevel=3,
+        )
+    return q
 
 
 def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:

@@ -65,7 +65,7 @@ def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
         if len(bodies) > 1:
             raise RobotError(
                 f"{urdf.source}: several chains: they end in {', '.join(ends)}; name the last "
-                f"link: --tip, or {Path(urdf.source).name}#{next(iter(ends))}"
+                f"link, as {Path(urdf.source).name}#{next(iter(ends))} or with tip="
             )
         named = [name for name in TIPS if name in links and len(urdf.to_link(name)) and
                  [j for j in urdf.to_link(name) if j.moves] in list(ends.values())]  # fmt: skip

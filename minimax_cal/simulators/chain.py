@@ -131,7 +131,7 @@ def joints_of(model: Any, count: int, source: str, tip: str) -> tuple[int, ...]:
             f"(the longest has {most})"
         )
     ends = ", ".join(names[0] or "a body without a name" for names in found.values())
-    raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body with --tip")
+    raise RobotError(f"{source}: several arms of {count} joints ({ends}); name a body as tip=")
 
 
 def way_to(model: Any, body: int) -> tuple[int, ...]:

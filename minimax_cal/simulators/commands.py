@@ -35,7 +35,7 @@ class Commands:
 
 
 def load_commands(path: Path | str) -> Commands:
-    """The command map that `export --to mjcf` wrote beside a file.
+    """The command map that an export to mjcf wrote beside a file.
 
     path: of the map.  It takes and gives the controller's joint values [rad, m].
     Raises CalibrationError.
@@ -45,7 +45,6 @@ def load_commands(path: Path | str) -> Commands:
     content = saved_content(path)
     if content.get("kind") != "commands" or "cell" not in content:
         raise CalibrationError(
-            f"{path}: is no command map; minimax-cal export --to mjcf -o writes one where it is "
-            "needed"
+            f"{path}: is no command map; an export to mjcf writes one where it is needed"
         )
     return Commands(cell_from_dict(content["cell"], str(path)))

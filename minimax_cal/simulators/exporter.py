@@ -27,7 +27,9 @@ def write(job: Job) -> Export:
 def correct(job: Job) -> Export:
     """The MJCF of a job with the calibrated arm in it: with its own masses, unless assumed."""
     if job.cell is None or not job.fitted or job.model is None:
-        raise OptionError(f"{job.source}: --mjcf corrects by a calibration; give one as FIT")
+        raise OptionError(
+            f"{job.source}: mjcf= is corrected by a calibration: give one, not a robot"
+        )
     given = read_model(job.model)
     chain = chain_of(
         given.compiled(), job.robot.joints, given.source, job.tip, unknown=given.assumed

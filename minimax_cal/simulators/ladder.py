@@ -68,7 +68,7 @@ def simulator_gap(
     chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
     causes = causes_of(chain, rows, fit, diagnosis, (holdout, seed), progress)
     if not causes.held.any():
-        raise OptionError(f"{causes.data.source}: no pose is held out; give --holdout 0.2")
+        raise OptionError(f"{causes.data.source}: no pose is held out; give holdout=0.2")
     run = Run(given, chain, causes, progress)
     rungs = [*run.before(), *run.corrected()]
     failed = causes.fits[-1].status is Status.FAILED

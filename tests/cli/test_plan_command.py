@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.cli.compensate import read_targets
+from minimax_cal.cli.options import in_flags
 from minimax_cal.cli.plan import plan_command
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.modelling.simulate import Simulation
@@ -28,7 +29,7 @@ def run(*arguments: object) -> tuple[int, str, str]:
     """Exit code, stdout, stderr of the command as `main` would run it."""
     result = CliRunner().invoke(plan_command, [str(a) for a in arguments], standalone_mode=False)
     if isinstance(result.exception, (CalibrationError, click.ClickException)):
-        return 2, result.stdout, str(result.exception)
+        return 2, result.stdout, in_flags(str(result.exception), plan_command)
     if result.exception:
         raise result.exception
     return int(result.return_value), result.stdout, result.stderr
@@ -200,7 +201,7 @@ def test_separate(poses: Path) -> None:
         (("--poses", 10, "--joint", "J9=0:1"), "has joints 1 to 6"),
         (("--poses", 10, "--joint", "two=0:1"), "write J2=-30:60"),
         (("--poses", 10, "--joint", "J3=100:120"), "joint 3: no range is left"),
-        (("--poses", 10, "--range", "9"), "--range '9': give low:high"),
+        (("--poses", 10, "--range", "9"), "--range 9: give low:high"),
         (("--poses", 10, "--range", "30:40"), "range rejects most"),
         (("--poses", 10, "--tracker", "0,0,9000"), "elevation rejects most"),
         (("--poses", 10, "--floor", "9000"), "floor rejects most"),

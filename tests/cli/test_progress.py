@@ -73,6 +73,16 @@ def test_files_by_their_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run("evaluate", tmp_path / "fit.json", tmp_path / "poses.csv", "-o",
                tmp_path / "a.png") == 2  # fmt: skip
     assert "this command draws no picture; write a .json" in capsys.readouterr().err
+    assert run(*command, "-o", tmp_path / "fit.csv") == 2
+    assert "this command writes no CSV; write a .json" in capsys.readouterr().err
+    assert run("simulate", "ur10", "-o", tmp_path / "poses.json") == 2
+    assert "the measurements are a CSV" in capsys.readouterr().err
+    assert run("import", tmp_path / "poses.csv", "-o", tmp_path / "said.json") == 0
+    assert json.loads((tmp_path / "said.json").read_text())["poses"] == 60
+    plan = ("plan", "irb120", "--poses", 6, "--candidates", 30, "-q", "-o")
+    for name, start in (("plan.json", "{"), ("plan.csv", "order,pose,q1_deg")):
+        assert run(*plan, tmp_path / name) == 0
+        assert (tmp_path / name).read_text().startswith(start)
 
 
 def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None:

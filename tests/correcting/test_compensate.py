@@ -16,14 +16,14 @@ from minimax_cal.cli import main
 from minimax_cal.cli.compensate import compensate_command
 from minimax_cal.correcting.compensate import (
     FRAMES,
-    arm_of,
+    Compensation,
     compensate,
     path_of,
 )
-from minimax_cal.correcting.reach import Outcome, Reach, examine, motion
 from minimax_cal.correcting.target_file import ADDED, read_targets
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.modelling.reach import Outcome, Reach, arm_of, motion
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate
 
 Move = Callable[[Array], Array]
@@ -145,10 +145,10 @@ def test_slope_is_the_derivative_of_what_is_missing(name: str, rng: np.random.Ge
     data = path_of(q, robot, 0.0)
     reach = Reach(arm_of(cell_of(robot)), data, robot.pose(q), 0.3, 1e-5, 0.1)
     still = np.zeros_like(q)
-    _, jacobian = examine(reach, q, reach.goal, still)
+    _, jacobian = reach.missing(q, reach.goal, still)
     for j, step in enumerate(1e-6 * np.eye(robot.joints)):
-        ahead, _ = examine(reach, q + step, reach.goal, still)
-        behind, _ = examine(reach, q - step, reach.goal, still)
+        ahead, _ = reach.missing(q + step, reach.goal, still)
+        behind, _ = reach.missing(q - step, reach.goal, still)
         assert_allclose((behind - ahead) / 2e-6, jacobian[:, :, j], rtol=0, atol=1e-8)
 
 
@@ -222,7 +222,7 @@ def test_a_redundant_arm_changes_least(rng: np.random.Generator) -> None:
     found = compensate(cell_of(real), q, seven, frame="own")
     assert set(found.outcome) == {Outcome.REACHED}
     reach = Reach(arm_of(cell_of(real)), path_of(q, real, 0.0), seven.pose(q), 0.1, 1e-5, 0.1)
-    residual, jacobian = examine(reach, q, reach.goal, np.zeros_like(q))
+    residual, jacobian = reach.missing(q, reach.goal, np.zeros_like(q))
     least = (np.linalg.pinv(jacobian) @ residual[..., None])[..., 0]
     assert_allclose(found.q - q, least, rtol=0, atol=0.02 * np.abs(least).max())
 
@@ -332,6 +332,86 @@ def test_wrong_input_is_told(robot: mc.Robot, fit: mc.Fit) -> None:
     ):
         with pytest.raises(mc.CalibrationError):
             wrong()
+
+
+def test_tables_hold_what_a_hand_reckons() -> None:
+    """Two targets of two joints, a turn and a slide; of nine missed ones eight are named."""
+    found = Compensation(
+        q=np.array([[0.101, 0.2], [0.3, 0.398]]),
+        commanded=np.array([[0.1, 0.2], [0.3, 0.4]]),
+        distance=np.array([3e-6, 4e-6]),
+        angle=np.array([0.0, 2e-6]),
+        distance_before=np.array([3e-3, 4e-3]),
+        angle_before=np.array([1e-3, 7e-3]),
+        outcome=(Outcome.REACHED, Outcome.LIMIT),
+        sliding=np.array([False, True]),
+        line=np.array([2, 3]),
+        name="two",
+        frame="own",
+        notices=(),
+    )
+    pose, ends, joints = found.tables()
+    rms = np.sqrt(12.5)
+    assert pose.rows[0] == ("as commanded", 2, *map(pytest.approx, (rms, 4.0, 5.0, 7.0)))
+    small = (1e-3 * rms, 4e-3, 1e-3 * np.sqrt(2.0), 2e-3)
+    assert pose.rows[1] == ("corrected", 2, *map(pytest.approx, small))
+    assert ends.rows == (("reached", 1, Outcome.REACHED.advice), ("limit", 1, Outcome.LIMIT.advice))
+    assert joints.rows == (
+        ("J1", "mrad", pytest.approx(np.sqrt(0.5)), pytest.approx(1.0)),
+        ("J2", "mm", pytest.approx(np.sqrt(2.0)), pytest.approx(2.0)),
+    )
+    assert found.headline().startswith(
+        "1 of 2 targets: largest error 4.000 mm, 7.000 mrad -> 0.004 mm, 0.002 mrad"
+    )
+    assert found.complaint().startswith("1 of 2 targets are missed: limit at line 3: ")
+    told = found.to_dict()
+    assert told["missed"] == 1
+    assert told["targets"][1] == {
+        "line": 3, "status": "limit", "q": [0.3, 0.398],
+        **dict(zip(("residual_mm", "residual_mrad", "before_mm", "before_mrad"),
+                   map(pytest.approx, (4e-3, 2e-3, 4.0, 7.0)), strict=True)),
+    }  # fmt: skip
+    for count, says in ((8, "line 1, 2, 3, 4, 5, 6, 7, 8: "), (9, "7, 8 and 1 more: ")):
+        many = replace(found, outcome=(Outcome.LIMIT,) * count, line=np.arange(count) + 1)
+        assert says in many.complaint()
+
+
+def test_the_arm_is_seen_by_four_points_about_its_targets(robot: mc.Robot) -> None:
+    cell = cell_of(robot)
+    arm = arm_of(cell)
+    assert len(arm.target_names) == len(arm.target_positions) == 4
+    assert_allclose(arm.target_positions.mean(axis=0), cell.target_positions.mean(axis=0))
+    away = np.linalg.norm(arm.target_positions - arm.target_positions.mean(axis=0), axis=1)
+    assert_allclose(away, 0.1 * np.sqrt(3.0), rtol=1e-14)
+    apart = np.linalg.norm(arm.target_positions[:, None] - arm.target_positions, axis=-1)
+    assert_allclose(apart[~np.eye(4, dtype=bool)], 0.2 * np.sqrt(2.0), rtol=1e-14)
+
+
+def test_the_start_of_the_session_and_20_degrees_are_taken(
+    robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    q = regular(robot, random_poses(robot, 20, rng))[:2]
+    warming = cell_of(robot, effect("thermal_growth", "all", [3e-4], constant=0.5, apart=0.0))
+    first = compensate(warming, q, robot, frame="own")
+    last = compensate(warming, q, robot, frame="own", clock=1.0)
+    assert_allclose(first.q, compensate(warming, q, robot, frame="own", clock=0.0).q)
+    assert np.abs(last.q - first.q).max() > 1e-5
+    assert any("taken at 0 of it" in notice for notice in first.notices)
+    assert any("taken at 1 of it" in notice for notice in last.notices)
+    hot = cell_of(robot, effect("thermal_growth", "all", [3e-4], temperature=1.0, apart=0.0))
+    measured = replace(path_of(q, robot, 0.0), columns={"temperature": np.full(2, 30.0)})
+    for targets, told in ((q, True), (measured, False)):
+        notices = compensate(hot, targets, robot, frame="own").notices
+        assert any("taken at 20 C" in notice for notice in notices) == told
+
+
+@pytest.mark.parametrize(("part", "told"), [(6, False), (7, True), (3, True), (4, False)])
+def test_a_compliance_of_measured_torques_asks_for_them(
+    part: int, told: bool, robot: mc.Robot, rng: np.random.Generator
+) -> None:
+    cell = cell_of(robot, effect("joint_compliance", "J2", [2e-6], parts=2.0**part))
+    found = compensate(cell, regular(robot, random_poses(robot, 20, rng))[:1], robot, frame="own")
+    assert any("fitted to measured torques" in notice for notice in found.notices) == told
 
 
 def write(path: Path, header: str, *rows: str) -> Path:

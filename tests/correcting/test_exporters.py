@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -283,6 +284,33 @@ def test_ros_yaml(name: str) -> None:
             elif row["type"] == "revolute":
                 found = found @ turn(2, value * row["axis"][2])
         assert_allclose(found, pose, **EXACT)
+
+
+@pytest.mark.parametrize("name", ["irb2600", "scara_600"])
+def test_ros2_control_holds_the_offsets(name: str) -> None:
+    """The drawing's arm at joint = actuator + offset stands where the calibrated one does."""
+    data = simulate(name, 40, 3, seed=4).data
+    fit = mc.calibrate(name, data, "sum", only="offsets")
+    made = export(read_job(fit), "ros2-control")
+    root = ElementTree.fromstring(made.content)
+    assert root.tag == "ros2_control"
+    parts = root.findall("transmission")
+    assert {part.findtext("plugin") for part in parts} == {
+        "transmission_interface/SimpleTransmission"
+    }
+    reduction, offset = (
+        np.array([float(str(part.findtext(f"joint/{key}"))) for part in parts])
+        for key in ("mechanical_reduction", "offset")
+    )
+    q = data.q[:5]
+    moved = fit.before.robot.pose(q / reduction + offset)
+    assert_allclose(moved, fit.robot.pose(q), **EXACT)
+    assert np.abs(offset).max() > 1e-5
+    assert len(made.notices) == 1
+    more = export(read_job(mc.calibrate(name, data, "sum")), "ros2-control")
+    assert "not in this file" in " ".join(more.notices)
+    with pytest.raises(OptionError, match="give a fit, no robot"):
+        export(read_job(name), "ros2-control")
 
 
 @pytest.mark.parametrize("name", ROBOTS)

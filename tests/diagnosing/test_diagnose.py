@@ -34,7 +34,7 @@ def test_nothing_is_named_on_a_sound_arm() -> None:
     assert found.verdict == "none"
     assert found.findings == ()
     assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
-    assert "no effect is named" in found.headline()
+    assert "Nothing beyond geometry and noise" in found.headline()
 
 
 def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:

@@ -1,5 +1,7 @@
 """What remains: right levels on noise, power against what no library holds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from problems_fit import study
@@ -22,10 +24,7 @@ def test_probabilities_are_right_on_noise() -> None:
     spread = np.sqrt(1e-10 * (1.0 + 0.5 * rows.variance_ratio))
     hits = []
     for _ in range(60):
-        drawn = type(rows)(
-            spread * rng.normal(size=len(rows.error)),
-            rows.basis, rows.variance_ratio, rows.size, rows.count, rows.turn, rows.weight,
-        )  # fmt: skip
+        drawn = replace(rows, error=spread * rng.normal(size=len(rows.error)))
         found = structure(made.scene, drawn, noise, np.zeros((len(rows.error), 0)))
         hits.append([trace.p < 0.1 for trace in found if "wave" not in trace.name])
     count = np.array(hits)

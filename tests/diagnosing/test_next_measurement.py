@@ -331,7 +331,7 @@ def test_a_call_is_short(robot: mc.Robot) -> None:
     taken = []
     for _ in range(3):
         fresh = dataclasses.replace(here)
-        began = time.perf_counter()
+        began = time.process_time()  # of this process: others may be busy
         separate_with(fresh, Pair(J2, np.array([1e-7]), BASE, [(GEAR, np.array([1e-4, 1e-4]))]))
-        taken.append(time.perf_counter() - began)
+        taken.append(time.process_time() - began)
     assert min(taken) < 0.3  # about 0.03 s on a free core

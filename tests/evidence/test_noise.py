@@ -8,7 +8,7 @@ from problems_fit import study
 import minimax_cal as mc
 from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.evidence.noise import Noise, Rows, restricted
+from minimax_cal.evidence.noise import Noise, Rows, inflation, restricted
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.grouping import split
@@ -75,7 +75,8 @@ def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None
         basis = np.linalg.qr(rng.normal(size=(n, p)))[0]
         noise = rng.normal(size=n)
         rest = noise - basis @ (basis.T @ noise)
-        rows = Rows(rest, basis, np.ones(n), 1.0, n, np.zeros((0, 0, 0)), np.zeros((0, 0)))
+        rows = Rows(rest, basis, np.ones(n), 1.0, n, np.zeros((0, 0, 0)), np.zeros((0, 0)),
+                    np.zeros(0, dtype=int))  # fmt: skip
         found.append(restricted(rows, np.zeros((n, 0))))
     total = [one.variance * (1.0 + one.ratio) for one in found]  # equal rows: only the sum counts
     assert abs(np.mean(total) - 1.0) < 4.0 * np.sqrt(2.0 / (n - p) / len(found))
@@ -84,8 +85,9 @@ def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None
 def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
     rows = quiet.rows
     few = Rows(
-        rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, 9, rows.turn, rows.weight
-    )
+        rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, 9, rows.turn, rows.weight,
+        rows.poses,
+    )  # fmt: skip
     assert restricted(few, np.zeros((9, 0))).variance > 0.0
 
 
@@ -99,3 +101,26 @@ def test_missing_targets_count_for_nothing(robot: mc.Robot) -> None:
     assert one.rows.count == 3 * int(train.seen.sum())
     found = restricted(one.rows, np.zeros((len(one.rows.error), 0)))
     assert 12e-6 < np.sqrt(found.variance) < 25e-6
+
+
+def test_a_field_is_as_noisy_as_its_groups_tell() -> None:
+    """White rows: 1; an error that all rows of a group share: as many times as there are rows."""
+    rng, n, count = np.random.default_rng(5), 3000, 6
+    group = np.arange(n) // count
+    field = np.sign(rng.normal(size=n // count))[group] * 0.1
+    white = [inflation(field, field + rng.normal(size=n), group, n) for _ in range(40)]
+    assert abs(np.mean(white) - 1.0) < 0.1
+    shared = rng.normal(size=n // count)[group] * np.sqrt(0.5)
+    alike = inflation(field, field + shared + np.sqrt(0.5) * rng.normal(size=n), group, n)
+    assert abs(alike - (1.0 + 0.5 * (count - 1))) < 0.6  # variance of a sum of `count` rows
+
+
+def test_one_wrong_group_makes_a_field_no_surer() -> None:
+    rng, n = np.random.default_rng(6), 900
+    group, law = np.arange(n) // 9, rng.normal(size=n)
+    rest = rng.normal(size=n)
+    rest[:9] += 30.0 * np.sign(law[:9])
+    field = law * float(law @ rest) / float(law @ law)
+    gain = float(field @ field) / float(np.var(rest - field))
+    assert gain > 10.0  # as by rows alone: p = 0.001
+    assert gain / inflation(field, rest, group, n) < 2.0

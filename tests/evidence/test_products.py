@@ -96,7 +96,7 @@ def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
     rows, kept = rough.rows, kept_rows(rough, poses)
     alone = Rows(rows.error[kept], orthonormal(rows.basis[kept]), rows.variance_ratio[kept],
                  rows.size, 3 * int(np.count_nonzero(rough.model.weight[:, poses])),
-                 rows.turn[poses], rows.weight[poses])  # fmt: skip
+                 rows.turn[poses], rows.weight[poses], rows.poses[poses])  # fmt: skip
     index = np.array([4, 9])
     found = lib.only(poses).products.noise(index)
     expected = restricted(alone, lib.columns[kept][:, index])

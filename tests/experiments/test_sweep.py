@@ -381,7 +381,7 @@ def test_nobody_at_the_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         for address in (f"tcp://127.0.0.1:{port}", "nonsense", "tcp://127.0.0.1:1"):
             began = time.monotonic()
             result = run_toy("--cluster", address)
-            assert time.monotonic() - began < 5
+            assert time.monotonic() - began < 30  # a loaded machine takes its time, too
             assert result.exit_code == 2
             line = result.stderr.splitlines()[-1]
             assert line.startswith(f"error: no Dask scheduler at {address!r}")

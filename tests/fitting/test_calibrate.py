@@ -302,3 +302,17 @@ def test_exact_data_are_a_success(objective: str, robot: mc.Robot, clean: Simula
     fit = mc.calibrate(robot, clean.data, objective)
     assert fit.status == "converged"
     assert fit.accuracy["holdout"].max_mm < 1e-6
+
+
+def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot) -> None:
+    fit = mc.calibrate(robot, noisy.data, "sum", only="offsets")
+    change = fit.robot.mdh - robot.mdh
+    assert np.flatnonzero(np.abs(change).max(axis=0)).tolist() == [2]  # theta
+    known = [p.name for p in fit.parameters if p.identifiable and p.name[-1].isdigit()]
+    assert known == ["theta2", "theta3", "theta4", "theta5"]
+    assert fit.options.only == "offsets"
+    fixed = [f"{kind}{j}" for kind in ("a", "d", "alpha", "beta") for j in range(1, 7)]
+    same = mc.calibrate(robot, noisy.data, "sum", fix=fixed)
+    assert (same.robot.mdh == fit.robot.mdh).all()
+    with pytest.raises(mc.OptionError, match="the only choice is offsets"):
+        mc.calibrate(robot, noisy.data, only="lengths")

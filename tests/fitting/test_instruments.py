@@ -398,9 +398,9 @@ def test_fix_and_free() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "words"),
     [
-        ("closures", {"offset": True}, "--offset is for distances"),
-        ("wires_3", {"known_distances": [("S1", "S2", 1.0)]}, "--known-distance is for closures"),
-        ("wires_3", {"lever": 0.1}, "--lever is for poses"),
+        ("closures", {"offset": True}, "offset= is for distances"),
+        ("wires_3", {"known_distances": [("S1", "S2", 1.0)]}, "known_distances= is for closures"),
+        ("wires_3", {"lever": 0.1}, "lever= is for poses"),
         ("closures", {"known_distances": [("S1", "Z", 1.0)]}, "no socket 'Z'"),
         ("closures", {"known_distances": [("S1", "S1", 1.0)]}, "two different sockets"),
         ("closures", {"known_distances": [("S1", "S2", -1.0)]}, "a positive length"),

@@ -1,4 +1,4 @@
-"""Public measurements of real arms: numbers that the project promises, held out."""
+"""Promises on real arms, held out; what holds of any arm is tried on a simulated one too."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,19 @@ from conftest import shared
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from minimax_cal.modelling.simulate import simulate
 
 SEEDS = range(10)
+ARMS = ("simulated", "irb120")  # what must hold of both is tested where real data are absent, too
+
+
+def arm_of(name: str) -> tuple[mc.Robot, mc.Measurements]:
+    """A real arm with its measurements, or one like it."""
+    if name != "simulated":
+        robot, path = shared(name)
+        return mc.load_robot(robot), mc.read_measurements(path)
+    robot = mc.load_robot("irb120")
+    return robot, simulate(robot, 70, 3, seed=11).data
 
 
 def medians(name: str, holdout: float) -> tuple[float, float]:
@@ -48,9 +59,10 @@ def test_fanuc_leave_one_pose_out() -> None:
     assert np.sqrt(np.mean(np.square(after))) <= 0.52
 
 
+@pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", range(3))
-def test_minimax_never_exceeds_the_sum(seed: int) -> None:
-    robot, data = shared("irb120")
+def test_minimax_never_exceeds_the_sum(seed: int, name: str) -> None:
+    robot, data = arm_of(name)
     total, worst = (
         mc.calibrate(robot, data, objective, holdout=0.3, seed=seed)
         for objective in ("sum", "minimax")
@@ -59,9 +71,10 @@ def test_minimax_never_exceeds_the_sum(seed: int) -> None:
     assert max(worst.accuracy["train"].sse_mm2) <= max(total.accuracy["train"].sse_mm2)
 
 
+@pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("backend", ["quadprog", "clarabel", "osqp", "proxqp"])
-def test_backends_agree(backend: str) -> None:
-    robot, data = shared("irb120")
+def test_backends_agree(backend: str, name: str) -> None:
+    robot, data = arm_of(name)
     best = [
         max(mc.calibrate(robot, data, qp=qp, holdout=0.3).accuracy["train"].sse_mm2)
         for qp in ("daqp", backend)
@@ -69,12 +82,13 @@ def test_backends_agree(backend: str) -> None:
     assert best[1] == pytest.approx(best[0], rel=1e-6)
 
 
-@pytest.mark.parametrize("times", [8, pytest.param(200, marks=pytest.mark.slow)])
-def test_turning_and_moving_the_frame(times: int) -> None:
-    robot, path = shared("irb120")
-    data = mc.read_measurements(path)
+@pytest.mark.parametrize(
+    ("times", "name"),
+    [(4, "simulated"), (8, "irb120"), pytest.param(200, "irb120", marks=pytest.mark.slow)],
+)
+def test_turning_and_moving_the_frame(times: int, name: str) -> None:
+    nominal, data = arm_of(name)
     rng = np.random.default_rng(0)
-    nominal = mc.load_robot(robot)
     total = mc.calibrate(nominal, data, "sum")
     worst = mc.calibrate(nominal, data, "minimax")
     for _ in range(times):

@@ -27,17 +27,24 @@ TEMPLATES = (
     "evaluate truth.json data.csv --json",
     "evaluate effects.json data.csv -o out.json",
     "import data.csv -o out.csv",
+    "import data.csv --leave-out 3:smr1,5 -o out.csv",
     "import tracker.csv -o out.csv --json",
     "import tracker.csv -o out.csv --safe-cells",
     "compensate fit.json targets.csv -o out.csv",
     "compensate effects.json targets.csv --json",
     "compensate truth.json targets.csv --robot ROBOT --safe-cells",
+    "check fit.json data.csv --tolerance rms=0.3 --json",
+    "check effects.json data.csv --tolerance max=5 -o out.json",
+    "compare fit.json effects.json --json",
+    "fleet cells.toml --jobs 1 --json",
+    "fleet cells.toml --jobs 1 --page out.html -o out.json",
     "iso9283 fit.json --poses --json",
     "iso9283 fit.json data.csv -o out.json",
     "map fit.json --samples 500 --json",
     "map fit.json data.csv --samples 500 -o out.png",
     "export fit.json --to urdf -o out.urdf",
     "export fit.json --to dh-csv -o out.csv",
+    "export fit.json --to ros2-control -o out.xml",
     "export ROBOT --to json -o out.json",
     "export effects.json --to ur-yaml -o out.yaml",
     "export fit.json --to urdf --urdf robot.urdf -o out.urdf",
@@ -52,13 +59,17 @@ TEMPLATES = (
     "plan irb120 --poses 4 --candidates 40 --fit fit.json --data data.csv --json",
     "simulate ROBOT --poses 8 -o out.csv --truth out.json",
     "effects ROBOT data.csv --json",
+    "gap robot.urdf data.csv --fit fit.json --diagnosis diagnosis.json --json",
+    "gap arm.xml data.csv --fit fit.json --diagnosis diagnosis.json --write out.xml -o out.json",
     "robots --json",
     "backends --json",
 )
+KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some changes is known
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
-RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08}
+RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08, "gap": 0.3}
 RATES |= {"robots": 0.2, "backends": 0.2}
+NAMED = {"cells.toml": ("robot.json", "data.csv", "fit.json")}  # files that a file names
 PLACES = (
     "/dev/null",
     ".",
@@ -101,10 +112,11 @@ def case(seed: int, number: int) -> Case:
     line = TEMPLATES[int(rng.choice(len(TEMPLATES), p=rates / rates.sum()))]
     words = [str(pick(rng, ROBOTS)) if word == "ROBOT" else word for word in line.split()]
     files = dict(material())
-    if "data.csv" in words and words[0] in ("calibrate", "evaluate") and rng.random() < 0.3:
+    if "data.csv" in words and words[0] in KNOWN and rng.random() < 0.3:
         return known(seed, number, words, files, rng)
     broke = []
     inputs = [word for word in words if word in files]
+    inputs += [name for word in inputs for name in NAMED.get(word, ())]
     for _ in range(int(rng.choice([1, 2, 3], p=[0.7, 0.2, 0.1]))):
         how = rng.random()
         if inputs and how < 0.65:

@@ -17,6 +17,20 @@ import minimax_cal as mc
 from minimax_cal.cli import main
 
 POSES = 24
+CELLS = """
+[defaults]
+tolerance = "rms 0.5"
+objective = "sum"
+[[cells]]
+name = "one"
+robot = "robot.json"
+data = "data.csv"
+fit = "fit.json"
+[[cells]]
+name = "two"
+fit = "fit.json"
+check = "data.csv"
+"""
 
 
 def done(*arguments: str) -> None:
@@ -61,6 +75,8 @@ def make() -> None:
     done(*sums, "--effects", "joint_compliance:all", "-o", "effects.json")
     done("diagnose", "robot.json", "data.csv", "-o", "diagnosis.json")
     done("export", "fit.json", "--to", "urdf", "-o", "robot.urdf")
+    done("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
+    Path("cells.toml").write_text(CELLS)
     rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
     bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
     write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])

@@ -217,6 +217,7 @@ OF_KIND: dict[str, tuple[Callable[[bytes, Rng], bytes], ...]] = {
     "yaml": (yaml_tree,),
     "toml": (odd_words,),
     "urdf": (odd_words,),
+    "xml": (odd_words,),
 }
 
 

@@ -13,7 +13,8 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
-from minimax_cal.ground.records import Packed, unpacked
+from minimax_cal.ground.files import json_of
+from minimax_cal.ground.records import Packed, packed, unpacked
 from minimax_cal.reporting.plots.figures import new_figure, save
 
 from .material import material
@@ -96,9 +97,19 @@ def test_the_name_of_an_output_moves_no_cursor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("data.csv").write_bytes(material()["data.csv"])
-    assert run("import", "data.csv", "-o", "\x1b]0;owned\x07") == 0
-    assert "\x1b" not in capsys.readouterr().out
+    odd = "\x1b]0;owned\x07"
+    for name in ("data.csv", "truth.json"):
+        Path(name).write_bytes(material()[name])
+    for command in (
+        ("import", "data.csv"),
+        ("evaluate", "truth.json", "data.csv"),
+        ("export", "truth.json", "--to", "json"),
+        ("simulate", "irb120", "--poses", 9),
+    ):
+        assert run(*command, "-o", odd) == 0
+    out, err = capsys.readouterr()
+    assert err.count("written: ") == 4
+    assert "\x1b" not in out + err
 
 
 def test_a_lever_that_cannot_be_is_refused(
@@ -131,3 +142,57 @@ def test_a_picture_without_room_is_drawn_without_a_warning(tmp_path: Path) -> No
     axes.set_title("t\n" * 40)
     save(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_numbers_that_no_result_has_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The charts of a diagnosis drew them with warnings of overflow."""
+    for value in (1e308, -1e160, 10**300):
+
+        def huge(content: Any, value: Any = value) -> None:
+            content["curves"]["order"]["views"][0]["values"][0] = value
+
+        path = broken(tmp_path, "diagnosis.json", huge)
+        assert "cannot be; at most 1e+100" in refused(capsys, "report", path)
+    assert json_of("[1e99, -3, 0, 2.5e-320, true]") == [1e99, -3, 0, 2.5e-320, True]
+    assert [type(value) for value in json_of("[1, 1.0, -0]")] == [int, float, int]
+    for text in ("1e400", "-" + "9" * 5000):
+        with pytest.raises(ValueError, match="at most"):
+            json_of(text)
+    far = np.array([1e99, np.inf, np.nan])
+    np.testing.assert_array_equal(unpacked(Packed.model_validate(packed(far))), far)
+    with pytest.raises(ValueError, match="beyond 1e"):
+        unpacked(Packed.model_validate(packed(11.0 * far)))
+
+
+def test_two_outputs_are_two_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second result replaced the first."""
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to("a.csv")
+    for other in ("a.csv", "./a.csv", "link"):
+        arguments = ("simulate", "irb120", "--poses", 9, "-o", "a.csv", "--truth", other)
+        assert "is to hold two results" in refused(capsys, *arguments)
+    assert not Path("a.csv").exists()
+    same = ("-o", "/dev/null", "--truth", "/dev/null")
+    assert run("simulate", "irb120", "--poses", 9, *same) == 0
+
+
+def test_a_file_whose_link_is_named_is_an_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robot.urdf").write_bytes(material()["robot.urdf"])
+    for named in ("robot.urdf", "robot.urdf#tool0"):
+        arguments = ("export", named, "--to", "urdf", "-o", "robot.urdf")
+        assert "is an input of this command" in refused(capsys, *arguments)
+    assert Path("robot.urdf").read_bytes() == material()["robot.urdf"]
+
+
+def test_a_fleet_has_no_more_processes_than_cells_can_use(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for jobs in ("0", "-2", "9" * 20):
+        assert "give their number" in refused(capsys, "fleet", "cells.toml", "--jobs", jobs)

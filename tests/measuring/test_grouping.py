@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -108,3 +110,83 @@ def test_sessions_and_the_last_poses_are_parts(rng: np.random.Generator) -> None
     assert [part.name[:11] for part in parts(made(q, session=day), "session")] == [
         "the session"
     ] * 3
+
+
+@pytest.mark.parametrize(("places", "each", "groups"), [(8, 2, 8), (8, 5, 8), (7, 5, 35)])
+def test_fewer_than_eight_clusters_are_regions(places: int, each: int, groups: int) -> None:
+    data = made(spread(np.random.default_rng(4), places, each, 0.01))
+    assert len(np.unique(clusters(data))) == groups
+
+
+def test_a_short_path_is_one_pose_and_a_longer_one_is_not() -> None:
+    """All within two steps of each other, or not."""
+    step = 0.8 * REPEAT * np.eye(6)[0]
+    counts = [len(np.unique(groups(made(np.outer(np.arange(n), step))))) for n in (2, 3, 5)]
+    assert counts[:2] == [1, 1]
+    assert counts[2] > 1
+
+
+def test_groups_are_numbered_by_their_joints() -> None:
+    q = np.array([[0.3, 0.0], [-0.2, 1.0], [0.3, 0.0], [-0.2, -1.0]])
+    assert_array_equal(groups(made(q)), [2, 1, 2, 0])
+    told = made(q, pose=np.array(["a", "b", "c", "b"]))
+    assert_array_equal(groups(told), [1, 0, 1, 0])
+    assert_array_equal(grouped(made(q, shift=np.array(["x", "", "", "x"])), "shift"), [0, 1, 0, 0])
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, 1.5])
+def test_a_share_is_a_share(share: float, rng: np.random.Generator) -> None:
+    with pytest.raises(mc.OptionError, match="is not a fraction"):
+        split(made(rng.normal(size=(9, 6))), share, 0)
+
+
+def test_a_column_splits_as_it_says(rng: np.random.Generator) -> None:
+    q = rng.uniform(-2.0, 2.0, (6, 6))
+    label = np.array(["train", "HOLDOUT", "train", "Train", "holdout", "train"])
+    train, held, notices = split(made(q, split=label), 0.9, 0)
+    assert_array_equal(held.q, q[[1, 4]])
+    assert_array_equal(train.q, q[[0, 2, 3, 5]])
+    assert notices == ("the split column decides what is held out",)
+    label[3] = "trian"
+    with pytest.raises(mc.DataError, match=r":4: column split: 'trian' is neither"):
+        split(made(q, split=label), 0.2, 0)
+    with pytest.raises(mc.DataError, match="leaves no row for training"):
+        split(made(q, split=np.repeat("holdout", 6)), 0.2, 0)
+    q[1] = q[0]
+    label[3] = "train"
+    assert "stand both in training" in split(made(q, split=label), 0.2, 0)[2][1]
+
+
+def test_regions_are_named_by_where_they_stand() -> None:
+    rng = np.random.default_rng(2)
+    q = 1e-3 * rng.normal(size=(35, 3))
+    q[:, 1] += np.repeat(np.radians([-80.0, -40.0, 0.0, 40.0, 80.0]), 7)
+    data = made(q)
+    turn = {f"region about joint 2 = {value} deg" for value in (-80, -40, 40, 80)}
+    found = {part.name: part.rows for part in parts(data)}
+    assert turn <= set(found)
+    assert_array_equal(np.flatnonzero(found["region about joint 2 = 40 deg"]), np.arange(21, 28))
+    slides = replace(data, sliding=np.array([False, True, False]))
+    middle = np.median(q[21:28, 1])
+    assert f"region about joint 2 = {1e3 * middle:.0f} mm" in {part.name for part in parts(slides)}
+
+
+def test_parts_are_neither_few_poses_nor_most() -> None:
+    q = np.linspace(-1.0, 1.0, 40)[:, None] * [1.0, 0.004, 0.0]  # joint 2 hardly moves
+    q[:, 2] = np.random.default_rng(3).permutation(q[:, 0])
+    named = {part.name: part.rows for part in parts(made(q, order=np.arange(40.0)))}
+    assert_array_equal(np.flatnonzero(named["joint 1 at its low end"]), np.arange(10))
+    assert_array_equal(np.flatnonzero(named["joint 1 at its high end"]), np.arange(30, 40))
+    assert_array_equal(np.flatnonzero(named["the last fifth"]), np.arange(32, 40))
+    assert not any("joint 2 at" in name for name in named)
+    day = np.repeat(["few", "some", "most"], [2, 3, 35])
+    names = [part.name for part in parts(made(q, session=day))]
+    assert [name for name in names if "session" in name] == ["session some"]
+
+
+def test_rows_of_a_group_column_are_told(rng: np.random.Generator) -> None:
+    """Nine poses that stand in six groups are worth a notice, eight in six are not."""
+    for poses, told in ((10, True), (9, False)):
+        label = [str(min(i, 5)) for i in range(poses)]
+        notices = split(made(rng.normal(size=(poses, 6)), group=np.array(label)), 0.3, 0)[2]
+        assert bool(notices) == told

@@ -105,10 +105,11 @@ def test_leica_points_by_target_name(
     assert_allclose(data.columns["time"], 3.0 * np.arange(POSES))
     assert set(data.unknown["smr2_target"]) == {"B #2"}
     assert run("import", points, "--joints", joints, "-o", tmp_path / "cli.csv") == 0
-    out, _ = capsys.readouterr()
+    out, err = capsys.readouterr()
+    assert err.splitlines()[-1] == f"written: {tmp_path / 'cli.csv'}"
     for words in (
         "Leica tracker CSV", "latin-1", "comma", "point", "smr1 to smr3 x", "header", "temperature",
-        "|q| up to", "60 poses", "wrote",
+        "|q| up to", "60 poses",
     ):  # fmt: skip
         assert words in out
     assert mc.read_measurements(tmp_path / "cli.csv").poses == POSES
@@ -126,7 +127,7 @@ def test_leica_one_reflector_in_turns_is_told_by_the_rigid_body(
     same(import_files([points], joints, layout="target"), truth)
     loose = np.random.default_rng(1).permutation(len(rows))
     shuffled = write("c.csv", table([rows[i] for i in loose], LEICA))
-    refused("add --layout pose if", shuffled, joints=joints)
+    refused("add layout='pose' if", shuffled, joints=joints)
 
 
 def test_leica_matched_by_key(truth: mc.Measurements, write: Write) -> None:
@@ -167,9 +168,9 @@ def test_leica_broken(truth: mc.Measurements, write: Write) -> None:
     refused(f"{points}:9: 5 cells, but the header has 16", points, joints=joints)
     points = write("leica.csv", table(leica_rows(truth)[:-1], LEICA))
     refused("target 'C #3' has 59 points", points, joints=joints)
-    refused("holds points but no joint values; add --joints FILE", points)
+    refused("holds points but no joint values; add their file as joints=", points)
     points = write("leica.csv", table(leica_rows(truth), LEICA).replace("Y  [mm],Z", "V  [mm],Z"))
-    refused("say what they are, as --columns", points, joints=joints)
+    refused("say what they are, as columns=", points, joints=joints)
     refused("cannot be read", points.with_name("none.csv"))
 
 
@@ -182,7 +183,7 @@ def test_columns_in_order_and_by_place(
     rows = np.column_stack([truth.y.reshape(POSES, 9) * 1e3, truth.q * DEG])
     path = write("plain.txt", table(rows))
     text = refused("has 15 columns and no header", path)
-    mapping = text.split("--columns ")[1].split()[0]
+    mapping = text.split("columns='")[1].split("'")[0]
     assert mapping == "smr1_mm,smr2_mm,smr3_mm,q_deg"
     same(import_files([path], columns=mapping), truth)
     found = import_files([path], columns="smr1,smr2,smr3,q_deg")
@@ -341,8 +342,8 @@ def test_one_file_per_target_broken(truth: mc.Measurements, write: Write) -> Non
     refused("holds points but no joint values", points)
     refused("but no points", write("j.csv", joint_rows(truth)))
     twice = write("j.csv", joint_rows(truth))
-    refused("holds joint values, as --joints", points, twice, joints=joints)
-    same(import_files([points, twice]), truth, targets=1)  # no need for --joints: it has names
+    refused("holds joint values, as joints=", points, twice, joints=joints)
+    same(import_files([points, twice]), truth, targets=1)  # no need for joints=: it has names
 
 
 # --- RAPID -------------------------------------------------------------------------------------
@@ -402,10 +403,10 @@ def test_figaroh_broken(truth: mc.Measurements, write: Write) -> None:
     header = "x1,y1,z1,a,b,c,d,e,f"
     degrees = table(np.column_stack([truth.y[:, 0], truth.q * DEG]), header)
     path = write("fig.csv", degrees)
-    refused("cannot be in rad; add --units q=deg", path)
+    refused("cannot be in rad; add units='q=deg'", path)
     same(import_files([path], units="q=deg"), truth, targets=1)
     path = write("fig.csv", table(np.column_stack([truth.y[:, 0] * 1e3, truth.q]), header))
-    refused("add --units smr=mm", path)
+    refused("add units='smr=mm'", path)
     same(import_files([path], units=["smr=mm"]), truth, targets=1)
     refused("target 2 has no column for z", write("fig.csv", "x1,y1,z1,x2,y2,a\n" + "1," * 5 + "1"))
 
@@ -451,7 +452,7 @@ def test_contract_broken(truth: mc.Measurements, write: Write) -> None:
     path = write("m.csv", head + "\n0;0;1;2;3\n0;1;4;;6")
     refused(f"{path}:3: a point has some of x, y, z only", path)
     refused("no unit for it", write("m.csv", head.replace("x_mm", "x_s") + "\n0;0;1;2;3"))
-    refused("has no unit; add --units u95=mm", write("m.csv", head + ";u95\n0;0;1;2;3;1"))
+    refused("has no unit; add units='u95=mm'", write("m.csv", head + ";u95\n0;0;1;2;3;1"))
 
 
 # --- units: proven, or asked for ---------------------------------------------------------------
@@ -470,7 +471,7 @@ def test_units_that_cannot_be_proven_are_asked_for(truth: mc.Measurements, write
     still = np.column_stack([truth.y[:1, 0], truth.q[:1]])
     path = write("m.txt", table(still))
     text = refused("joints (up to", path, columns="smr1,q")
-    assert "add --units q=rad or --units q=deg, and --units smr=mm or --units smr=m" in text
+    assert "add units='q=rad' or units='q=deg', and units='smr=mm' or units='smr=m'" in text
     found = import_files([path], columns="smr1,q", units="rad,m")
     same(found, truth.take(np.array([0])), targets=1)
     refused("write q=rad", path, columns="smr1,q", units="q=parsec")
@@ -482,10 +483,10 @@ def test_small_ways_in_millimetres_are_not_taken_for_metres(write: Write) -> Non
     q = 0.5 + rng.normal(size=(40, 6)) * 1e-3
     y = np.array([3000.0, 10.0, 20.0]) + rng.normal(size=(40, 3)) * 2.0
     path = write("m.txt", table(np.column_stack([y, q])))
-    refused("add --units smr=mm or --units smr=m", path, columns="smr1,q_rad")
+    refused("add units='smr=mm' or units='smr=m'", path, columns="smr1,q_rad")
     y = y - y.mean(axis=0)
     path = write("m.txt", table(np.column_stack([y, q])))
-    refused("add --units smr=m", path, columns="smr1,q_rad")
+    refused("units='smr=m'", path, columns="smr1,q_rad")
 
 
 def test_days_and_months_are_asked_for(truth: mc.Measurements, write: Write) -> None:
@@ -498,7 +499,7 @@ def test_days_and_months_are_asked_for(truth: mc.Measurements, write: Write) -> 
         return write("t.csv", table(rows, header))
 
     path = stamped("{1:02d}/04/2026 10:00:{0:02d}")
-    refused("add --units time=dmy or --units time=mdy", path)
+    refused("add units='time=dmy' or units='time=mdy'", path)
     found = import_files([path], units="time=dmy")
     assert found.data.columns["time"][-1] == pytest.approx(86400 + 59)
     path = stamped("2026-04-{1:02d} 10:00:{0:02d}")
@@ -511,7 +512,7 @@ def test_thousands_or_decimals_are_asked_for(write: Write) -> None:
     path = write("m.csv", "q1_rad;smr1_x_mm;smr1_y_mm;smr1_z_mm\n1;1,234;5,678;9,012\n2;1,2;3;4\n")
     assert_allclose(import_files([path]).data.y[0, 0], [1.234e-3, 5.678e-3, 9.012e-3])
     path = write("m.csv", "q1_rad;smr1_x_mm;smr1_y_mm;smr1_z_mm\n1;1,234;5,678;9,012\n2;2;3;4\n")
-    refused("add --decimal comma", path)
+    refused("add decimal='comma'", path)
     found = import_files([path], decimal="comma")
     assert_allclose(found.data.y[0, 0], [1.234e-3, 5.678e-3, 9.012e-3])
 

@@ -16,6 +16,7 @@ import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects import EFFECTS, Effect, Term, register
+from minimax_cal.modelling.effects.maps import spread, waves_over
 from minimax_cal.modelling.effects.scene import Columns, one_joint
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
@@ -98,6 +99,8 @@ def check_found(fit: mc.Fit, put: dict[str, list[float]], sigmas: float = 4.0) -
         assert max(abs(value) / sigma for value, sigma in found) > 10.0
 
 
+# factors of sines as the prior of the curve has them
+MAP = 1e-3 * spread(2.0, 1.5, waves_over(1.5)) * np.random.default_rng(4).normal(size=29)
 CASES: dict[str, list[float]] = {
     "joint_compliance:J2": [6e-7],
     "gravity_compensator:J2:zero=0:eye=0.4:rest=0.45": [2e-3],
@@ -107,6 +110,7 @@ CASES: dict[str, list[float]] = {
     "gear_error:J3:turns=2": [3e-4, -2e-4],
     "gear_ripple:J1:turns=17": [2e-4, 1e-4],
     "encoder_gain:J1": [4e-4],
+    "joint_error_map:J1:low=-1:high=0.5:length=2:size=0.001": MAP.tolist(),
     "joint_coupling:J5:source=4": [5e-4],
     "backlash:all": [2e-4, -1e-4, 3e-4, 2e-4, 4e-4, 5e-4],
     "settling:J3": [1e-3],

@@ -647,20 +647,20 @@ def test_revisits_from_the_other_side_show_play(
     ("wishes", "message"),
     [
         ({"criterion": "Z"}, "no criterion 'Z'; choose D, A, E, G, I"),
-        ({"poses": 0}, "--poses 0: give 1 to 1000"),
-        ({"candidates": 5}, "--candidates 5: give at least as many as poses"),
-        ({"approach": "both"}, "--approach both is about revisits"),
+        ({"poses": 0}, "poses=0: give 1 to 1000"),
+        ({"candidates": 5}, "candidates=5: give at least as many as poses"),
+        ({"approach": "both"}, "approach='both' is about revisits"),
         ({"approach": "left"}, "choose none or both"),
-        ({"revisit": 50}, "--revisit 50: give 0 to 10"),
-        ({"targets": 0}, "--targets 0"),
-        ({"acceptance": 0.0}, "--acceptance"),
-        ({"reach": (5.0, 1.0)}, "--range: the limits are reversed"),
-        ({"volume": ((1.0, 0.0, 0.0), (0.5, 1.0, 1.0))}, "--volume: the limits"),
-        ({"noise": -1.0}, "noise -1 must be"),
+        ({"revisit": 50}, "revisit=50: give 0 to 10"),
+        ({"targets": 0}, "targets=0"),
+        ({"acceptance": 0.0}, "acceptance="),
+        ({"reach": (5.0, 1.0)}, "reach=: the limits are reversed"),
+        ({"volume": ((1.0, 0.0, 0.0), (0.5, 1.0, 1.0))}, "volume=: the limits"),
+        ({"noise": -1.0}, "noise=-1 must be"),
         ({"joints": {7: (0.0, 1.0)}}, "has no joint 8"),
         ({"seed": -1}, "seed -1"),
         ({"separate": ("backlash:J2",)}, "name two effects"),
-        ({"separate": GAIN}, "give measurements with --data"),
+        ({"separate": GAIN}, "give measurements as data="),
         ({"effects": ("nonsense",)}, "no effect 'nonsense'"),
     ],
 )
@@ -672,7 +672,7 @@ def test_wishes_that_make_no_sense(robot: mc.Robot, wishes: dict, message: str) 
 
 def test_a_fit_tells_where_things_are(robot: mc.Robot, noisy: object) -> None:
     cell = cell_ahead(mc.Cell(robot, np.eye(4), ("smr1",), ring(1)), np.array([3.0, 0.0, 1.0]))
-    with pytest.raises(mc.OptionError, match="leave --tracker and --target out"):
+    with pytest.raises(mc.OptionError, match="leave tracker= and spots= out"):
         plan(robot, 10, fit=cell, tracker=(3.0, 0.0, 1.0))
     with pytest.raises(mc.OptionError, match=r"has 6 joints, but .* has 4"):
         plan("scara_600", 10, fit=cell)

@@ -12,7 +12,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 from minimax_cal.modelling.simulate import Truth, simulate
-from minimax_cal.reporting.plots import diagnosis
+from minimax_cal.reporting.plots import diagnosis, figures
 from minimax_cal.reporting.plots.figures import new_figure, save
 
 ROBOT = mc.load_robot("ur10")
@@ -152,3 +152,20 @@ def test_powers_on_a_logarithmic_axis_are_set_as_mathematics(tmp_path: Path) -> 
     labels = [*axes.get_xticklabels(), *axes.get_yticklabels()]
     assert len(labels) >= 4
     assert all(label.get_parse_math() for label in labels)
+
+
+def test_labels_stand_clear_of_the_line() -> None:
+    axes = figures.new_figure(4, 4).subplots()
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    spots = np.array([[0.2, 0.8], [0.5, 0.5], [0.8, 0.8]])  # a V: above its tip runs the line
+    side = figures.free_side(axes, spots, 1)
+    assert side[1] < 0.0
+    assert np.hypot(*side) == pytest.approx(figures.LABEL_AWAY)
+
+
+def test_workspaces_are_shown_in_millimetres() -> None:
+    axes = figures.new_figure(4, 4).subplots()
+    axes.set(xlim=(-1.0, 1.0), ylim=(0.0, 0.5))
+    figures.in_millimetres(axes)
+    assert axes.xaxis.get_major_formatter()(0.25, None) == "250"
+    assert axes.yaxis.get_major_formatter()(-1.0, None) == "-1000"

@@ -210,8 +210,8 @@ def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
         assert row[1:] == [f"{value:.4f}" for value in numbers]
     assert ladder[-1][1] == f"{gap['gap']['noise_floor_mm']:.4f}"
     effects = table_of(seen, "effects found")[1:]
-    assert [row[0] for row in effects] == [e["effect"] for e in gap["effects"]]
-    assert [row[4:6] for row in effects] == [
+    assert [row[0] for row in effects] == [f"{e['effect']} {e['place']}" for e in gap["effects"]]
+    assert [row[3:5] for row in effects] == [
         [f"{e['holdout_rms_mm'][k]:.4f}" for k in ("before", "after")] for e in gap["effects"]
     ]
     regions = seen.tables["what geometry leaves, by region"][1:]
@@ -273,9 +273,9 @@ def test_what_later_files_tell_is_shown(
     assert [row[0], *row[2:4], *row[5:]] == ["calibrated", "0.1110", "0.2220", "0.2220", "-"]
     assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["accuracy"]
     assert seen.tables["Strongest correlations"][1] == ["a1", "theta2", "+0.500"]
-    assert seen.tables["points that stand out (may be real effects: run minimax-cal diagnose)"][1][
-        :4
-    ] == ["7", "smr2", "1.5000", "9.2"]
+    assert seen.tables[
+        "points that stand out, 1 % of such a list by chance; they may be real effects"
+    ][1][:4] == ["7", "smr2", "1.5000", "9.2"]
 
 
 @pytest.mark.parametrize(("given", "lacking"), [("fit.json", "gap"), ("gap.json", "parameters")])
@@ -505,7 +505,7 @@ def test_hostile_names_are_text(tmp_path: Path, fit: dict[str, Any], gap: dict[s
         curve["title"] = curve["x"]["label"] = curve["views"][0]["name"] = NASTY
     gap["effects"][0]["parameters"][0]["name"] = NASTY
     gap["not_testable"] = [{"effect": NASTY, "needs": NASTY}]
-    gap["reasons"] = [NASTY]
+    gap["verdict"], gap["structure"] = "unknown", {"p": 1e-9, "in": NASTY}
     fit["parameters"][0]["reason"] = fit["objective"] = fit["qp"] = NASTY
     fit["parameters"][0]["identifiable"] = False
     fit["minimax"]["trace"][0]["backend"] = NASTY

@@ -259,6 +259,23 @@ def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
     assert clear
 
 
+def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -> None:
+    """The table that is signed needs no scrolling, no button lies on a legend, maps have room."""
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    open_page(driver, folder / "good.html")
+    table, bars, map_wide = driver.execute_script(
+        "const map = document.querySelector('#chart-correlations .nsewdrag');"
+        "return [document.querySelector('#verdict table').getBoundingClientRect().right,"
+        " document.querySelectorAll('.modebar-btn').length, map.getBoundingClientRect().width]"
+    )
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    open_page(driver, folder / "good.html")
+    assert table <= 390
+    assert bars == 0
+    assert map_wide > 195  # half of the screen; names and scale beside it had left it 40
+
+
 def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
     found = opened.execute_async_script(
         """

@@ -6,7 +6,13 @@ from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, approx
 from scipy.sparse import csr_array
 
 import minimax_cal as mc
-from minimax_cal.solvers.minimize import complex_step
+from minimax_cal.solvers.minimize import (
+    MaxOfFunctions,
+    Rows,
+    below,
+    central,
+    complex_step,
+)
 
 
 @pytest.mark.parametrize("name", CLASSICS)
@@ -132,7 +138,7 @@ def test_unbounded_problem_does_not_claim_success() -> None:
     ("options", "say"),
     [
         ({"jac": "exact"}, "jac 'exact'"),
-        ({"x0": [np.nan]}, "x0"),
+        ({"x0": [1.0, np.nan]}, "x0 holds"),
         ({"fun": lambda x: x * np.nan}, "finite"),
         ({"constraints": [{"type": "ineq"}]}, "not dict"),
         ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
@@ -187,3 +193,95 @@ def test_what_has_no_minimum_is_said() -> None:
 def test_a_jacobian_of_another_shape_is_said() -> None:
     with pytest.raises(mc.OptionError, match=r"shape \(2, 2\); 2 functions of 1 variables"):
         mc.minimize_max(lambda x: np.array([x[0], -x[0]]), [0.0], jac=lambda x: np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("sign", "bounds"), [(1.0, [(None, 5.0)]), (-1.0, [(-5.0, None)]), (1.0, None)]
+)
+def test_a_bound_on_the_other_side_does_not_end_a_fall(
+    sign: float, bounds: list[tuple[float | None, float | None]] | None
+) -> None:
+    found = mc.minimize_max(lambda x: sign * x, [1.0], jac="cs", bounds=bounds)
+    assert found.status == "unbounded"
+
+
+def test_evaluations_are_counted() -> None:
+    seen = {"fun": 0, "jac": 0}
+
+    def fun(x: np.ndarray) -> np.ndarray:
+        seen["fun"] += 1
+        return np.array([(x[0] - 1.0) ** 2, (x[0] + 2.0) ** 2])
+
+    def jac(x: np.ndarray) -> np.ndarray:
+        seen["jac"] += 1
+        return np.array([[2.0 * (x[0] - 1.0)], [2.0 * (x[0] + 2.0)]])
+
+    found = mc.minimize_max(fun, [3.0], jac=jac)
+    assert (found.nfev, found.njev) == (seen["fun"], seen["jac"])
+    assert_allclose(found.x, [-0.5], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("jac", ["cs", lambda x: 2.0 * x])
+def test_a_constraint_has_the_derivative_that_it_names(jac: object) -> None:
+    """The complex step shows complex numbers to the function; a function is asked itself."""
+    kinds, asked = set(), []
+
+    def circle(x: np.ndarray) -> np.ndarray:
+        kinds.add(x.dtype.kind)
+        return x @ x
+
+    def told(x: np.ndarray) -> np.ndarray:
+        asked.append(x)
+        return 2.0 * x
+
+    constraint = NonlinearConstraint(circle, 1.0, 1.0, jac=jac if jac == "cs" else told)
+    found = mc.minimize_max(lambda x: x, [1.0, 0.2], jac="cs", constraints=constraint)
+    assert_allclose(found.x, np.sqrt([0.5, 0.5]), rtol=0, atol=1e-8)
+    assert ("c" in kinds) == (jac == "cs")
+    assert bool(asked) == (jac != "cs")
+
+
+def test_central_differences_are_of_second_order() -> None:
+    """On exp, whose third derivative is itself: h^2/6 with h = 6e-6, and rounding eps/h."""
+    x = np.array([0.3, 40.0])
+    found = central(lambda z: np.array([np.exp(z[0]), np.log(z[1])]), x)
+    assert_allclose(found, np.diag([np.exp(0.3), 1.0 / 40.0]), rtol=1e-9, atol=1e-10)
+
+
+def scaled(fun: object, x: np.ndarray, rows: Rows | None = None) -> MaxOfFunctions:
+    jacobian = lambda z: complex_step(fun, z)  # noqa: E731
+    return MaxOfFunctions.at(x, fun, jacobian, rows or Rows.of(len(x), None, []))
+
+
+@pytest.mark.parametrize(
+    ("fun", "size"),
+    [
+        (lambda x: np.array([3.0 * x[0], -7.0 * x[0]]), 7.0),
+        (lambda x: np.array([1e9 - 1.0 + x[0]]), 1e9),  # flat: a slope of a part in 1e9
+        (lambda x: np.array([0.0 * x[0]]), 1.0),
+    ],
+)
+def test_functions_are_divided_by_their_slope_or_else_their_size(fun: object, size: float) -> None:
+    problem = scaled(fun, np.array([1.0]))
+    assert problem.size == size
+    assert_allclose(problem.evaluate(np.array([2.0]))[0], np.real(fun(np.array([2.0]))) / size)  # type: ignore[operator]
+
+
+def test_the_way_down_from_a_flat_point_is_the_steepest() -> None:
+    nowhere = np.zeros(2)
+
+    def top(x: np.ndarray) -> np.ndarray:
+        a, b = x
+        return np.array([1.0 - a**2 - 3.0 * b**2 - 1e3 * b**3, -(a**2) - 1.0])
+
+    assert_allclose(below(scaled(top, nowhere), nowhere), [0.0, 1e-3])  # type: ignore[arg-type]
+    only = Rows.of(2, Bounds([-1.0, -1.0], [1.0, 0.0]), [])
+    assert_allclose(below(scaled(top, nowhere, only), nowhere), [0.0, -1e-3])  # type: ignore[arg-type]
+    for flat in (
+        lambda x: np.array([1.0 + 0.0 * x[0]]),
+        lambda x: np.array([1.0 + x[0] ** 2 + x[1] ** 2]),
+        lambda x: np.array([1.0 + x[0]]),  # a slope: the search itself goes down
+        lambda x: np.array([1.0 - 1e-9 * x[0] ** 2]),  # less than rounding can tell
+        lambda x: np.array([-1e-7 * x[0] ** 2]),
+    ):
+        assert below(scaled(flat, nowhere), nowhere) is None

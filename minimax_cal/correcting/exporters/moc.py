@@ -173,7 +173,7 @@ def write(job: Job) -> Export:
     if not job.fitted:
         raise OptionError(
             f"moc: {job.source} holds no nominal robot, and the format holds corrections "
-            "only; export a fit written by minimax-cal calibrate -o"
+            "only; export a fit written by minimax-cal calibrate"
         )
     if job.robot.prismatic.any():
         raise OptionError("moc: the format is for turning joints")

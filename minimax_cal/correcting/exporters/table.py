@@ -7,7 +7,15 @@ from dataclasses import replace
 from importlib import import_module
 from typing import cast
 
-from minimax_cal.correcting.exporters import dh_csv, moc, robot_json, ros_yaml, ur_yaml, urdf
+from minimax_cal.correcting.exporters import (
+    dh_csv,
+    moc,
+    robot_json,
+    ros2_control,
+    ros_yaml,
+    ur_yaml,
+    urdf,
+)
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.ground.errors import OptionError
 
@@ -21,6 +29,7 @@ EXPORTERS: dict[str, Callable[[Job], Export]] = {
     "urdf": urdf.write,
     "ur-yaml": ur_yaml.write,
     "ros-yaml": ros_yaml.write,
+    "ros2-control": ros2_control.write,
     "dh-csv": dh_csv.write,
     "json": robot_json.write,
     "moc": moc.write,

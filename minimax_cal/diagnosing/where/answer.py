@@ -199,4 +199,5 @@ def triage_table(triage: Mapping[str, Any]) -> Table:
         (cause, *(number((triage[kind] or nothing).get(key)) for key in ("rms_mm", "share", "p")))
         for kind, cause in causes.items()
     )
-    return Table("kind of error", ("kind", "RMS mm", "share", "p"), rows, ("", ".4f", ".3f", ".2g"))
+    title = "kind of error; by chance, 0.01 is rare enough"
+    return Table(title, ("kind", "RMS mm", "share", "by chance"), rows, ("", ".4f", ".3f", ".2g"))

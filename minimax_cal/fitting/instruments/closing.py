@@ -6,7 +6,7 @@ import numpy as np
 
 from minimax_cal.fitting.identify import random_joints
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots import kinematics
+from minimax_cal.robots.inverse import missing, nearest
 from minimax_cal.robots.robot import Robot
 
 LONGEST = 0.5  # step of a joint [rad, m]
@@ -21,33 +21,17 @@ def reach(
     ball: (3,) in the last frame [m].  goal: (m, 3) in the base [m].  q: (m, n) where to start
     [rad, m].  Damped Newton with steps of least norm; what cannot be reached ends nearby.
     """
-    best = q * robot.sign
-    damping = np.full(len(q), 1e-6)
-    gap, jacobian = examine(robot, ball, goal, best)
-    for _ in range(iterations):
-        square = jacobian @ np.swapaxes(jacobian, 1, 2)
-        size = np.trace(square, axis1=1, axis2=2)[:, None, None] + 1e-12
-        damped = square + damping[:, None, None] * size * np.eye(3)
-        step = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(damped, gap[..., None])
-        step = step[..., 0] * np.minimum(1.0, LONGEST / np.maximum(np.abs(step).max(axis=1), 1e-12))
-        trial = best + step
-        after, after_slope = examine(robot, ball, goal, trial)
-        better = np.linalg.norm(after, axis=1) < np.linalg.norm(gap, axis=1)
-        best, gap = np.where(better[:, None], trial, best), np.where(better[:, None], after, gap)
-        jacobian = np.where(better[:, None, None], after_slope, jacobian)
-        damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), 1e-12, 1e6)
-        if not better.any() and (damping >= 1e2).all():
-            break
-    return best * robot.sign, np.asarray(np.linalg.norm(gap, axis=1))
+    place = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+    place[:, :3, 3] = goal
 
+    def look(rows: Array, here: Array) -> tuple[Array, Array]:
+        signs = robot.sign
+        return missing(robot.mdh, here * signs, robot.prismatic, signs, place[rows], 0.0, ball)
 
-def examine(robot: Robot, ball: Array, goal: Array, q: Array) -> tuple[Array, Array]:
-    """Gap from the ball to its goal (m, 3), and the ball's motion (m, 3, n); q: signs applied."""
-    links = kinematics.chain(robot.mdh, q, robot.prismatic)
-    point = kinematics.points(links, ball[None])[0]
-    swing = kinematics.cross(links.z, point - links.before)
-    jacobian = np.where(robot.prismatic[:, None, None], links.z, swing)
-    return goal - point.T, np.moveaxis(jacobian, -1, 0).swapaxes(1, 2)
+    anywhere = np.full(q.shape, np.inf)
+    found = nearest(look, q, -anywhere, anywhere, longest=LONGEST, steps=iterations)
+    gap, _ = look(np.arange(len(q)), found)
+    return found, np.asarray(np.linalg.norm(gap, axis=1))
 
 
 def closing_poses(

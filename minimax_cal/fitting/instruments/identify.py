@@ -39,7 +39,7 @@ FRAMELESS = {
 }
 SCALE = (
     "all lengths together: a closure has no length standard; one known length, as "
-    "--known-distance A,B,MM, gives it"
+    "known_distances= A,B,MM, gives it"
 )
 
 

@@ -26,7 +26,7 @@ def silent(message: str) -> None:
 
 
 def known_of(text: str) -> Known:
-    """A,B,MM of --known-distance.  Raises OptionError."""
+    """A,B,MM: two sockets and the distance of their centres.  Raises OptionError."""
     parts = [part.strip() for part in text.split(",")]
     number = parts[-1].removesuffix("mm").strip()
     if len(parts) == 3 and parts[0] and parts[1] and re.fullmatch(r"[-+.\deE]+", number):
@@ -34,7 +34,7 @@ def known_of(text: str) -> Known:
             return parts[0], parts[1], 1e-3 * float(number)
         except ValueError:
             pass
-    raise OptionError(f"--known-distance {text!r}: write two sockets and a length, as A,B,500.02")
+    raise OptionError(f"known_distances={text!r}: write two sockets and a length, as A,B,500.02")
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,11 @@ class RelativeOptions:
     seed: int = Options.seed
     fix: Sequence[str] = ()
     free: Sequence[str] = ()
-    offset: bool = option(False, "Lengths: fit a constant offset of each wire (weakly determined).")
+    offset: bool = option(
+        False,
+        "Lengths: fit a constant offset of each wire (weakly determined).",
+        group="What is fitted",
+    )
     known_distances: Sequence[Known] = option(
         (),
         "Closures: the distance between two sockets' centres; gives the scale.",
@@ -60,12 +64,14 @@ class RelativeOptions:
         metavar="A,B,MM",
         read=known_of,
         many=tuple,
+        group="What is fitted",
     )
     lever: float | None = option(
         None,
         "Poses: what a radian counts as, linear over angular noise [default: of the columns "
         "u95_mm and rotation_u95_rad, else 100].",
         "mm",
+        group="What is fitted",
     )
     method: str = Options.method
     resolution: float = Options.resolution
@@ -81,17 +87,17 @@ def check_options(data: RelativeData, options: RelativeOptions) -> None:
         raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
-    for kind, flag, chosen in (
-        ("distances", "--offset", options.offset),
-        ("closures", "--known-distance", bool(options.known_distances)),
-        ("poses", "--lever", options.lever is not None),
+    for kind, name, chosen in (
+        ("distances", "offset", options.offset),
+        ("closures", "known_distances", bool(options.known_distances)),
+        ("poses", "lever", options.lever is not None),
     ):
         if chosen and data.kind != kind:
             raise OptionError(
-                f"{flag} is for {kind}; {data.at.source} holds {data.kind}: leave it out"
+                f"{name}= is for {kind}; {data.at.source} holds {data.kind}: leave it out"
             )
     for first, second, distance in options.known_distances:
-        said = f"--known-distance {first},{second},{1e3 * distance:g}"
+        said = f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
         for label in (first, second):
             if label not in data.sockets:
                 raise OptionError(f"{said}: {data.at.source} has no socket {label!r}")

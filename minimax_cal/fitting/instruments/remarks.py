@@ -35,7 +35,7 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     return (
         f"the scale is not identifiable from closures: {kept[0]} is kept as drawn, and if that is "
         "wrong by a part in a thousand, so is every length; sigmas leave this out; "
-        "--known-distance A,B,MM gives the scale",
+        "known_distances= A,B,MM gives the scale",
     )
 
 

@@ -56,7 +56,7 @@ def split_sockets(
         if gone:
             raise DataError(
                 f"{data.at.source}: column split holds out all of socket {gone[0]!r}, whose "
-                "distance is given with --known-distance; leave some of its visits in training"
+                "distance is given with known_distances=; leave some of its visits in training"
             )
         return held, notices
     if holdout == 0.0:

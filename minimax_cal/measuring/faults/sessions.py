@@ -71,7 +71,7 @@ def session_jumps(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, .
             "frame",
             f"{data.source}: all targets stand elsewhere from {told}: was the instrument or the "
             "base moved, or another workspace measured? name the sessions in a column `session`, "
-            "or free the jump (--effects session_jump)",
+            "or free the jump with effects='session_jump'",
             rows,
             parameters=tuple(Amount("size", float(size), "m") for size in sizes),
         ),

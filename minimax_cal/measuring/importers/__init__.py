@@ -103,7 +103,7 @@ def units_of(texts: Sequence[str]) -> dict[str, str]:
         kinds = (*TIMES, *DATES) if name == "time" else kinds
         if not name or unit not in kinds:
             ways = [f"{name}={kind}" for kind in kinds] if name else ["q=deg", "smr=mm", "time=dmy"]
-            raise OptionError(f"--units {part!r}: write {', '.join(ways[:-1])} or {ways[-1]}")
+            raise OptionError(f"units={part!r}: write {', '.join(ways[:-1])} or {ways[-1]}")
         found[name] = unit
     return found
 
@@ -133,13 +133,13 @@ def unknown(sheet: Sheet) -> str:
         names = ", ".join(sheet.header[:6])
         return (
             f"{sheet.path}:1: columns {names}{' ...' if w > 6 else ''} are not known; say what "
-            "they are, as --columns 1-3=smr1_mm,4-9=q_deg"
+            "they are, as columns='1-3=smr1_mm,4-9=q_deg'"
         )
     targets = 3 if w >= 13 else 1
     example = ",".join([f"smr{i + 1}_mm" for i in range(targets)] + ["q_deg"])
     return (
-        f"{sheet.path}: has {w} columns and no header; say what they are, as --columns {example} "
-        f"({w - 3 * targets} joints) or --columns q_deg,smr1_mm"
+        f"{sheet.path}: has {w} columns and no header; say what they are, as "
+        f"columns='{example}' ({w - 3 * targets} joints) or columns='q_deg,smr1_mm'"
     )
 
 
@@ -173,7 +173,7 @@ def import_files(
     elif turns:
         raise DataError(
             f"{turns[1].sheet.path}: holds joint values, as {turns[0].sheet.path} does; import "
-            "one at a time, or name the file of joints with --joints"
+            "one at a time, or name the file of joints as joints="
         )
     else:
         raise DataError(f"{points[0].sheet.path if points else files[0]}: {no_joints(points)}")
@@ -199,10 +199,10 @@ def told_by(
 ) -> Told:
     """What the user says about files.  Raises OptionError."""
     if layout not in LAYOUTS:
-        raise OptionError(f"--layout {layout!r}: write pose or target")
+        raise OptionError(f"layout={layout!r}: write pose or target")
     sign = {name: sign for sign, name in DECIMALS.items()}.get(decimal, decimal)
     if sign not in ("", *DECIMALS):
-        raise OptionError(f"--decimal {decimal!r}: write comma or point")
+        raise OptionError(f"decimal={decimal!r}: write comma or point")
     if not isinstance(units, Mapping):
         units = units_of([units] if isinstance(units, str) else units)
     return Told(columns, units, layout, sign)
@@ -215,7 +215,7 @@ def file_of_joints(path: Path | str, turns: Sequence[Reading], told: Told) -> Re
         raise DataError(f"{path}: holds no joint values; name its columns q1_deg, q2_deg ...")
     if turns:
         raise DataError(
-            f"{turns[0].sheet.path}: holds joint values, as --joints {path} does; leave one "
+            f"{turns[0].sheet.path}: holds joint values, as joints={str(path)!r} does; leave one "
             "of them out"
         )
     return held
@@ -224,8 +224,8 @@ def file_of_joints(path: Path | str, turns: Sequence[Reading], told: Told) -> Re
 def no_joints(points: Sequence[Reading]) -> str:
     """What to do about missing joint values."""
     if points:
-        return "holds points but no joint values; add --joints FILE"
-    return "holds neither points nor joint values; say what its columns are with --columns"
+        return "holds points but no joint values; add their file as joints="
+    return "holds neither points nor joint values; say what its columns are as columns="
 
 
 def save(path: Path | str, imported: Imported) -> None:

@@ -48,7 +48,7 @@ def unit_of(column: Column, told: Told) -> tuple[str, str]:
     for name in (column.meaning, column.meaning.partition("_")[0], column.family):
         if name in told.units:
             also = f", though {column.known} says {column.unit}" if column.unit else ""
-            return told.units[name], "--units" + (also if column.unit != told.units[name] else "")
+            return told.units[name], "told" + (also if column.unit != told.units[name] else "")
     return column.unit, column.known
 
 
@@ -67,7 +67,7 @@ def one_unit(
         reading, column = found[""]
         raise DataError(
             f"{reading.sheet.path}: column {column.name} has no unit, others have; add "
-            f"--units {column.family}={next(unit for unit in found if unit)}"
+            f"units='{column.family}={next(unit for unit in found if unit)}'"
         )
     return MIXED if len(found) > 1 else next(iter(found), "rad")
 
@@ -304,8 +304,8 @@ def optional(reading: Reading, column: Column, unit: str, known: str) -> Underst
     if factors and unit not in factors:
         what = f"{unit} is no unit for it" if unit else "has no unit"
         raise DataError(
-            f"{reading.sheet.path}: column {column.name}: {what}; add --units "
-            f"{family}={next(iter(factors))}"
+            f"{reading.sheet.path}: column {column.name}: {what}; add "
+            f"units='{family}={next(iter(factors))}'"
         )
     values = reading.numbers(column) * factors.get(unit, 1.0)
     if not np.isfinite(values).any():

@@ -23,7 +23,7 @@ EXACT = re.compile(r"q\d+|smr\d+_[xyz]|payload|tau\d+|approach\d+|qread\d+|base\
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:
-    """Never by itself: only with --columns."""
+    """Never by itself: only where its columns are told."""
     return False
 
 
@@ -36,7 +36,7 @@ def read(sheet: Sheet, told: Told) -> Reading:
     for i in range(sheet.width):
         name = sheet.header[i] if sheet.header else f"column {i + 1}"
         what, unit = found.get(i, ("", ""))
-        known = "--columns" if unit else ""
+        known = "told" if unit else ""
         if what and not unit and sheet.header and (unit := split_unit(name)[1]):
             known = "header"
         columns.append(Column(name, what, unit, tuple(row[i] for row in sheet.cells), known))
@@ -55,7 +55,7 @@ def expand(token: str, room: int) -> list[tuple[str, str]]:
     if EXACT.fullmatch(stem) or plain(stem):
         return [(stem if EXACT.fullmatch(stem) else plain(stem), unit)]
     raise OptionError(
-        f"--columns: {token!r} is not known; write smr1, smr1_mm, q_deg, q1_deg, u95_mm, "
+        f"columns=: {token!r} is not known; write smr1, smr1_mm, q_deg, q1_deg, u95_mm, "
         "temperature_C, time_s, pose, target, order or skip*3"
     )
 
@@ -63,13 +63,13 @@ def expand(token: str, room: int) -> list[tuple[str, str]]:
 def in_order(sheet: Sheet, tokens: list[str]) -> dict[int, tuple[str, str]]:
     """Tokens that follow each other; `q` takes what the others leave."""
     if sum(split_unit(token)[0] == "q" for token in tokens) > 1:
-        raise OptionError("--columns: q stands twice; write q1_deg, q2_deg, ... for single joints")
+        raise OptionError("columns=: q stands twice; write q1_deg, q2_deg, ... for single joints")
     fixed = sum(len(expand(token, 0)) for token in tokens)
     room = sheet.width - fixed
     whole = [pair for token in tokens for pair in expand(token, max(room, 0))]
     if len(whole) != sheet.width:
         raise OptionError(
-            f"--columns: means {len(whole)} columns, but {sheet.path} has {sheet.width}; "
+            f"columns=: means {len(whole)} columns, but {sheet.path} has {sheet.width}; "
             "use skip (or skip*3) for columns to leave out"
         )
     return dict(enumerate(whole))
@@ -81,21 +81,21 @@ def by_place(sheet: Sheet, tokens: list[str]) -> dict[int, tuple[str, str]]:
     for token in tokens:
         place, equals, what = (part.strip() for part in token.partition("="))
         if not equals:
-            raise OptionError(f"--columns: {token!r} has no place; write 1-3={token}")
+            raise OptionError(f"columns=: {token!r} has no place; write 1-3={token}")
         if place in sheet.header:
             first = last = sheet.header.index(place)
         elif span := SPAN.fullmatch(place):
             first, last = int(span[1]) - 1, int(span[2] or span[1]) - 1
         else:
-            raise OptionError(f"--columns: {sheet.path} has no column {place!r}")
+            raise OptionError(f"columns=: {sheet.path} has no column {place!r}")
         if not 0 <= first <= last < sheet.width:
             raise OptionError(
-                f"--columns: {place}: {sheet.path} has columns 1 to {sheet.width} only"
+                f"columns=: {place}: {sheet.path} has columns 1 to {sheet.width} only"
             )
         whole = expand(what, last - first + 1)
         if len(whole) != last - first + 1:
             raise OptionError(
-                f"--columns: {token}: {what} takes {len(whole)} columns, {place} are "
+                f"columns=: {token}: {what} takes {len(whole)} columns, {place} are "
                 f"{last - first + 1}"
             )
         found |= dict(zip(range(first, last + 1), whole, strict=True))

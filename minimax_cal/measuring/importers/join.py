@@ -138,7 +138,7 @@ def by_turns(points: Reading, joints: Reading, layout: str) -> Places:
         if len(rigid) != 1 or max(loose.values()) < LOOSE:
             raise DataError(
                 f"{points.sheet.path}: {k} points for each row of {joints.sheet.path}; add "
-                "--layout pose if the points of a pose follow each other, or --layout target if "
+                "layout='pose' if the points of a pose follow each other, or layout='target' if "
                 "those of a target do"
             )
         layout = rigid[0]

@@ -1,4 +1,4 @@
-"""Joint values only: a header J1, J2 ..., or (given with --joints) no header at all."""
+"""Joint values only: a header J1, J2 ..., or (told to be joints) no header at all."""
 
 from __future__ import annotations
 

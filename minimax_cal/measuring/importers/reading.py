@@ -38,7 +38,7 @@ PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
 
 @dataclass(frozen=True)
 class Told:
-    """What the user said: --columns, --units by meaning, --layout, --decimal."""
+    """What the user said: columns, units by meaning, layout, decimal."""
 
     columns: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
@@ -185,7 +185,7 @@ def checked(reading: Reading) -> Reading:
         if column.meaning and column.meaning in seen:
             raise DataError(
                 f"{path}: columns {seen[column.meaning]!r} and {column.name!r} both are "
-                f"{column.meaning}; delete one, or say which with --columns"
+                f"{column.meaning}; delete one, or say which with columns="
             )
         seen[column.meaning] = column.name
     for number in reading.smrs:

@@ -175,7 +175,7 @@ def decimal_of(
         )
     if comma and not proven:
         raise DataError(
-            f"{comma} may have a decimal comma or be thousands; add --decimal comma, or take "
+            f"{comma} may have a decimal comma or be thousands; add decimal='comma', or take "
             "the commas out"
         )
     return "," if comma else "."

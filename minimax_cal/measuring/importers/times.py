@@ -39,7 +39,7 @@ def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
             raise DataError(
                 f"{reading.sheet.path}: column {column.name}: {unit} is no unit of time"
             )
-        return reading.numbers(column) * TIMES[unit], "--units" if told else column.known
+        return reading.numbers(column) * TIMES[unit], "told" if told else column.known
     found: dict[tuple[float, ...], tuple[Array, str]] = {}
     for order, days in DAYS.items():
         if told and told != order:
@@ -54,13 +54,13 @@ def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
     if found:
         raise DataError(
             f"{reading.sheet.path}: column {column.name}: {filled[0]} may be day or month first; "
-            "add --units time=dmy or --units time=mdy"
+            "add units='time=dmy' or units='time=mdy'"
         )
     if told:
         raise DataError(
             f"{reading.sheet.path}: column {column.name}: {filled[0]!r} is not a time as {told}"
         )
-    return np.empty(0), "no time stamps that are understood; if seconds, add --units time=s"
+    return np.empty(0), "no time stamps that are understood; if seconds, add units='time=s'"
 
 
 def parsed(cells: list[str], form: str) -> Array | None:
@@ -82,14 +82,14 @@ def celsius(reading: Reading, column: Column, told: str) -> tuple[Array, str, st
     values = reading.numbers(column)
     if not np.isfinite(values).any():
         return np.empty(0), "", "empty"
-    unit, known = told or column.unit, "--units" if told else column.known
+    unit, known = told or column.unit, "told" if told else column.known
     if not unit:
         low, high = np.nanmin(values), np.nanmax(values)
         fit = [name for name, (least, most) in ROOM.items() if least <= low and high <= most]
         if len(fit) != 1:
             raise DataError(
                 f"{reading.sheet.path}: column {column.name}: {low:g} to {high:g} may be in C, F "
-                "or K; add --units temperature=C"
+                "or K; add units='temperature=C'"
             )
         unit, known = fit[0], "as rooms are"
     if unit not in CELSIUS:

@@ -36,12 +36,12 @@ def decide(
     far = np.nanmax(np.abs(y), initial=0.0)
     if q_unit == "rad" and turned > MOST_TURN:
         raise DataError(
-            f"{where[0]}: a joint at {turned:g} cannot be in rad; add --units q=deg if it is in "
+            f"{where[0]}: a joint at {turned:g} cannot be in rad; add units='q=deg' if it is in "
             "degrees"
         )
     if y_unit == "m" and far > FARTHEST_POINT:
         raise DataError(
-            f"{where[1]}: a point {far:g} m away was not measured; add --units smr=mm if it is "
+            f"{where[1]}: a point {far:g} m away was not measured; add units='smr=mm' if it is "
             "in mm"
         )
     if q_unit and y_unit:
@@ -91,8 +91,8 @@ def question(
     """What to ask, with the exact options."""
     joints = f"{where[0]}: joints (up to {turned:.4g}) may be in {' or '.join(q_able)}"
     points = f"{where[1]}: points (up to {far:.4g}) may be in {' or '.join(y_able)}"
-    add_q = " or ".join(f"--units q={unit}" for unit in q_able)
-    add_y = " or ".join(f"--units smr={unit}" for unit in y_able)
+    add_q = " or ".join(f"units='q={unit}'" for unit in q_able)
+    add_y = " or ".join(f"units='smr={unit}'" for unit in y_able)
     if len(y_able) == 1:
         return f"{joints}; add {add_q}"
     if len(q_able) == 1:

@@ -71,6 +71,7 @@ GEAR_ERROR = Effect(
     choices=lambda scene, place: [
         at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)
     ],
+    lines=True,
     typical=5e-4,
 )
 
@@ -90,6 +91,7 @@ GEAR_RIPPLE = Effect(
     lambda scene: tuple(f"J{j + 1}" for j in sweeping(scene)),
     waves,
     choices=ratios,
+    lines=True,
     typical=5e-4,
 )
 

@@ -18,6 +18,7 @@ from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
 MASS_DOUBT = 0.2  # relative sigma of the masses and centres of gravity in a robot file
+BESIDE = 5e-5  # error of a coordinate beside which priors of effects are weighed [m]
 LEAST_ARM = 0.02  # sigma of a centre of gravity, where 20 % of it is less [m]
 
 
@@ -209,6 +210,7 @@ class Columns:
     doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
     doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
+    ridge: (d,) weight of a prior of mean zero, (BESIDE / sigma)^2 [m^2 per unit^2]; empty for none.
     """
 
     names: tuple[str, ...]
@@ -218,6 +220,7 @@ class Columns:
     doubt: tuple[Array, ...] = ()
     doubt_shift: tuple[Callable[[], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
+    ridge: Array = field(default_factory=lambda: np.zeros(0))
 
     def displacement(self, scene: Scene) -> Array:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
@@ -266,7 +269,10 @@ class Effect:
     choices: the variants of the law at a place that are worth trying.
     finer: variants near one that was chosen, to try afterwards.
     positive: whether its one parameter is a compliance, which cannot be negative.
+    lines: whether several of its variants at one place are one cause: waves of one gear.
     typical: usual size of a parameter; far larger ones are believed less [SI].
+    is_map: whether its parameters are those of a free curve, told by the curve; sought when causes
+    with a formula are known.
     """
 
     name: str
@@ -278,7 +284,9 @@ class Effect:
     choices: Callable[[Scene, str], Sequence[Choice]] = lambda scene, place: PLAIN
     finer: Callable[[Scene, Choice], Sequence[Choice]] = lambda scene, choice: ()
     positive: bool = False
+    lines: bool = False
     typical: float = np.inf
+    is_map: bool = False
 
 
 def joint_of(place: str) -> int:

@@ -22,6 +22,7 @@ from minimax_cal.modelling.effects.gears import (
     JOINT_COUPLING,
     SETTLING,
 )
+from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
 from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
 from minimax_cal.modelling.effects.time import (
     FRAME_DRIFT,
@@ -43,6 +44,7 @@ EFFECTS: dict[str, Effect] = {
         GEAR_ERROR,
         GEAR_RIPPLE,
         ENCODER_GAIN,
+        JOINT_ERROR_MAP,
         JOINT_COUPLING,
         BACKLASH,
         SETTLING,
@@ -78,6 +80,11 @@ class Term:
     def label(self) -> str:
         """As joint_compliance:J2."""
         return f"{self.effect}:{self.place}"
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Effect and place."""
+        return self.effect, self.place
 
     @property
     def frees_frames(self) -> bool:
@@ -165,7 +172,8 @@ def terms(
     return tuple(out)
 
 
-FREE = frozenset({"turns", "constant", "since", "zero", "eye", "rest"})  # any number will do
+FREE = frozenset({"turns", "constant", "since", "zero", "eye", "rest",
+                  "low", "high", "length", "size"})  # any number will do  # fmt: skip
 
 
 def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choice, ...]:
@@ -265,3 +273,12 @@ def names_of(terms: Sequence[Term], scene: Scene) -> tuple[tuple[str, ...], tupl
 def fields_of(terms: Sequence[Term], scene: Scene) -> Array:
     """(e, k, 3, m) motion of the points in base axes per unit of each parameter."""
     return np.concatenate([term.columns(scene).displacement(scene) for term in terms])
+
+
+def ridge_of(terms: Sequence[Term], scene: Scene) -> Array:
+    """(e,) weights of the priors of all parameters, 0 where there is none [m^2 per unit^2]."""
+    parts = [np.zeros(0)]
+    for term in terms:
+        columns = term.columns(scene)
+        parts.append(columns.ridge if len(columns.ridge) else np.zeros(len(columns.names)))
+    return np.concatenate(parts)

@@ -81,7 +81,7 @@ def begin(menu: Menu, criterion: Criterion, count: int) -> Array:
             )
     raise OptionError(
         f"{len(longer)} of the candidates do not tell the {menu.unknowns} parameters apart; allow "
-        "more of the joints' ranges, or more --candidates"
+        "more of the joints' ranges, or more candidates="
     )
 
 

@@ -23,8 +23,8 @@ from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import gap_verdict
 
 NO_FIT = (
-    "Not in this report: it was made without a calibration; give the file of `minimax-cal "
-    "calibrate -o` as well."
+    "Not in this report: it was made without a calibration; give the file that `minimax-cal "
+    "calibrate` writes as well."
 )
 HEX = re.compile(r"[0-9a-f]{64}")
 

@@ -209,14 +209,16 @@ def limits_now(sources: Sources, found: Signed) -> str:
     """The one thing that keeps the error from being smaller; empty where nobody knows."""
     left = found.claims[0].rms.value
     if sources.gap:
-        lacking = [f for f in established(sources.gap) if not holds(sources, f)]
+        lacking = [f for f in causes(sources.gap) if not holds(sources, f)]
         if lacking:
             return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
         floor = sources.gap.floor
         alone = f"{'' if floor.certain else 'at most '}{number(floor.value)}"
         if left <= NEAR_NOISE * floor.value:
             return f"the noise of the measurements, which alone leaves {alone}."
-        return f"a remainder that no known effect explains; noise alone would leave {alone}."
+        rest = sources.gap.remainder
+        known = f" ({number(rest.predictable_mm)} of it follow the pose)" if rest else ""
+        return f"a remainder that no known effect explains{known}; noise alone would leave {alone}."
     if sources.fit:
         few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
         if few:
@@ -228,9 +230,9 @@ def limits_now(sources: Sources, found: Signed) -> str:
     return ""
 
 
-def established(gap: Diagnosis) -> list[Finding]:
+def causes(gap: Diagnosis) -> list[Finding]:
     """The effects that the diagnosis holds for established, the largest first."""
-    return [f for f in gap.findings if getattr(f, "established", True) and not f.rows]
+    return [f for f in gap.findings if f.established and not f.rows]
 
 
 def holds(sources: Sources, finding: Finding) -> bool:
@@ -252,7 +254,7 @@ def which_is_which(sources: Sources, found: Signed) -> list[str]:
     if not (sources.fit and sources.gap):
         return []
     last, _ = claims_at(sources.gap, None)
-    if all(holds(sources, f) for f in established(sources.gap)):
+    if all(holds(sources, f) for f in causes(sources.gap)):
         return []
     final = sources.gap.ladder[-1].holdout.rms_mm
     return [

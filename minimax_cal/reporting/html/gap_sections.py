@@ -9,18 +9,19 @@ from minimax_cal.ground.records import reading
 from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
 from minimax_cal.reporting.html.sources import Sources
-from minimax_cal.reporting.tables import where_tables
+from minimax_cal.reporting.tables import remainder_table, where_tables
 
 CURVES = ("residual", "order")
 NO_GAP = (
-    "Not in this report: it was made without a diagnosis; give the file of `minimax-cal diagnose "
-    "-o` as well."
+    "Not in this report: it was made without a diagnosis; give the file that `minimax-cal "
+    "diagnose` writes as well."
 )
 
 
 def gap_steps(gap: Diagnosis) -> Blocks:
     """How far the gap closes, rung by rung."""
-    return [waterfall(gap), gap.ladder_table(), text(closing(gap))]
+    left = remainder_table(gap)
+    return [waterfall(gap), gap.ladder_table(), text(closing(gap)), *([left] if left.rows else [])]
 
 
 def closing(gap: Diagnosis) -> str:
@@ -56,9 +57,9 @@ def causes(gap: Diagnosis, *, parameters: bool) -> Blocks:
         blocks.append(rivals)
         blocks.append(
             text(
-                "Likeness is how much of the named effect's motion the rival imitates (1: all of "
-                "it). Power is what these data have to tell the two apart: 25 is enough, and the "
-                "measurement proposed aims at that."
+                "Likeness is how much of the named effect's motion the rival imitates. Power is "
+                "what these data have to tell the two apart; a measurement is proposed where one "
+                "helps."
             )
         )
     elif gap.findings:

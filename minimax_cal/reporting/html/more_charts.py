@@ -76,13 +76,18 @@ def correlation_map(known: Uncertainty) -> Figure:
     trace = {
         "type": "heatmap", "x": names, "y": names, "z": rows, "zmin": -1.0, "zmax": 1.0,
         "colorscale": [[0.0, "before"], [0.5, "back"], [1.0, "after"]],
-        "colorbar": {"title": {"text": "correlation"}, "thickness": 14},
+        "colorbar": {"title": {"text": "correlation"}, "thickness": 10, "orientation": "h",
+                     "len": 0.8, "y": 1.02, "yanchor": "bottom",
+                     "tickvals": [-1, 0, 1], "tickangle": 0},
         "hovertemplate": "%{x}, %{y}: %{z:.3f}<extra></extra>",
         "xaxis": key("x", 0), "yaxis": key("y", 0),
     }  # fmt: skip
     # more labels than these hide each other; all are told where one points
     every = int(np.ceil(len(names) / MOST_LABELS))
-    tick = {"type": "category", "tickfont": {"size": 10}, "showgrid": False, "dtick": every}
+    short = [name.rpartition(".")[2] for name in names]  # of an effect its parameter
+    short = short if len(set(short)) == len(short) else names
+    tick = {"type": "category", "tickfont": {"size": 10}, "showgrid": False,
+            "tickvals": names[::every], "ticktext": short[::every]}  # fmt: skip
     layout = frame(
         xaxis=axis("") | tick | {"tickangle": -90},
         yaxis=axis("") | tick | {"autorange": "reversed"},

@@ -1,60 +1,20 @@
-"use strict";
 // Draws the charts of the report in the colours of the page, light or dark, on screen or paper.
 (() => {
+  const { CONFIG, SCREEN_BUTTONS, SPACE_BUTTONS, GAP, palette, coloured, triples, put, arrows,
+    hasDepth } = drawing;
   const root = document.documentElement;
   const paper = "paper" in root.dataset;
   const PAPER_WIDTH = 680; // pixels between the margins of A4
   const PAPER_HEIGHT = 0.8; // of the height on a screen
-  const SCREEN_BUTTONS = { modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] };
-  const SPACE_BUTTONS = { modeBarButtons: [["toImage", "resetCameraDefault3d"]] };
-  const CONFIG = { responsive: true, displaylogo: false, showLink: false, showSendToCloud: false,
-    showEditInChartStudio: false, plotlyServerURL: "", scrollZoom: false };
+  const NARROW = window.matchMedia("(max-width: 40rem)"); // no room for buttons beside the legend
   const figures = [...document.querySelectorAll(".chart")].map((element) => ({
     element, ...JSON.parse(element.nextElementSibling.textContent),
   }));
   const state = { shown: 1, times: 0, pose: 0, printing: paper };
 
-  // ---- colours ---------------------------------------------------------------------------------
-
-  function palette() {
-    const probe = document.createElement("span");
-    document.body.append(probe);
-    const found = {};
-    for (const name of root.dataset.palette.split(" ")) {
-      probe.style.color = `var(--${name})`;
-      found[name] = getComputedStyle(probe).color;
-    }
-    probe.remove();
-    return found;
-  }
-
-  // Colours stand under keys that end in "color" or "colorscale": no other text is touched.
-  function coloured(value, colours, key = "") {
-    if (Array.isArray(value)) return value.map((part) => coloured(part, colours, key));
-    if (value !== null && typeof value === "object") {
-      return Object.fromEntries(Object.entries(value).map(
-        ([name, part]) => [name, coloured(part, colours, name)]));
-    }
-    const isColour = typeof value === "string" && /color(scale)?$/.test(key);
-    return isColour && Object.hasOwn(colours, value) ? colours[value] : value;
-  }
-
   const heightOf = (figure) => Math.round(figure.height * (state.printing ? PAPER_HEIGHT : 1));
-
-  function layoutOf(figure, colours) {
-    const axis = { gridcolor: colours.line, linecolor: colours.soft, zerolinecolor: colours.line,
-      tickcolor: colours.soft, automargin: true, showline: true, ticks: "outside", ticklen: 4 };
-    const font = { color: colours.ink, size: 12, family: getComputedStyle(document.body).fontFamily };
-    const size = state.printing ? { width: PAPER_WIDTH, autosize: false } : { autosize: true };
-    return {
-      ...coloured(figure.layout, colours),
-      ...size, height: heightOf(figure), font,
-      modebar: { bgcolor: "rgba(0,0,0,0)", color: colours.soft, activecolor: colours.ink }, uirevision: "kept",
-      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      hoverlabel: { bgcolor: colours.back, bordercolor: colours.soft, font },
-      template: { layout: { xaxis: axis, yaxis: axis } },
-    };
-  }
+  const sizeOf = (figure) => ({ height: heightOf(figure),
+    ...(state.printing ? { width: PAPER_WIDTH, autosize: false } : { autosize: true }) });
 
   // ---- charts ----------------------------------------------------------------------------------
 
@@ -66,8 +26,9 @@
     const buttons = flat ? SCREEN_BUTTONS : SPACE_BUTTONS;
     figure.element.querySelector(".waiting")?.remove();
     figure.element.style.height = `${heightOf(figure)}px`;
-    return Plotly.react(figure.element, coloured(traces, colours), layoutOf(figure, colours),
-      { ...CONFIG, ...buttons });
+    const layout = drawing.layoutOf(figure, colours, sizeOf(figure));
+    return Plotly.react(figure.element, coloured(traces, colours), layout,
+      { ...CONFIG, ...buttons, displayModeBar: NARROW.matches ? false : "hover" });
   }
 
   function drawAll() {
@@ -75,28 +36,6 @@
   }
 
   // ---- the view in space -----------------------------------------------------------------------
-
-  const triples = (flat) => Array.from({ length: flat.length / 3 },
-    (_, i) => flat.slice(3 * i, 3 * i + 3));
-  const put = (trace, points) => ({ ...trace,
-    x: points.map((p) => p[0] / 1e3), y: points.map((p) => p[1] / 1e3),
-    z: points.map((p) => p[2] / 1e3) });
-  const GAP = [NaN, NaN, NaN];
-
-  // Lines with heads; a head lies in the plane of its arrow and the vertical.
-  function arrows(points, errors, times) {
-    const starts = triples(points), out = [];
-    triples(errors).forEach((error, i) => {
-      const from = starts[i], along = error.map((e) => e * times);
-      const flat = Math.hypot(along[0], along[1]), long = Math.hypot(...along);
-      const side = flat > 1e-9 * long
-        ? [-along[0] * along[2] / flat, -along[1] * along[2] / flat, flat] : [long, 0, 0];
-      const tip = from.map((f, j) => f + along[j]);
-      const wing = (sign) => tip.map((t, j) => t - 0.25 * along[j] + sign * 0.1 * side[j]);
-      out.push(from, tip, wing(1), GAP, tip, wing(-1), GAP);
-    });
-    return out;
-  }
 
   function inSpace(figure) {
     const { arms, traces } = figure, times = arms.steps[state.times], pose = arms.poses[state.pose];
@@ -142,11 +81,6 @@
         again();
       });
     }
-  }
-
-  function hasDepth() {
-    const canvas = document.createElement("canvas");
-    return Boolean(canvas.getContext("webgl2") || canvas.getContext("webgl"));
   }
 
   // ---- the page --------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ def render(report: Report, *, paper: bool = False) -> str:
     from markupsafe import Markup
 
     pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
-    own, plotly = part("page.js"), str(offline.get_plotlyjs())
+    own, plotly = part("drawing.js") + part("page.js"), str(offline.get_plotlyjs())
     template = pages.from_string(part("page.html.jinja"))
     whole: str = template.render(
         report=report,
@@ -54,9 +54,9 @@ def needed() -> tuple[Any, Any]:
     return jinja, offline
 
 
-def part(name: str) -> str:
-    """A file of this package."""
-    return (resources.files("minimax_cal.reporting.html") / name).read_text("utf-8")
+def part(name: str, package: str = "minimax_cal.reporting.html") -> str:
+    """A file of this package, or of another one of ours."""
+    return (resources.files(package) / name).read_text("utf-8")
 
 
 def kind_of(block: Block) -> str:

@@ -141,8 +141,8 @@ def arms_of(space: Space, poses: Poses, names: Names) -> dict[str, Any]:
 
 
 def cloud(name: str, colour: str, points: Array, **more: Any) -> dict[str, Any]:
-    """Points or lines in space, in metres."""
-    x, y, z = (plain(1e-3 * column, 6) for column in np.reshape(points, (-1, 3)).T)
+    """Points or lines in space, in millimetres."""
+    x, y, z = (plain(column, 4) for column in np.reshape(points, (-1, 3)).T)
     return {"type": "scatter3d", "name": name, "x": x, "y": y, "z": z, "hoverinfo": "skip",
             "marker": {"color": colour, "size": 3}, "line": {"color": colour, "width": 4},
             **more}  # fmt: skip
@@ -193,12 +193,12 @@ def workspace(poses: Poses, cell: Cell, names: Names) -> View:
 
 
 def scene_axes(space: Space) -> dict[str, Any]:
-    """Axes in metres, the same scale on all, that do not move with the arrows."""
+    """Axes in millimetres, the same scale on all, that do not move with the arrows."""
     pad = (PAD + 0.02) * space.radius
-    ends = [[1e-3 * (a - pad), 1e-3 * (b + pad)]
+    ends = [[a - pad, b + pad]
             for a, b in zip(space.low, space.high, strict=True)]  # fmt: skip
     axes = {
-        f"{letter}axis": {"title": {"text": f"{letter} (m)"}, "range": plain(np.array(ends[i]), 4),
+        f"{letter}axis": {"title": {"text": f"{letter} (mm)"}, "range": plain(np.array(ends[i]), 4),
                           "color": "ink", "gridcolor": "line", "showbackground": False, "nticks": 6}
         for i, letter in enumerate("xyz")
     }  # fmt: skip

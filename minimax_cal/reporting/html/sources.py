@@ -143,8 +143,7 @@ def read_sources(results: Sequence[Result]) -> Sources:
             arms.append(SimulatorGap.from_dict(content, path))
         else:
             raise CalibrationError(
-                f"{path}: is neither a calibration nor a diagnosis; {AGAIN} calibrate -o or "
-                "diagnose -o"
+                f"{path}: is neither a calibration nor a diagnosis; {AGAIN} calibrate or diagnose"
             )
         files.append(File(kind, path, digest))
     for kind, other, count in (

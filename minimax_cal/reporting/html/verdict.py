@@ -10,14 +10,6 @@ from minimax_cal.fitting.intervals import UNKNOWN, Interval
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.reporting.html.content import Note, caveat, text
 
-VERDICTS = {
-    "none": "Nothing beyond geometry and noise was found.",
-    "named": "What remains has been found and named; no rival explains it as well.",
-    "one_of": "A cause has been found, but these data leave more than one name for it.",
-    "unknown": "Something remains that follows pose, load, move or time, and no known law "
-    "explains it.",
-    "not_repeatable": "The arm does not come back to the same place when a pose is repeated.",
-}
 OBJECTIVES = {
     "sum": "the sum of all squared errors as small as possible",
     "minimax": "minimax, the error of the worst target as small as possible",
@@ -102,9 +94,10 @@ def trouble(status: str, advice: str) -> tuple[Note, ...]:
 
 
 def gap_verdict(gap: Diagnosis) -> tuple[Note, ...]:
-    """The diagnosis, its reasons as they stand in the file."""
-    reasons = (Note(reason, "reason") for reason in gap.reasons)
-    return (Note(VERDICTS[gap.verdict], "verdict"), *reasons, *trouble(gap.status, ""))
+    """The diagnosis in its sentences, the verdict first."""
+    verdict, *reasons = gap.reasons
+    more = (Note(reason, "reason") for reason in reasons)
+    return (Note(verdict, "verdict"), *more, *trouble(gap.status, ""))
 
 
 REASONS = (

@@ -14,6 +14,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.reporting.plots.figures import (
     AFTER,
     BEFORE,
+    MAP_COLOURS,
+    in_millimetres,
     logarithmic,
     new_figure,
     plain_ticks,
@@ -100,7 +102,7 @@ def draw_maps(part: Any, left: Leftover) -> None:
     tall = int(np.argmax(np.abs(up)))
     first, second = (axis for axis in range(3) if axis != tall)
     across, deep, high = left.points[..., first], left.points[..., second], left.points @ up
-    views = (("top", deep, f"{'xyz'[second]} (m)"), ("side", high, "height (m)"))
+    views = (("top", deep, f"{'xyz'[second]} (mm)"), ("side", high, "height (mm)"))
     widest = float(max(np.nanmax(along) - np.nanmin(along) for along in (across, deep, high)))
     wide = len(sizes) > 1  # one view stands beside the other; two above each other
     grid = part.subplots(
@@ -111,22 +113,24 @@ def draw_maps(part: Any, left: Leftover) -> None:
         order = np.argsort(np.nan_to_num(size), axis=None)  # the worst on top
         shown = axes.scatter(
             across.ravel()[order], down.ravel()[order],
-            c=size.ravel()[order], norm=scale, cmap="cividis_r", s=9,
+            c=size.ravel()[order], norm=scale, cmap=MAP_COLOURS, s=11, linewidths=0.3,
+            edgecolors="#777777",
         )  # fmt: skip
         axes.set_aspect("equal", adjustable="box")
+        in_millimetres(axes)
         axes.set(xlim=room(across, widest), ylim=room(down, widest))
         axes.set_title(f"{name}, {view}", fontsize="medium")
         axes.grid(visible=True, alpha=0.3)
         if axes in grid[:, 0] or not wide:
             axes.set_ylabel(label)
         if axes in grid[-1]:
-            axes.set_xlabel(f"{'xyz'[first]} (m)")
+            axes.set_xlabel(f"{'xyz'[first]} (mm)")
     scale_bar(part, shown, grid, "error of a point (mm)", "right" if wide else "bottom")
 
 
 def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict in a few words."""
-    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.findings]
+    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.by_rung if f.established]
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     found = ", ".join(names[:3]) + more
     return {

@@ -10,13 +10,19 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.maps import Section, WorkspaceMap
 from minimax_cal.judging.saved import AFTER, BEFORE
-from minimax_cal.reporting.plots.figures import logarithmic, new_figure, save, scale_bar
+from minimax_cal.reporting.plots.figures import (
+    MAP_COLOURS,
+    in_millimetres,
+    logarithmic,
+    new_figure,
+    save,
+    scale_bar,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = "OrRd"  # pale is small, dark is large: one hue, for colour-blind eyes too
 NOWHERE = "#dfe3e8"  # where no joints come
 REACHED = 0.5  # share of a bin's samples among the training poses: fewer is extrapolation
 MARKS: dict[bool, dict[str, Any]] = {  # held out or not: size and rim of a point
@@ -34,9 +40,10 @@ def save_map(found: WorkspaceMap, path: Path) -> None:
         draw_predicted(figure, grid[:, :1], found)
     draw_observed(figure, grid[:, -2:], found)
     for row, part in zip(grid, found.sections, strict=True):
-        row[0].set(ylabel=part.axes[1], xlim=part.x[[0, -1]], ylim=part.y[[0, -1]])
+        row[0].set(ylabel=millimetres(part.axes[1]), xlim=part.x[[0, -1]], ylim=part.y[[0, -1]])
         for axes in row:
-            axes.set(xlabel=part.axes[0], aspect="equal")
+            axes.set(xlabel=millimetres(part.axes[0]), aspect="equal")
+            in_millimetres(axes)
             axes.grid(visible=True, alpha=0.3)
             axes.set_facecolor(NOWHERE)
     figure.suptitle(f"{found.robot}: position over the workspace, base frame", fontweight="bold")
@@ -44,14 +51,20 @@ def save_map(found: WorkspaceMap, path: Path) -> None:
     save(figure, path)
 
 
+def millimetres(title: str) -> str:
+    """The title of an axis in metres that is shown in millimetres."""
+    return title.replace("(m)", "(mm)")
+
+
 def legend(found: WorkspaceMap) -> str:
     """What the rows, the line and the points mean."""
+    height, thick = 1e3 * found.height, 1e3 * found.slab
     return (
         "upper row: half-plane through axis 1, into which all poses are turned; lower row: "
-        f"horizontal slab at {found.height:.2f} m, {found.slab:.2f} m thick (pale points lie "
-        "outside it).\nline: on its far side most joints that come there lie beyond the training "
-        "poses (extrapolation); grey: no joints come there.\nlarge ringed points: held-out poses; "
-        "small points: training poses"
+        f"horizontal slab at {height:.0f} mm, {thick:.0f} mm thick (pale points lie outside it).\n"
+        "line: on its far side most joints that come there lie beyond the training poses "
+        "(extrapolation); grey: no joints come there.\nlarge ringed points: held-out poses; small "
+        "points: training poses"
     )
 
 
@@ -61,7 +74,7 @@ def draw_predicted(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
     scale = logarithmic(np.concatenate(every), 0.02)
     for axes, part in zip(grid[:, 0], found.sections, strict=True):
         shown = axes.pcolormesh(
-            part.x, part.y, 1e3 * part.worst.T, norm=scale, cmap=COLOURS, rasterized=True
+            part.x, part.y, 1e3 * part.worst.T, norm=scale, cmap=MAP_COLOURS, rasterized=True
         )
         outline(axes, part)
         axes.set_title("predicted, the worst of each bin", fontsize="medium")
@@ -86,7 +99,7 @@ def draw_observed(figure: Figure, grid: Array, found: WorkspaceMap) -> None:
                     rows = np.flatnonzero(mask & (seen.held == held) & np.isfinite(error))
                     rows = rows[np.argsort(error[rows])]  # the worst on top
                     shown = axes.scatter(
-                        across[rows], along[rows], c=error[rows], norm=scale, cmap=COLOURS,
+                        across[rows], along[rows], c=error[rows], norm=scale, cmap=MAP_COLOURS,
                         alpha=alpha, zorder=3, **mark,
                     )  # fmt: skip
             axes.set_title(f"observed, {name}", fontsize="medium")

@@ -9,7 +9,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.planning.result import POWER, Plan
-from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, save
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, in_millimetres, new_figure, save
 
 GREY = "#bbbbbb"
 FAR = 1.0  # of the candidates' span: a tracker farther off is told by an arrow
@@ -53,29 +53,41 @@ def views(plan: Plan, side: Any, above: Any) -> None:
         side.scatter(out(points), points[:, 2], s=size, color=colour, label=name)
         above.scatter(points[:, 0], points[:, 1], s=size, color=colour)
     above.plot(chosen[:, 0], chosen[:, 1], color=AFTER, linewidth=0.6, alpha=0.7)
-    mark(side, out(everywhere), everywhere[:, 2], (float(out(eye)), float(eye[2])))
-    mark(above, everywhere[:, 0], everywhere[:, 1], (float(eye[0]), float(eye[1])))
-    side.set(xlabel="flange, distance from the base's vertical (m)", ylabel="height (m)")
-    above.set(xlabel="flange, from above (m)", ylabel="across (m)")
+    panels = (
+        (side, np.stack([out(everywhere), everywhere[:, 2]], 1), np.array([out(eye), eye[2]])),
+        (above, everywhere[:, :2], eye[:2]),
+    )
+    far = max(away(points, place) for _, points, place in panels) > FAR
+    for one, points, place in panels:
+        mark(one, points, place, f"{np.linalg.norm(eye):.1f} m away" if far else "")
+    side.set(xlabel="flange, distance from the base's vertical (mm)", ylabel="height (mm)")
+    above.set(xlabel="flange from above, along (mm)", ylabel="across (mm)")
     for one in (side, above):
         one.set_aspect("equal", adjustable="datalim")
         one.grid(visible=True, alpha=0.3)
+        in_millimetres(one)
     side.legend(frameon=False, fontsize="small")
 
 
-def mark(axes: Any, across: Array, along: Array, eye: tuple[float, float]) -> None:
-    """The tracker, or the way to it where it would leave a thumbnail of the arm."""
-    middle = np.array([across.mean(), along.mean()])
-    span = float(max(np.ptp(across), np.ptp(along)))
-    way = np.array(eye) - middle
-    distance = float(np.linalg.norm(way))
-    if distance <= FAR * span:
-        axes.plot(*eye, "^", color=BEFORE, label="tracker")
+def away(points: Array, place: Array) -> float:
+    """How far a place is from the middle of points (m, 2), in their span."""
+    return float(np.linalg.norm(place - points.mean(axis=0)) / np.ptp(points, axis=0).max())
+
+
+def mark(axes: Any, points: Array, place: Array, far: str) -> None:
+    """The tracker, or the way to it where it would leave a thumbnail of the arm.
+
+    far: how far it is away, empty where it is near.
+    """
+    if not far:
+        axes.plot(*place, "^", color=BEFORE, linestyle="", label="tracker")
         return
-    tip = middle + 0.75 * span * way / distance
+    middle, span = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    way = (place - middle) / np.linalg.norm(place - middle)
+    tip = middle + 0.75 * span * way
     arrow = {"arrowstyle": "-|>", "color": BEFORE, "linewidth": 1.5}
-    axes.annotate("", tip, xytext=middle + 0.55 * span * way / distance, arrowprops=arrow)
-    axes.plot([], [], "^", color=BEFORE, label=f"to the tracker, {distance:.1f} m away")
+    axes.annotate("", tip, xytext=middle + 0.55 * span * way, arrowprops=arrow)
+    axes.plot([], [], color=BEFORE, label=f"arrow: to the tracker, {far}")
     axes.plot(*tip, alpha=0.0)  # within the limits
 
 

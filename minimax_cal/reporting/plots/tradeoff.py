@@ -5,8 +5,10 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
+import numpy as np
+
 from minimax_cal.judging.tradeoff import Tradeoff
-from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, save
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, free_side, new_figure, save
 
 
 def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
@@ -23,17 +25,19 @@ def save_tradeoff(found: Tradeoff, path: Path | str) -> None:
     panels = figure.subplots(1, len(parts), squeeze=False)[0]
     for axes, (name, judged), colour in zip(panels, parts.items(), (BEFORE, AFTER), strict=False):
         axes.plot([a.rms_mm for a in judged], [a.max_mm for a in judged], "o-", color=colour)
-        for number, a in enumerate(judged):
-            text = {0: "sum", len(judged) - 1: "point"}.get(number, str(number))
-            spot = (a.rms_mm, a.max_mm)
-            axes.annotate(
-                text, spot, xytext=(7, 4), textcoords="offset points",
-                path_effects=[withStroke(linewidth=3, foreground="white")],
-            )  # fmt: skip
         axes.set(xlabel="RMS error (mm)", ylabel="largest error (mm)")
         axes.set_title(f"{judged[0].poses} {name}")
         axes.margins(0.15)
         axes.grid(visible=True, alpha=0.3)
+        axes.autoscale_view()
+        spots = np.array([(a.rms_mm, a.max_mm) for a in judged])
+        for number, spot in enumerate(spots):
+            text = {0: "sum", len(judged) - 1: "point"}.get(number, str(number))
+            axes.annotate(
+                text, spot, xytext=free_side(axes, spots, number), textcoords="offset points",
+                ha="center", va="center",
+                path_effects=[withStroke(linewidth=3, foreground="white")],
+            )  # fmt: skip
     title = textwrap.fill(f"{found.robot}: RMS against the largest error", 80)
     figure.suptitle(title, fontweight="bold")
     save(figure, Path(path))

@@ -8,17 +8,22 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kinematics import cross
+from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 
 SLIDE = 0.5  # metres a slide may change by where a turning joint may by a radian [m/rad]
-STEPS = 40  # Newton's, at most
 PASSES, PATIENCE = 12, 6  # over the effects; those until sides are kept
 SETTLED = 1e-10  # change of a joint that no pass need follow [rad, m]
+# What moves the reflectors or the instrument, and not the flange of the arm.
+SEEN_ONLY = frozenset({"tool_flex", "frame_drift", "session_jump", "target_shift", "target_offset"})
+TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+CORNERS = tuple(f"corner{i + 1}" for i in range(4))
+LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
 SOFT = 0.01  # of the lever: what a radian of change costs where the goal is out of reach anyway
 
 
@@ -174,7 +179,7 @@ class Reach:
         for count in range(PASSES):
             turn, moved = bent(self.arm, data)
             goal = np.linalg.inv(moved) @ self.goal
-            new = newton(self, q, goal, turn, soft)
+            new = self.nearest(q, goal, turn, soft)
             change = np.abs(new - q).max(axis=1)
             q = new
             if not self.arm.effects.terms:
@@ -191,11 +196,30 @@ class Reach:
         agree = np.abs(walked - turn).max(axis=1) < 1e4 * SETTLED
         return q, agree & (change < 1e4 * SETTLED)
 
+    def nearest(self, begin: Array, goal: Array, turn: Array, soft: Array) -> Array:
+        """Joints (m, n) nearest to goals for effects that turn the joints by turn (m, n).
+
+        soft: (m,) price of change, relative to the lever.
+        """
+
+        def look(rows: Array, q: Array) -> tuple[Array, Array]:
+            return self.missing(q, goal[rows], turn[rows])
+
+        price = (soft * self.lever) ** 2
+        return nearest(look, begin, *self.box, price, self.start)
+
+    def missing(self, q: Array, goal: Array, turn: Array) -> tuple[Array, Array]:
+        """What is missing of goals, and its slope, as `inverse.missing` has them."""
+        robot = self.arm.robot
+        moved = q * robot.sign + turn
+        return missing(robot.mdh, moved, robot.prismatic, robot.sign, goal, self.lever)
+
     def outcomes(self, q: Array, good: Array, settled: Array) -> tuple[Outcome, ...]:
         """How each target ended."""
         turn, moved = bent(self.arm, self.at(q))
-        residual, jacobian = examine(self, q, np.linalg.inv(moved) @ self.goal, turn)
         robot, (lower, upper) = self.arm.robot, self.box
+        goal = np.linalg.inv(moved) @ self.goal
+        residual, jacobian = self.missing(q, goal, turn)
         force = np.einsum("mij,mi->mj", jacobian, residual)
         size = np.linalg.norm(jacobian, axis=1) * np.linalg.norm(residual, axis=1)[:, None]
         down, up = force < -1e-2 * size, force > 1e-2 * size
@@ -220,64 +244,45 @@ class Reach:
         return tuple(out)
 
 
-def examine(reach: Reach, q: Array, goal: Array, turn: Array) -> tuple[Array, Array]:
-    """What is missing of the goals (m, 6) [m], turns times the lever, and its slope (m, 6, n)."""
-    robot, lever = reach.arm.robot, reach.lever
-    links = kinematics.chain(robot.mdh, q * robot.sign + turn, robot.prismatic)
-    missing = goal[:, :3, 3] - links.origin.T
-    pose = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
-    away = Rotation.from_matrix(goal[:, :3, :3] @ np.swapaxes(pose, -1, -2)).as_rotvec()
-    slides = robot.prismatic[:, None, None]
-    moves = np.where(slides, links.z, cross(links.z, links.origin - links.before))
-    turns = np.where(slides, 0.0, lever * links.z)
-    jacobian = np.concatenate([moves, turns], axis=1) * robot.sign[:, None, None]
-    return np.concatenate([missing, lever * away], axis=1), np.moveaxis(jacobian, -1, 0).swapaxes(
-        1, 2
+def arm_of(cell: Cell) -> Cell:
+    """The calibrated arm in its own base, seen by four points about its targets' centre.
+
+    They tell the flange's pose.  Of the effects those that move the flange.
+    """
+    middle = cell.target_positions.mean(axis=0) if len(cell.target_positions) else np.zeros(3)
+    kept = [
+        (term, value)
+        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
+        if term.effect not in SEEN_ONLY and term.place not in cell.target_names
+    ]
+    effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
+    return replace(
+        cell,
+        target_names=CORNERS,
+        target_positions=middle + USUAL_LEVER * TETRAHEDRON,
+        effects=effects,
     )
 
 
-def newton(reach: Reach, begin: Array, goal: Array, turn: Array, soft: Array) -> Array:
-    """Joints (m, n) nearest to their goals within the box: damped Gauss-Newton on all at once.
+def lever_of(cell: Cell) -> float:
+    """What a radian counts as with the targets of a cell [m]."""
+    away = np.linalg.norm(cell.target_positions, axis=1)
+    own = rms(away) if len(away) else 0.0
+    return own if own > LEAST_LEVER else USUAL_LEVER
 
-    Minimises |missing|^2 + soft^2 |change from the start|^2.  A joint at a bound that would leave
-    is held; steps are cut to the box, and damped until they lower the cost.  turn: (m, n) that
-    effects add.  soft: (m,) price of change, relative to the lever.
+
+def joints_at(cell: Cell, pose: Array, near: Array | None = None) -> tuple[Array, Array]:
+    """Joints (..., n) that bring the flange of an arm at rest to poses, and (...) what is missing.
+
+    Effects count that move the flange.  Arguments as `Cell.inverse`.
     """
-    lower, upper = reach.box
-    q, rest = np.clip(begin, lower, upper), reach.start
-    price = (soft * reach.lever) ** 2
-    damping, eye = np.full(len(q), 1e-6), np.eye(q.shape[1])
-    todo = np.arange(len(q))
+    arm, lever = arm_of(cell), lever_of(cell)
 
-    def look(rows: Array, at: Array) -> tuple[Array, Array, Array]:
-        residual, jacobian = examine(reach, at, goal[rows], turn[rows])
-        cost = (residual**2).sum(1) + price[rows] * ((at - rest[rows]) ** 2).sum(1)
-        return residual, jacobian, cost
+    def find(goal: Array, begin: Array) -> tuple[Array, Array]:
+        data = still(begin, arm.target_names, arm.robot)
+        reach = Reach(arm, data, goal, lever, NEAR, np.inf)
+        q, _ = reach.settle(reach.start, np.zeros(len(goal)))
+        distance, angle = reach.error(q)
+        return q, np.maximum(distance, lever * angle)
 
-    residual, jacobian, cost = look(todo, q)
-    for _ in range(STEPS):
-        here, weight = q[todo], price[todo]
-        force = np.einsum("mij,mi->mj", jacobian, residual) - weight[:, None] * (here - rest[todo])
-        free = ~(((here <= lower[todo]) & (force < 0)) | ((here >= upper[todo]) & (force > 0)))
-        gram = np.swapaxes(jacobian, 1, 2) @ jacobian + weight[:, None, None] * eye
-        scale = np.maximum(np.trace(gram, axis1=1, axis2=2) / len(eye), 1e-12)
-        gram = np.where(free[:, :, None] & free[:, None, :], gram, 0.0)
-        force = np.where(free, force, 0.0)
-        matrix = gram + (damping[todo] * scale)[:, None, None] * eye
-        step = np.linalg.solve(matrix, force[..., None])[..., 0]
-        trial = np.clip(here + step, lower[todo], upper[todo])
-        step = trial - here
-        gain = 2.0 * (force * step).sum(1) - np.einsum("mi,mij,mj->m", step, gram, step)
-        done = (np.abs(step).max(1) < 1e-13) | (np.abs(gain) <= 1e-12 * cost + 1e-28)
-        new_residual, new_slope, new_cost = look(todo, trial)
-        better = new_cost < cost
-        q[todo[better]] = trial[better]
-        pick = better[:, None]
-        residual = np.where(pick, new_residual, residual)
-        jacobian = np.where(pick[..., None], new_slope, jacobian)
-        cost = np.where(better, new_cost, cost)
-        damping[todo] = np.clip(damping[todo] * np.where(better, 0.1, 10.0), 1e-12, 1e9)
-        todo, residual, jacobian, cost = (part[~done] for part in (todo, residual, jacobian, cost))
-        if not len(todo):
-            break
-    return q
+    return at_poses(find, pose, near, cell.robot.lower, cell.robot.upper)

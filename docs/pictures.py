@@ -1,0 +1,90 @@
+"""Make the pictures of README and documentation again: python docs/pictures.py [PICTURE ...].
+
+Without a name those of the program itself, in some minutes (the report's needs Chromium, Chrome or
+Edge); a picture of a study by its name, as coverage.png, by running that study in full.
+"""
+
+import contextlib
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import minimax_cal as mc
+from minimax_cal.reporting.plots.diagnosis import save_diagnosis
+
+DOCS = Path(__file__).resolve().parent
+ROOT, IMAGES = DOCS.parent, DOCS / "images"
+sys.path += [str(DOCS), str(ROOT / "examples")]
+STUDIES = {  # picture: the study, and what it calls the picture in its folder
+    "blind_detectability.png": ("blind_gap", "blind_gap_detectability"),
+    "coverage.png": ("coverage", "coverage"),
+    "outliers.png": ("outliers", "outliers"),
+    "worst_growth.png": ("worst_point", "growth"),
+    "planning.png": ("planning", "planning"),
+    "relative.png": ("relative", "relative"),
+    "simulator_gap.png": ("simulator_gap", "simulator_gap_ladder"),
+    "subgradient.png": ("solver_accuracy", "subgradient"),
+    "profile_maros_meszaros.png": ("solver_accuracy", "profile_Maros-Meszaros"),
+    "papers_s_fig3.png": ("papers", "convergence/rms_all_mm"),
+    "papers_s_fig4.png": ("papers", "courses/s_fig4"),
+    "papers_s_fig5.png": ("papers", "courses/s_fig5"),
+    "papers_s_fig6.png": ("papers", "courses/s_fig6"),
+    "papers_m_fig2.png": ("papers", "conditions/by_pose_irb120"),
+    "papers_m_fig5.png": ("papers", "conditions/sums_irb120"),
+    "papers_m_fig6.png": ("papers", "conditions/accuracy_irb120"),
+    "papers_splits.png": ("papers", "splits/splits"),
+    "papers_loop.png": ("papers", "measuring_loop/measuring_loop"),
+}
+
+
+def example() -> None:
+    """The README's first picture, with its measurements."""
+    import make
+
+    make.make(ROOT / "examples")
+
+
+def diagnosis() -> None:
+    """The README's picture of a diagnosis, as its commands make it."""
+    made = mc.simulate("ur10", 100, 3, seed=1, truth=mc.Truth(compliance=2e-6))
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        mc.write_measurements("gap.csv", made.data)
+        save_diagnosis(mc.diagnose("ur10", "gap.csv", quick=True), IMAGES / "diagnosis.png")
+
+
+def report() -> None:
+    """The first page of a report."""
+    import first_page
+
+    first_page.make(IMAGES / "report.png")
+
+
+OWN = {"irb2600.svg": example, "diagnosis.png": diagnosis, "report.png": report}
+
+
+def from_studies(names: list[str]) -> None:
+    """Pictures of studies, each study run once."""
+    for study in dict.fromkeys(STUDIES[name][0] for name in names):
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, "-m", "experiments", study, "--out", folder]
+            subprocess.run(command, check=True, cwd=ROOT)
+            for name in names:
+                if STUDIES[name][0] == study:
+                    shutil.copy(Path(folder) / f"{STUDIES[name][1]}.png", IMAGES / name)
+
+
+def main(names: list[str]) -> None:
+    """Make the pictures of these names, or those of the program itself."""
+    unknown = [name for name in names if name not in OWN and name not in STUDIES]
+    if unknown:
+        sys.exit(f"no picture {unknown[0]!r}; choose {', '.join((*OWN, *STUDIES))}")
+    for name in names or OWN:
+        if name in OWN:
+            OWN[name]()
+    from_studies([name for name in names if name in STUDIES])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,318 @@
+"""Do names hold on arms as shops have them?  Blind, as `blind_gap`, under harder conditions.
+
+    python -m experiments.machine_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
+        [--only CONDITION]... [--every N]
+
+`machines` makes the arms; the diagnosis sees a robot file and a CSV.  A name counts where it is
+established; what is only tentative makes no verdict.  Separable is a cause with lambda >= 50 of
+which its own law explains so much more than the best other that 25 of lambda tell them apart.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import sweep
+from experiments.blind_gap import (
+    Criterion,
+    Row,
+    clean,
+    is_right,
+    number_of,
+    pairing,
+    share_of,
+    text_of,
+    troubles,
+    verdicts,
+)
+from experiments.gap_cases import Cause
+from experiments.machines import INSIDE, MAKES, OUTSIDE, Asked, Made, make, places
+from experiments.sweep import Study, study_options
+from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.measurements import write_measurements
+
+POWERS = (50.0, 100.0, 300.0, 1000.0, 5000.0)
+CLEAR = (100.0, 300.0, 1000.0)
+POSES, SHARES = (40, 60, 100, 200, 600), (0.15, 0.25, 0.35, 0.2, 0.05)
+SPREADS = ("whole", "half", "clusters")
+SEEN = 50.0 * (1.0 - 1e-6)  # lambda from which a cause must be seen
+APART = 25.0  # lambda (own rho^2 - best other's) from which it must be told apart
+WORSE = 1.05  # held-out RMS over that of geometry alone that is worse
+
+
+@dataclass(frozen=True)
+class Size:
+    """How many runs of each condition; of each law, where there are laws."""
+
+    sound: int = 400
+    single: int = 12
+    orders: int = 60
+    outside: int = 12
+    pair: int = 120
+    triple: int = 60
+
+
+QUICK = Size(sound=40, single=3, orders=10, outside=3, pair=16, triple=8)
+
+
+def plan(seed: int, size: Size) -> list[Asked]:
+    """All cases of the study; each has a seed of its own."""
+    rng = np.random.default_rng(seed)
+    cases = [some_asked(rng, "sound") for _ in range(size.sound)]
+    for law in INSIDE:
+        cases += [some_cases(rng, "single", (law,), POWERS) for _ in range(size.single)]
+    cases += [some_cases(rng, "orders", ("gear_error/orders",), CLEAR) for _ in range(size.orders)]
+    for law in OUTSIDE:
+        cases += [some_cases(rng, "outside", (law,), (*CLEAR, 5000.0)) for _ in range(size.outside)]
+    for condition, count, runs in (("pair", 2, size.pair), ("triple", 3, size.triple)):
+        for _ in range(runs):
+            effects = rng.choice(sorted({law.partition("/")[0] for law in INSIDE}), count, False)
+            laws = [str(rng.choice([i for i in INSIDE if i.startswith(e)])) for e in effects]
+            cases.append(some_cases(rng, condition, laws, CLEAR))
+    return [replace(case, seed=1_000_000 * seed + i) for i, case in enumerate(cases)]
+
+
+def some_asked(rng: np.random.Generator, condition: str) -> Asked:
+    """An arm under conditions drawn at random."""
+    return Asked(
+        robot=str(rng.choice(list(MAKES))),
+        condition=condition,
+        poses=int(rng.choice(POSES, p=SHARES)),
+        spread=str(rng.choice(SPREADS, p=(0.5, 0.25, 0.25))),
+        told=bool(rng.random() < 0.6),
+        targets=int(rng.choice((1, 3), p=(0.2, 0.8))),
+        off=bool(rng.random() < 0.25),
+        oval=bool(rng.random() < 0.5),
+        creep=bool(rng.random() < 0.2),
+        jitter=float(rng.choice((3e-6, 6e-6, 12e-6))),
+    )
+
+
+def some_cases(
+    rng: np.random.Generator, condition: str, laws: Sequence[str], powers: Sequence[float]
+) -> Asked:
+    """Some laws together at some of their places, on an arm that can have them all."""
+    while True:
+        asked = some_asked(rng, condition)
+        rooms = [places(law, asked.robot, asked.targets) for law in laws]
+        if all(rooms):
+            break
+    causes = [
+        Cause(law, str(rng.choice(room)), float(rng.choice(powers)), int(rng.integers(2)))
+        for law, room in zip(laws, rooms, strict=True)
+    ]
+    return replace(asked, causes=tuple(sorted(causes, key=lambda cause: -cause.power)))
+
+
+# ---- one run -------------------------------------------------------------------------------------
+
+
+def run(asked: Asked) -> Row:
+    """Make the files, let them be diagnosed, and score."""
+    made = make(asked)
+    with TemporaryDirectory() as name:
+        robot, data = Path(name) / "robot.json", Path(name) / "data.csv"
+        made.robot.save(robot)
+        write_measurements(data, made.data)
+        began = time.perf_counter()
+        try:
+            said: Row = mc.diagnose(robot, data, quick=True).to_dict()
+        except Exception as error:  # a crash is an answer too, and a bad one
+            said = {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
+        seconds = time.perf_counter() - began
+    return score(asked, made, said) | {"seconds": seconds}
+
+
+def score(asked: Asked, made: Made, said: Row) -> Row:
+    """What an answer is worth, as plain data.  said: the JSON of a diagnosis."""
+    effects = said.get("effects", [])
+    sure = [e for e in effects if e.get("established", True)]
+    names = [(str(e["effect"]), str(e["place"])) for e in sure]
+    sets = [
+        [name, *((str(a["effect"]), str(a["place"])) for a in e.get("alternatives", []))]
+        for name, e in zip(names, sure, strict=True)
+    ]
+    own, other = likeness(made)
+    power = np.array(made.powers)
+    gap = said.get("gap", {})
+    count = len(made.truth)
+    beside = [name for name in names if not (asked.off and name[0] == "outliers")]
+    return {
+        "condition": asked.condition,
+        "asked": [asked.robot, asked.poses, asked.spread, asked.targets,
+                  *(word for word in ("told", "off", "oval", "creep") if getattr(asked, word))],
+        "seed": asked.seed,
+        "laws": [cause.law for cause in asked.causes],
+        "truth": [list(name) for name in made.truth],
+        "lambda": float(power.min(initial=np.inf)),
+        "telling": float((power * (own - other)).min(initial=np.inf)),
+        "left": float((power * (1.0 - np.maximum(own, other))).min(initial=np.inf)),
+        "verdict": str(said["verdict"]),
+        "names": [list(name) for name in beside],
+        "tentative": [[str(e["effect"]), str(e["place"])] for e in effects if e not in sure],
+        "strange": sum(not any(is_right(n, t) for t in made.truth) for n in beside),
+        "all_right": len(beside) == count == pairing(made.truth, [[n] for n in beside]),
+        "in_sets": pairing(made.truth, sets) == count,
+        "final_mm": number_of(gap, "holdout_rms_mm", "final"),
+        "geometric_mm": number_of(gap, "holdout_rms_mm", "geometric"),
+        "trouble": str(said.get("trouble", "")),
+    }  # fmt: skip
+
+
+def likeness(made: Made) -> tuple[Array, Array]:
+    """(c,) rho^2 of each cause's own law, and of the best other law."""
+    own, other = np.zeros(len(made.truth)), np.zeros(len(made.truth))
+    for i, (truth, part) in enumerate(zip(made.truth, made.displacement, strict=True)):
+        found = resemblance(made.robot, made.data, part)
+        mine = [rho2 for name, rho2 in found.items() if is_right(name, truth)]
+        rest = [rho2 for name, rho2 in found.items() if not is_right(name, truth)]
+        own[i], other[i] = max(mine, default=0.0), max(rest, default=0.0)
+    return own, other
+
+
+# ---- criteria ------------------------------------------------------------------------------------
+
+
+def told(row: Row) -> bool:
+    """A verdict that names."""
+    return row["verdict"] in ("named", "one_of")
+
+
+def right(row: Row) -> bool:
+    """Every cause established and nothing else, in a verdict that names."""
+    return bool(told(row) and row["all_right"])
+
+
+def separable(row: Row) -> bool:
+    """Each cause is seen and can be told from the best other law."""
+    return bool(row["lambda"] >= SEEN and row["telling"] >= APART)
+
+
+def criteria(rows: Sequence[Row]) -> list[Criterion]:
+    """What the diagnosis is held to, and what is only shown."""
+
+    def of(*conditions: str) -> list[Row]:
+        return [row for row in rows if row["condition"] in conditions]
+
+    sound, plain = of("sound"), [row for row in of("single", "orders") if separable(row)]
+    orders = [row for row in of("orders") if separable(row)]
+    beyond = [row for row in of("outside") if row["left"] >= SEEN]
+    pairs, triples = ([row for row in of(c) if separable(row)] for c in ("pair", "triple"))
+
+    def named(row: Row) -> bool:
+        return bool(row["names"])
+
+    return [
+        Criterion("no fault: nothing established, not unknown", "false alarm", sound,
+                  lambda r: not named(r) and r["verdict"] != "unknown", 0.985),
+        Criterion("  something established", "", sound, named),
+        Criterion("one cause, separable: right", "not right", plain, right, 0.96),
+        Criterion("  a strange name established", "", plain, lambda r: r["strange"] > 0),
+        Criterion("  verdict unknown", "", plain, lambda r: r["verdict"] == "unknown"),
+        Criterion("  two orders of one gear", "orders", orders, right, 0.95),
+        Criterion("one cause, lambda >= 50: in the sets", "",
+                  [r for r in of("single", "orders") if r["lambda"] >= SEEN],
+                  lambda r: r["in_sets"]),
+        Criterion("outside the library, lambda (1 - rho^2) >= 50: unknown", "not unknown", beyond,
+                  lambda r: r["verdict"] == "unknown", 0.90),
+        Criterion("  named for sure", "outside, but named", beyond,
+                  lambda r: r["verdict"] == "named", 0.05, False),
+        Criterion("two causes, separable: right", "pair", pairs, right, 0.95),
+        Criterion("three causes, separable: right", "triple", triples, right, 0.80),
+        Criterion("of all verdicts named, false", "", [r for r in rows if r["verdict"] == "named"],
+                  lambda r: r["strange"] > 0),
+        Criterion("held-out RMS more than 5 % above geometry alone", "worse", rows,
+                  lambda r: r["final_mm"] > WORSE * r["geometric_mm"], 0.005, False),
+        Criterion("crashed", "crash", rows, lambda r: r["verdict"] == "error", 0.0, False),
+    ]  # fmt: skip
+
+
+def headline(found: Sequence[Criterion]) -> Table:
+    """The criteria."""
+    return Table(
+        "names on arms as shops have them: shares [%] with 95 % intervals, and the limits",
+        ("criterion", "runs", "found", "from", "to", "limit", "verdict"),
+        tuple(criterion.line() for criterion in found),
+        ("", "d", ".1f", ".1f", ".1f", "", ""),
+    )
+
+
+def per_law(rows: Sequence[Row]) -> Table:
+    """Separable single causes by their law."""
+    seen = [row for row in rows if row["condition"] in ("single", "orders") and separable(row)]
+    lines: list[tuple[Cell, ...]] = []
+    for law in INSIDE:
+        own = [row for row in seen if row["laws"] == [law]]
+        if own:
+            wrong = Counter(":".join(n) for row in own for n in row["names"]
+                            if row["strange"] and n not in row["truth"])  # fmt: skip
+            lines.append((
+                law, len(own), share_of(own, right),
+                share_of(own, lambda r: r["verdict"] == "unknown"),
+                share_of(own, lambda r: r["strange"] > 0),
+                ", ".join(name for name, _ in wrong.most_common(2)),
+            ))  # fmt: skip
+    return Table(
+        "separable single causes [%]",
+        ("law", "runs", "right", "unknown", "a strange name", "most often"),
+        tuple(lines), ("", "d", ".1f", ".1f", ".1f", ""),
+    )  # fmt: skip
+
+
+def misses(found: Sequence[Criterion], each: int) -> Table:
+    """The runs behind the limits, for those who mend the diagnosis."""
+    lines: list[tuple[Cell, ...]] = []
+    for criterion in found:
+        for row in criterion.misses()[:each]:
+            truth = [
+                (law, place) for law, (_, place) in zip(row["laws"], row["truth"], strict=True)
+            ]
+            lines.append((
+                criterion.reason, f"{' '.join(map(str, row['asked']))} #{row['seed']}",
+                text_of(truth),
+                row["trouble"][:60] or f"{row['verdict']} {text_of(row['names'])}",
+                row["lambda"], row["telling"], row["final_mm"] / row["geometric_mm"],
+            ))  # fmt: skip
+    return Table(
+        "misses, some of each", ("what", "arm", "truth", "said", "lambda", "telling", "RMS"),
+        tuple(lines), ("", "", "", "", ".0f", ".0f", ".3f"),
+    )  # fmt: skip
+
+
+@click.command()
+@study_options("machine_gap")
+@click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
+@click.option("--every", type=int, default=1, show_default=True, help="Run each N-th case alone.")
+def main(study: Study, only: tuple[str, ...], every: int) -> None:
+    """Names on arms as shops have them."""
+    cases = plan(study.seed, QUICK if study.quick else Size())
+    conditions = tuple(dict.fromkeys(case.condition for case in cases))
+    for name in only:
+        if name not in conditions:
+            raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
+    if every < 1:
+        raise OptionError(f"--every {every}: give a whole number, 1 or more")
+    cases = [case for case in cases if not only or case.condition in only][::every]
+    rows = study.sweep(run, cases, "diagnoses")
+    found = criteria(rows)
+    tables = [headline(found), verdicts(rows), per_law(rows), misses(found, 8),
+              *([troubles(rows)] if any(row["trouble"] for row in rows) else [])]  # fmt: skip
+    names = ("criterion", "runs", "found", "low", "high", "limit", "verdict")
+    lines = [dict(zip(names, row, strict=True)) for row in tables[0].rows]
+    study.save(tables, {"criteria": clean(lines), "rows": clean(rows)})
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)

@@ -1,0 +1,452 @@
+"""Arms as shops have them, for the harder half of the blind study: more makes, worse conditions.
+
+Six arms from a SCARA to a six-axis arm on a rail; poses all over, in one half of the workspace, or
+in clusters; 40 to 600 of them; masses told or not; trackers whose range is better than their
+angles; a few points that are slightly off; a base that creeps by microns.  Laws have the forms that
+machines show: two orders of one eccentricity, two time constants, settling that saturates.
+
+What a deviation is, how an arm moves and what lambda means stand in `gap_cases`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from experiments import gap_cases
+from experiments.gap_cases import (
+    Arm,
+    Cause,
+    Deviation,
+    Law,
+    World,
+    at_joint,
+    at_joints,
+    frames,
+    load,
+    measure,
+    number,
+    rigid,
+    torque,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.robots.gravity import tubes
+from minimax_cal.robots.robot import Robot, load_robot
+
+NAN = float("nan")
+HELD_OUT = 60
+REVISITED = 0.1  # of the training poses, measured twice
+HALF = 0.5  # of a joint's range, in half a workspace
+CLUSTER, WIDTH = 8, 0.06  # poses of a cluster, and how far its joints scatter [rad]
+OFF_SHARE, OFF_SIGMAS = 0.01, (5.0, 12.0)  # points that are slightly off
+RADIAL, ACROSS = 0.5, 1.3  # noise along the line of sight and across it, of what is told
+CREEP = 4e-6  # RMS of a base that wanders [m]
+
+
+@dataclass(frozen=True)
+class Make:
+    """What is known of a make of arm.
+
+    masses: of its links [kg].  ratio: of its gears, NaN untold.  beams, loaded: as in `Arm`.
+    upright: joint that a spring may balance, '' for none.  driven: (joint, its driver) of coupled
+    joints.
+    """
+
+    masses: tuple[float, ...]
+    ratio: tuple[float, ...]
+    beams: tuple[int, ...]
+    loaded: tuple[int, ...]
+    upright: str
+    driven: tuple[tuple[str, int], ...]
+
+
+WRISTS = (("J3", 2), ("J5", 4), ("J6", 5))
+ON_RAIL = (("J4", 3), ("J6", 5), ("J7", 6))
+MAKES = {
+    "scara_600": Make((8.0, 5.0, 2.0, 1.5), (50.0, 50.0, NAN, NAN), (1,), (), "", ()),
+    "irb120": Make(
+        (4.0, 6.0, 4.0, 2.5, 1.0, 1.0), (120.0, 120.0, 100.0, NAN, NAN, NAN), (2, 4), (2, 3, 5),
+        "", WRISTS,
+    ),
+    "ur5e": Make(
+        (4.0, 8.0, 2.8, 1.4, 1.4, 1.2), (NAN, NAN, NAN, NAN, NAN, NAN), (2, 3), (2, 3, 4, 5),
+        "", (),
+    ),
+    "fanuc_r2000ic_165f": Make(
+        (350.0, 200.0, 180.0, 90.0, 30.0, 60.0), (NAN, 180.0, 170.0, NAN, NAN, NAN), (2, 4),
+        (2, 3, 5), "J2", WRISTS,
+    ),
+    "rail": Make(
+        (400.0, 95.0, 52.0, 48.0, 22.0, 7.0, 14.0), (NAN, 121.0, 141.3, 105.5, NAN, NAN, NAN),
+        (3, 5), (3, 4, 6), "J3", ON_RAIL,
+    ),
+    "seven": Make(
+        (4.0, 4.0, 3.0, 2.7, 1.7, 1.8, 1.3), (160.0,) * 4 + (NAN,) * 3, (3, 5), (2, 3, 4, 6),
+        "", (),
+    ),
+}  # fmt: skip
+
+
+@cache
+def nominal(make: str) -> Robot:
+    """The arm of a make, without masses."""
+    if make == "seven":
+        lengths = np.array([0.34, 0.0, 0.4, 0.0, 0.4, 0.0, 0.126])
+        alpha = np.array([-1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 0.0]) * np.pi / 2.0
+        mdh = np.zeros((7, 5))
+        mdh[:, 1], mdh[:, 3] = lengths, alpha
+        limit = np.radians([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0])
+        return bare("seven", mdh, np.zeros(7, dtype=bool), -limit, limit, np.array([0, 0, 1.0]))
+    if make == "rail":
+        arm = load_robot("irb2600")
+        mdh = np.concatenate([[[0.0, 0.0, 0.0, -np.pi / 2.0, 0.0]], arm.mdh])
+        slides = np.array([True, *arm.prismatic])
+        lower, upper = np.append(0.0, arm.lower), np.append(3.0, arm.upper)
+        return bare("rail", mdh, slides, lower, upper, np.array([0.0, 1.0, 0.0]))
+    return load_robot(make)
+
+
+def bare(name: str, mdh: Array, prismatic: Array, lower: Array, upper: Array, up: Array) -> Robot:
+    """A robot of which no masses are told."""
+    n = len(mdh)
+    nothing = np.full(n, np.nan)
+    return Robot(name, mdh, np.ones(n), prismatic, lower, upper, nothing, nothing,
+                 np.full((n, 3), np.nan), up)  # fmt: skip
+
+
+# ---- what is asked for ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One arm and its measurement, as plain data.
+
+    spread: of its poses, whole, half or clusters.  told: whether the file tells masses.  targets:
+    how many.  off, oval, creep: whether some points are slightly off, range and angles of the
+    tracker differ, the base wanders.
+    """
+
+    robot: str
+    condition: str
+    causes: tuple[Cause, ...] = ()
+    poses: int = 100
+    spread: str = "whole"
+    told: bool = True
+    targets: int = 3
+    off: bool = False
+    oval: bool = False
+    creep: bool = False
+    jitter: float = 6e-6
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A measured arm: robot and data as told, and the truth.
+
+    truth: (effect, place) of each cause.  displacement: (c, k, m, 3) by each cause [m].
+    powers: (c,) lambda of each.
+    """
+
+    robot: Robot
+    data: Measurements
+    truth: tuple[tuple[str, str], ...]
+    displacement: Array
+    powers: tuple[float, ...]
+
+
+# ---- laws as machines show them ------------------------------------------------------------------
+
+
+def two_orders(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """An eccentric gear: once and twice a turn."""
+    own = world.q[:, number(cause.place)]
+    phase, second = rng.uniform(0.0, 2.0 * np.pi, 2), rng.uniform(0.4, 1.0)
+    return at_joint(
+        world, number(cause.place),
+        np.sin(own + phase[0]) + second * np.sin(2.0 * own + phase[1]),
+    )  # fmt: skip
+
+
+def ripple(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Ripple at the gear ratio or twice that, or at a few dozen waves a turn where none is told."""
+    ratio = world.told.ratio[number(cause.place)]
+    times = ratio * (1 + cause.variant % 2) if np.isfinite(ratio) else rng.uniform(12.0, 60.0)
+    return gap_cases.wave(world, cause, times, rng)
+
+
+def saturating(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A rest of the last move, but never more than that of half a radian."""
+    return at_joints(world, cause.place, -np.tanh(world.move / 0.5), rng)
+
+
+def loaded_play(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """Play that closes a little under load."""
+    i = number(cause.place)
+    pull = np.abs(torque(world.robot, world.q)[:, i])
+    side = np.sign(world.move[:, i])
+    return at_joint(world, i, side * (1.0 - 0.3 * pull / max(float(pull.max()), 1e-9)))
+
+
+def two_constants(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Growth by motors that warm up soon and a casting that warms up late."""
+    tau = world.time.max() * rng.uniform(0.08, 0.2)
+    way = 0.6 * -np.expm1(-world.time / tau) + 0.4 * -np.expm1(-world.time / (5.0 * tau))
+    mdh = world.robot.mdh
+    lengths = np.zeros((*world.q.shape, 2))
+    lengths[:] = np.where(np.abs(mdh[:, :2]) > 0.15, mdh[:, :2], 0.0) * way[:, None, None]
+    return replace(rigid(world), lengths=lengths)
+
+
+def balance(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A spring, shortest with the arm upright or with the arm hanging."""
+    i = number(cause.place)
+    pose = frames(world.robot, world.q)
+    along = pose[:, i + 1, :3, 3] - pose[:, i, :3, 3]
+    axis, up = pose[:, i, :3, 2], world.robot.up
+    lean = np.arctan2(np.sum(np.cross(up, along) * axis, axis=1), along @ up)
+    a, arm = rng.uniform(0.2, 0.3), rng.uniform(0.5, 0.6)
+    angle = lean - rng.normal(0.0, 0.2) + np.pi * (cause.variant % 2)
+    length = np.sqrt(a**2 + arm**2 - 2.0 * a * arm * np.cos(angle))
+    rest = rng.uniform(0.4, 0.95) * (arm - a)
+    return at_joint(world, i, np.sin(angle) * (1.0 - rest / length))
+
+
+def driven(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """A joint turned by the motor of another."""
+    source = dict(MAKES[world.told.name].driven)[cause.place]
+    return at_joint(world, number(cause.place), world.q[:, source - 1])
+
+
+def tipping(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """The foot gives way to the overturning moment."""
+    pose = frames(world.robot, world.q)
+    about = pose[:, 1, :3, 3] if world.robot.prismatic[0] else np.zeros((len(pose), 3))
+    moment = load(world.robot, pose, 0, about)[1]
+    base = np.zeros((len(pose), 6))
+    base[:, :3] = moment - np.outer(moment @ world.robot.up, world.robot.up)
+    return replace(rigid(world), base=base)
+
+
+# ---- what no library holds -----------------------------------------------------------------------
+
+
+def worn(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """Play in one sector of the joint alone."""
+    i = number(cause.place)
+    low, high = np.quantile(world.q[:, i], np.sort(rng.uniform(0.0, 0.5, 1))[0] + [0.0, 0.4])
+    there = (world.q[:, i] > low) & (world.q[:, i] < high)
+    return at_joint(world, i, np.where(there, np.sign(world.move[:, i]), 0.0))
+
+
+def weary(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """A joint that drifts with the work of its last dozen moves."""
+    i, fade, work = number(cause.place), 0.0, []
+    for move in np.abs(world.move[:, i]):
+        fade = 0.92 * fade + move
+        work.append(fade)
+    return at_joint(world, i, np.array(work))
+
+
+def cable(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A cable pulls a joint as two others wind it up."""
+    i = number(cause.place)
+    others = rng.choice([j for j in range(world.q.shape[1]) if j != i], 2, replace=False)
+    a, b = world.q[:, others].T
+    return at_joint(world, i, np.abs(a) * np.sin(1.5 * b + rng.uniform(0.0, 2.0 * np.pi)))
+
+
+def swaying(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """A hall that tilts to and fro as the sun and the crane move."""
+    t = world.time / world.time.max()
+    base = np.zeros((len(t), 6))
+    base[:, :3] = np.sin(2.0 * np.pi * rng.uniform(2.0, 5.0) * t)[:, None] * rng.normal(size=3)
+    return replace(rigid(world), base=base)
+
+
+LAWS: dict[str, Law] = {
+    **{name: gap_cases.LAWS[name] for name in (
+        "joint_compliance", "link_bending", "gear_error", "encoder_gain", "backlash", "settling",
+        "frame_drift", "tool_flex", "target_offset", "target_shift", "joint_compliance/hardening",
+        "outside_sum", "outside_product", "outside_waves", "outside_cubic",
+        "outside_field",
+    )},
+    "gear_error/orders": two_orders,
+    "joint_error_map/step": gap_cases.LAWS["outside_step"],
+    "gear_ripple": ripple,
+    "settling/saturating": saturating,
+    "backlash/loaded": loaded_play,
+    "thermal_growth/two": two_constants,
+    "gravity_compensator": balance,
+    "joint_coupling": driven,
+    "base_flex": tipping,
+    "outside_worn": worn,
+    "outside_weary": weary,
+    "outside_cable": cable,
+    "outside_sway": swaying,
+}  # fmt: skip
+OUTSIDE = tuple(law for law in LAWS if "outside" in law)
+INSIDE = tuple(law for law in LAWS if law not in OUTSIDE and law != "joint_compliance/hardening")
+
+
+def places(law: str, make: str, targets: int) -> tuple[str, ...]:
+    """Where a law can be on an arm."""
+    known, effect = MAKES[make], law.partition("/")[0]
+    slides = nominal(make).prismatic
+    joints = tuple(f"J{i + 1}" for i, slide in enumerate(slides) if not slide)
+    loaded = tuple(f"J{i}" for i in known.loaded)
+    spots = tuple(f"smr{i + 1}" for i in range(targets))
+    some = {
+        "joint_compliance": (*loaded, "all") if loaded else (),
+        "link_bending": tuple(f"L{i}" for i in known.beams),
+        "gravity_compensator": (known.upright,) if known.upright else (),
+        "joint_coupling": tuple(place for place, _ in known.driven),
+        "settling": ("all", joints[0], joints[1]),
+        "thermal_growth": ("all",),
+        "base_flex": ("frame",),
+        "frame_drift": ("frame",),
+        "tool_flex": ("all",) if loaded else (),
+        "target_offset": (*spots, "all") if targets > 1 else ("all",),
+        "target_shift": spots if targets > 1 else (),
+        "outside_cubic": loaded,
+        "outside_field": ("all",),
+        "outside_sway": ("all",),
+    }
+    return some.get(effect, joints)
+
+
+# ---- building a case -----------------------------------------------------------------------------
+
+
+def told_robot(asked: Asked) -> Robot:
+    """The robot of the file, with the masses that it would tell."""
+    known, arm = MAKES[asked.robot], nominal(asked.robot)
+    rng = np.random.default_rng(len(asked.robot))
+    _, halfway = tubes(arm.mdh)
+    com = halfway + rng.normal(0.0, 0.02, halfway.shape)
+    mass, ratio = np.array(known.masses), np.array(known.ratio)
+    return replace(arm, name=asked.robot, mass=mass, com=com, ratio=ratio)
+
+
+def some_poses(robot: Robot, count: int, spread: str, rng: np.random.Generator) -> Array:
+    """Joint values (count, n) as the spread has them, the flange above the floor [rad, m]."""
+    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    lower, upper = (
+        np.where(np.isfinite(lower), lower, -2.0),
+        np.where(np.isfinite(upper), upper, 2.0),
+    )
+    if spread == "half":
+        for j in rng.choice(min(3, robot.joints), 2, replace=False):
+            low = rng.uniform(0.0, 1.0 - HALF) * (upper[j] - lower[j])
+            lower[j], upper[j] = lower[j] + low, lower[j] + low + HALF * (upper[j] - lower[j])
+
+    def above(q: Array) -> Array:
+        pose = frames(robot, q)
+        height = (pose[:, -1, :3, 3] - pose[:, 0, :3, 3]) @ robot.up
+        return q[height > 0.05]
+
+    many = -(-count // CLUSTER) if spread == "clusters" else count
+    found = np.zeros((0, robot.joints))
+    while len(found) < many:
+        found = np.concatenate([found, above(rng.uniform(lower, upper, (2 * many, robot.joints)))])
+    found = found[:many]
+    if spread != "clusters":
+        return found
+    found = np.repeat(found, CLUSTER, axis=0)[:count]
+    return np.clip(found + WIDTH * rng.uniform(-1.0, 1.0, found.shape), lower, upper)
+
+
+def world_of(asked: Asked, rng: np.random.Generator) -> World:
+    """The arm in its place with all its visits; of clusters whole ones are held out."""
+    told = told_robot(asked)
+    count, again = asked.poses, round(REVISITED * asked.poses)
+    q = np.concatenate([some_poses(told, count, asked.spread, rng),
+                        some_poses(told, HELD_OUT, asked.spread, rng)])  # fmt: skip
+    pose = np.concatenate([np.arange(len(q)), rng.choice(count, again, replace=False)])
+    pose = rng.permutation(pose)
+    time = np.cumsum(gap_cases.PAUSE * rng.uniform(0.7, 1.3, len(pose)))
+    q, move = q[pose], np.zeros((len(pose), told.joints))
+    move[1:] = np.diff(q, axis=0)
+    known = MAKES[asked.robot]
+    return World(
+        robot=gap_cases.true_robot(told, rng),
+        told=told,
+        arm=Arm(known.masses, (), known.ratio, (17.0, 24.0), known.beams, known.loaded, ()),
+        base=gap_cases.some_base(rng),
+        spots=gap_cases.some_spots(rng)[: asked.targets],
+        q=q,
+        jitter=asked.jitter * rng.normal(size=q.shape),
+        move=move,
+        time=time - time[0],
+        warm=rng.uniform(1000.0, 3000.0),
+        train=pose < count,
+    )
+
+
+def make(asked: Asked, laws: dict[str, Law] = LAWS) -> Made:
+    """Build the arm of a case and measure it."""
+    rng = np.random.default_rng(asked.seed)
+    world = world_of(asked, rng)
+    still = measure(world, rigid(world))
+    away = np.linalg.norm(still, axis=-1)
+    spread = gap_cases.NOISE + gap_cases.NOISE_PER_METRE * away
+    ruler = gap_cases.judge(world, spread, asked.jitter)
+    whole, parts = rigid(world), []
+    for cause in asked.causes:
+        unit = laws[cause.law](world, cause, rng)
+        deviation = unit * gap_cases.sized(world, ruler, cause, unit)
+        whole += deviation
+        parts.append(measure(world, deviation) - still)
+    y = measure(world, whole + creep(world, rng) if asked.creep else whole)
+    y = y + noise(asked, y, spread, rng)
+    if not asked.told:
+        told = replace(world.told, mass=np.full(world.told.joints, NAN),
+                       com=np.full((world.told.joints, 3), NAN))  # fmt: skip
+        world = replace(world, told=told)
+    return Made(
+        robot=world.told,
+        data=measured(world, y),
+        truth=tuple((cause.effect, cause.place) for cause in asked.causes),
+        displacement=np.moveaxis(np.array([*parts]).reshape(-1, *y.shape), 2, 1),
+        powers=tuple(ruler.power(part) for part in parts),
+    )
+
+
+def noise(asked: Asked, y: Array, spread: Array, rng: np.random.Generator) -> Array:
+    """(m, k, 3) what the instrument adds [m].  spread: (m, k) of a coordinate."""
+    out = spread[..., None] * rng.normal(size=y.shape)
+    if asked.oval:
+        sight = y / np.linalg.norm(y, axis=-1, keepdims=True)
+        along = np.sum(out * sight, axis=-1, keepdims=True) * sight
+        out = RADIAL * along + ACROSS * (out - along)
+    if asked.off:
+        off = rng.random(spread.shape) < OFF_SHARE
+        way = rng.normal(size=y.shape)
+        way /= np.linalg.norm(way, axis=-1, keepdims=True)
+        size = rng.uniform(*OFF_SIGMAS, spread.shape) * spread
+        out = out + (off * size)[..., None] * way
+    return out
+
+
+def creep(world: World, rng: np.random.Generator) -> Deviation:
+    """A base that wanders by microns."""
+    walk = np.cumsum(rng.normal(size=(len(world.q), 3)), axis=0)
+    walk = walk - walk.mean(axis=0)
+    base = np.zeros((len(walk), 6))
+    base[:, 3:] = CREEP * walk / np.sqrt(np.mean(np.sum(walk**2, axis=1)))
+    return replace(rigid(world), base=base)
+
+
+def measured(world: World, y: Array) -> Measurements:
+    """What stands in the file.  y: (m, k, 3) with its noise [m]."""
+    data = measurements(
+        world.q,
+        y,
+        order=np.arange(len(y), dtype=float),
+        time=np.round(world.time, 1),
+        split=np.where(world.train, "train", "holdout"),
+    )
+    return replace(data, sliding=world.told.prismatic)

@@ -1,0 +1,64 @@
+"""The command `minimax-cal check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli import FAILED
+from minimax_cal.cli.options import (
+    DATA,
+    FIT,
+    InGroups,
+    Output,
+    options_of,
+    plain_option,
+    result_options,
+    show,
+)
+from minimax_cal.ground.files import json_text
+from minimax_cal.ground.options import Option
+from minimax_cal.ground.words import one_line
+from minimax_cal.judging.watching.health import check
+
+ASKED = "What is asked"
+
+
+@click.command(name="check", cls=InGroups)
+@FIT
+@DATA
+@plain_option(
+    ASKED, "--tolerance", required=True, help='What is required in mm, as "rms 0.2, max 0.5".'
+)
+@options_of(
+    check,
+    known=Option(
+        "What is where it was at the calibration: frame (the instrument), targets (the "
+        "reflectors).",
+        metavar="NAMES",
+        many=tuple,
+        group=ASKED,
+    ),
+    seed=Option("The seed of samples behind the intervals.", group=ASKED),
+)
+@result_options("the calibration with what moved refitted (JSON)")
+def check_command(
+    fit: Path, data: Path, tolerance: str, known: tuple[str, ...], seed: int, to: Output
+) -> int:
+    """Whether the calibration FIT is still valid, and what moved, by a few new poses in DATA.
+
+    Instrument and reflectors may stand anew.  Ends with 0 where it is valid, else with 1.
+    """
+    found = check(fit, data, tolerance, known=known, seed=seed)
+    to.notice(*found.notices)
+    if to.path:
+        found.save(to.path)
+        to.wrote(to.path)
+    if to.as_json:
+        click.echo(json_text(found.to_dict()), nl=False)
+    else:
+        show(*found.tables(), headline=found.headline())
+    if not found.valid:
+        click.echo(f"error: {one_line(found.headline())}", err=True)
+    return 0 if found.valid else FAILED

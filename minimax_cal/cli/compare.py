@@ -1,0 +1,28 @@
+"""The command `minimax-cal compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli.options import PATH, InGroups, Output, result_options, show
+from minimax_cal.ground.files import json_text
+from minimax_cal.judging.watching.comparison import compare
+
+
+@click.command(name="compare", cls=InGroups)
+@click.argument("a", type=PATH)
+@click.argument("b", type=PATH)
+@result_options("the comparison (JSON)")
+def compare_command(a: Path, b: Path, to: Output) -> int:
+    """What differs between two results A and B: before and after a repair, or two months.
+
+    Both are what `calibrate` or `check` wrote with -o, the earlier first.  Base and reflectors may
+    stand anew; parameters that these imitate are told as they are drawn in both.
+    """
+    found = compare(a, b)
+    to.notice(*found.notices)
+    if to.deliver(lambda: json_text(found.to_dict())):
+        show(*found.tables(), headline=found.headline())
+    return 0

@@ -1,0 +1,46 @@
+"""The command `minimax-cal fleet`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli import FAILED
+from minimax_cal.cli.options import PATH, InGroups, Output, plain_option, result_options, show
+from minimax_cal.reporting.fleet.overview import fleet
+
+WORK = "Who does the work"
+
+
+@click.command(name="fleet", cls=InGroups)
+@click.argument("cells", type=PATH)
+@click.option("--out", type=PATH, metavar="FOLDER", help="Write each cell's calibration there.")
+@click.option("--page", "path", type=PATH, metavar="HTML", help="Write one overview page of all.")
+@plain_option(
+    WORK, "--jobs", type=int, default=-1, help="The number of processes [default: one a core]."
+)
+@plain_option(
+    WORK,
+    "--cluster",
+    default="",
+    metavar="tcp://HOST:PORT",
+    help="Let a Dask cluster do it instead.",
+)
+@result_options("all rows (JSON)")
+def fleet_command(
+    cells: Path, out: Path | None, path: Path | None, jobs: int, cluster: str, to: Output
+) -> int:
+    """Calibrate or check every cell of CELLS (TOML) in one go, with one overview of all.
+
+    Ends with 1 where a cell failed; the others are done all the same.
+    """
+    with to.stages() as progress:
+        found = fleet(cells, out=out, page=path, processes=jobs, cluster=cluster, progress=progress)
+    to.wrote(path)
+    if to.deliver(found.json):
+        show(found.table(), headline=found.headline())
+    if found.failed:
+        names = ", ".join(row.cell for row in found.failed)
+        click.echo(f"error: {len(found.failed)} cells failed: {names}", err=True)
+    return FAILED if found.failed else 0

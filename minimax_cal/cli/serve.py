@@ -1,0 +1,46 @@
+"""The command `minimax-cal serve`."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+
+import click
+
+from minimax_cal.cli.options import PATH, InGroups
+from minimax_cal.serving.server import FOLDER, PORT, serve
+
+
+@click.command(name="serve", cls=InGroups)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    metavar="N",
+    help=f"Where the page is; 0 for any that is free [default: {PORT}, or any that is free].",
+)
+@click.option(
+    "--folder",
+    type=PATH,
+    default=FOLDER,
+    show_default=True,
+    help="Where the sessions are kept, a folder of plain files each.",
+)
+@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+def serve_command(port: int | None, folder: Path, no_browser: bool) -> int:
+    """A page to work in, in the browser of this machine: drop files, fit, diagnose, judge, plan.
+
+    It prints one address, with a token that opens it.  Only this machine can reach it, nothing
+    leaves the machine, and each click shows the command line that does the same.  Ctrl-C ends it.
+    """
+
+    def ready(url: str) -> None:
+        click.echo(url)
+        click.echo(f"sessions are kept in {folder}; Ctrl-C ends the page", err=True)
+        if not no_browser:
+            webbrowser.open(url)
+
+    try:
+        serve(folder, port, ready)
+    except KeyboardInterrupt:
+        click.echo("ended; the sessions stay where they are", err=True)
+    return 0

@@ -1,0 +1,134 @@
+"""KRL of KUKA (.src, .dat): E6POS, POS, FRAME and E6AXIS, declared, assigned or in a motion.
+
+{X .., Y .., Z .., A .., B .., C .., S .., T ..} in mm and degrees, with the orientation
+Rz(A) Ry(B) Rx(C).  Bit i of T is set where joint i + 1 is negative [KUKA, expert programming].
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.correcting.programs.points import Number, Point, Text, blanked, checked, posed
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')
+AGGREGATE = re.compile(r"\{\s*(?:(E6POS|POS|FRAME|E6AXIS|AXIS)\s*:)?([^{}]*)\}", re.IGNORECASE)
+ENTRY = re.compile(r"\s*([A-Za-z]\w{0,3})\s+([^,\s]+)\s*")
+BEFORE = re.compile(
+    r"(?:\b(E6POS|POS|FRAME|E6AXIS|AXIS)\s+)?\$?(\w{1,32})\s*(?:\[[^\]]{0,20}\]\s*)?=\s*\Z",
+    re.IGNORECASE,
+)
+MOTION = re.compile(r"\b(?:PTP|LIN|CIRC|SPTP|SLIN|SCIRC)\b[^\r\n]*\Z", re.IGNORECASE)
+MOVED = re.compile(r"\b(?:PTP|LIN|CIRC|SPTP|SLIN|SCIRC)\s+(\w{1,32})", re.IGNORECASE)
+PLACE = ("X", "Y", "Z", "A", "B", "C")
+AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
+LEVEL = 1e-7  # cosine of B below which A and C turn about one axis
+LOOK = 200  # letters before a value that say what it is
+
+
+def read(text: str, source: str) -> Text:
+    """A program or its data list."""
+    return Text(text, blanked(text, ASIDE), source)
+
+
+def points(program: Text) -> Iterator[Point]:
+    """Every point with numbers, in the order of the file.  Raises DataError.
+
+    A FRAME may be a base or a tool: it is a point where a motion of the same file goes to it.
+    """
+    moved = {name.upper() for name in MOVED.findall(program.bare)}
+    for found in AGGREGATE.finditer(program.bare):
+        line_start = program.bare.rfind("\n", 0, found.start()) + 1
+        head = program.bare[max(line_start, found.start() - LOOK) : found.start()]
+        declared, motion = BEFORE.search(head), MOTION.search(head)
+        kind = (found[1] or (declared[1] if declared else "") or "").upper()
+        name = declared[2] if declared else ""
+        keys = [entry[1].upper() for entry in ENTRY.finditer(found[2])]
+        if not kind:
+            kind = "E6AXIS" if set(AXES) <= set(keys) else "E6POS" if "S" in keys else "FRAME"
+        if name.startswith(("BASE", "TOOL")) or not (
+            set(PLACE) <= set(keys) or set(AXES) <= set(keys)
+        ):
+            continue
+        if kind == "FRAME" and not (motion or name.upper() in moved):
+            continue
+        yield point(program, kind, name, found)
+
+
+def point(program: Text, kind: str, name: str, found: re.Match[str]) -> Point:
+    """One point.  Raises DataError."""
+    line = program.line(found.start())
+    where = f"{program.source}:{line}: {kind} {name}".rstrip()
+    values: dict[str, Number] = {}
+    for entry in ENTRY.finditer(program.bare, found.start(2), found.end(2)):
+        (number,) = program.numbers(*entry.span(2), f"{kind} {name} {entry[1]}")
+        if entry[1].upper() in values:
+            raise DataError(f"{where}: {entry[1]} stands twice")
+        values[entry[1].upper()] = number
+    if kind in ("E6AXIS", "AXIS"):
+        missing = [axis for axis in AXES if axis not in values]
+        if missing:
+            raise DataError(f"{where}: {missing[0]} is missing")
+        place = tuple(values[axis] for axis in AXES)
+        checked(place, where)
+        return Point(kind, name, line, place, None, np.radians([n.value for n in place]))
+    place = tuple(values[key] for key in PLACE)
+    checked(place, where)
+    at = np.array([number.value for number in place])
+    turn = Rotation.from_euler("ZYX", at[3:], degrees=True).as_matrix()
+    way = (values["T"],) if "T" in values else ()
+    return Point(kind, name, line, place, posed(at[:3], turn), np.zeros(0), way)
+
+
+def numbers_of(pose: Array, point: Point) -> list[str]:
+    """A pose as X, Y, Z, A, B, C, each angle within half a turn of the one that was there."""
+    old = np.array([number.value for number in point.place[3:]])
+    turn = angles(pose[:3, :3], np.radians(old[0]))
+    other = np.array([turn[0] + 180.0, 180.0 - turn[1], turn[2] + 180.0])  # the same rotation
+    both = [one + 360.0 * np.round((old - one) / 360.0) for one in (turn, other)]
+    best = min(both, key=lambda one: float(np.abs(one - old).max()))
+    return [f"{1e3 * v:.6f}" for v in pose[:3, 3]] + [f"{v:.8f}" for v in best]
+
+
+def angles(turn: Array, a: float) -> Array:
+    """A, B, C of a rotation (3, 3) [deg]; A as given [rad] where B leaves only A and C together."""
+    level = float(np.hypot(turn[0, 0], turn[1, 0]))
+    a = float(np.arctan2(turn[1, 0], turn[0, 0])) if level > LEVEL else a
+    b = np.arctan2(-turn[2, 0], level)
+    rest = Rotation.from_euler("Z", -a).as_matrix() @ turn
+    return np.degrees([a, b, np.arctan2(-rest[1, 2], rest[1, 1])])
+
+
+def stands(point: Point, q: Array) -> bool:
+    """Whether joints (n,) have the signs that T says."""
+    return all(int(number.value) & 63 == turn_bits(q) for number in point.way)
+
+
+def ways(point: Point, before: Array, after: Array) -> list[tuple[Number, str]]:
+    """T, where a correction changed the sign of a joint."""
+    now = turn_bits(after)
+    return [
+        (number, str((int(number.value) & ~63) | now))
+        for number in point.way
+        if int(number.value) & 63 == turn_bits(before) and turn_bits(before) != now
+    ]
+
+
+def turn_bits(q: Array) -> int:
+    """The signs of six joints as bits."""
+    return sum(1 << i for i, angle in enumerate(q[:6]) if angle < 0.0)
+
+
+def frames(program: Text) -> dict[str, Array]:
+    """KRL keeps bases and tools in the controller."""
+    return {}
+
+
+def used(program: Text) -> Iterator[tuple[int, str, str]]:
+    """Nothing that a file says of tools is fixed."""
+    yield from ()

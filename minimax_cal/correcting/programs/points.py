@@ -1,0 +1,125 @@
+"""Points in a program: where their numbers stand in its text, and what they mean."""
+
+from __future__ import annotations
+
+import math
+import re
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+LONGEST = 40  # letters of a number
+FARTHEST = 1e5  # of a coordinate [mm]
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number and where it stands in the text."""
+
+    value: float
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A place that a program moves to.
+
+    kind: as the language calls it.  line: where it stands, from 1.  place: numbers of the position
+    and the orientation, or of the joints.  pose: (4, 4) of the tool in the work object [m], None
+    for joints.  joints: (n,) [rad], empty for a pose.  way: numbers that say which way the arm
+    stands: RAPID's cf1, cf4, cf6, or KRL's T; empty where it does not say.
+    """
+
+    kind: str
+    name: str
+    line: int
+    place: tuple[Number, ...]
+    pose: Array | None
+    joints: Array
+    way: tuple[Number, ...] = ()
+
+
+@dataclass(frozen=True)
+class Text:
+    """A program: its text with comments and strings blanked, of the same length.
+
+    source: what messages call it.
+    """
+
+    text: str
+    bare: str
+    source: str
+
+    def line(self, at: int) -> int:
+        """The line of a letter, from 1."""
+        return bisect_right(self.starts, at)
+
+    @cached_property
+    def starts(self) -> list[int]:
+        """Where each line begins."""
+        return [0, *(found.end() for found in re.finditer("\n", self.text))]
+
+    def numbers(self, start: int, stop: int, what: str) -> list[Number]:
+        """Numbers between commas.  Raises DataError for anything else."""
+        out, at = [], start
+        for part in self.bare[start:stop].split(","):
+            inner = part.strip()
+            begin = at + len(part) - len(part.lstrip())
+            if len(inner) > LONGEST or not NUMBER.fullmatch(inner):
+                raise DataError(
+                    f"{self.source}:{self.line(start)}: {what}: {inner[:LONGEST]!r} is no number; "
+                    "write points as numbers, not as expressions"
+                )
+            out.append(Number(float(inner), begin, begin + len(inner)))
+            at += len(part) + 1
+        return out
+
+    def replaced(self, changes: Sequence[tuple[Number, str]]) -> str:
+        """The text with numbers written anew; all else as it is."""
+        parts, at = [], 0
+        for number, new in sorted(changes, key=lambda change: change[0].start):
+            parts += [self.text[at : number.start], new]
+            at = number.stop
+        return "".join([*parts, self.text[at:]])
+
+
+def blanked(text: str, pattern: re.Pattern[str]) -> str:
+    """Text with what matches turned into spaces; line ends stay."""
+    return pattern.sub(lambda found: re.sub(r"[^\r\n]", " ", found[0]), text)
+
+
+def checked(numbers: Sequence[Number], where: str) -> None:
+    """Raise DataError for coordinates that no arm reaches."""
+    for number in numbers:
+        if not (math.isfinite(number.value) and abs(number.value) <= FARTHEST):
+            raise DataError(f"{where}: {number.value:g} is no coordinate in mm or degrees")
+
+
+def of_quaternion(q: Array, where: str) -> Array:
+    """Rotation (3, 3) of w, x, y, z.  Raises DataError unless it has unit length."""
+    size = float(np.linalg.norm(q))
+    if abs(size - 1.0) > 1e-3:
+        raise DataError(f"{where}: the quaternion has length {size:.4g}; it must be 1")
+    w, x, y, z = q / size
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def posed(place: Array, turn: Array) -> Array:
+    """(4, 4) of a place (3,) [mm] and a rotation."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, 1e-3 * place
+    return pose

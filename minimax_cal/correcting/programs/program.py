@@ -1,0 +1,213 @@
+"""A program in, the same with corrected points out.
+
+A controller turns a point into joints by its own arm, the nominal one.  It is therefore told the
+pose that the nominal arm has at the corrected joints, which bring the calibrated arm to the point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from minimax_cal.correcting.compensate import Compensation
+from minimax_cal.correcting.programs import krl, rapid
+from minimax_cal.correcting.programs.points import Number, Point, Text, of_quaternion, posed
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.files import read_raw
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.inverse import NEAR, missing, nearest
+from minimax_cal.robots.robot import LEVER, Robot
+
+LANGUAGES: dict[str, ModuleType] = {
+    ".mod": rapid, ".modx": rapid, ".prg": rapid, ".sys": rapid, ".sysx": rapid,
+    ".src": krl, ".dat": krl,
+}  # fmt: skip
+LARGEST = 16 << 20  # bytes of a program
+MOST = 20_000  # points
+STARTS, CHUNK = 48, 100  # of the search for all ways; points at a time
+SAME = 1e-3  # two ways are one [rad]
+
+
+def is_program(path: Path | str) -> bool:
+    """Whether a file is one of the languages known, by its ending."""
+    return Path(path).suffix.lower() in LANGUAGES
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A program and its points.
+
+    tool: (4, 4) in the flange.  work: (4, 4) of the work object in the robot's base [m].
+    data: the joints (m, n) that the controller turns the points into.
+    """
+
+    text: Text
+    language: ModuleType
+    points: tuple[Point, ...]
+    tool: Array
+    work: Array
+    robot: Robot
+    data: Measurements
+
+    def corrected(self, found: Compensation) -> bytes:
+        """The same bytes, with the points' numbers anew."""
+        changes: list[tuple[Number, str]] = []
+        poses = np.linalg.inv(self.work) @ self.robot.pose(found.q) @ self.tool
+        for point, pose, old, q in zip(self.points, poses, found.commanded, found.q, strict=True):
+            if point.pose is None:
+                new = [f"{angle:.8f}" for angle in np.degrees(q)]
+            else:
+                new = self.language.numbers_of(pose, point)
+                changes += self.language.ways(point, old, q)
+            changes += zip(point.place, new, strict=True)
+        return self.text.replaced(changes).encode("latin-1")
+
+
+def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "") -> Program:
+    """A program and the joints that a nominal robot takes at its points.
+
+    tool, work: x,y,z,q1,q2,q3,q4 in mm, or the name of one that the program declares; the flange
+    and the robot's base unless given.  Raises CalibrationError with the line.
+    """
+    language = LANGUAGES[Path(path).suffix.lower()]
+    raw = read_raw(path, kind=DataError, most=LARGEST)
+    if b"\0" in raw:
+        raise DataError(f"{path}: is no text")
+    text = language.read(raw.decode("latin-1"), str(path))
+    if robot.joints != 6 or robot.prismatic.any():
+        raise OptionError(f"{robot.name}: points of programs are for arms with six turning joints")
+    points = tuple(point for point, _ in zip(language.points(text), range(MOST + 1), strict=False))
+    if not points:
+        raise DataError(f"{path}: holds no points with numbers")
+    if len(points) > MOST:
+        raise DataError(f"{path}: holds over {MOST} points; split it")
+    known = language.frames(text)
+    check_used(language, text, tool, work)
+    grip, table = frame_of(tool, known, "tool"), frame_of(work, known, "wobj")
+    q, notices = joints_of(points, language, robot, grip, table, str(path))
+    lines = np.array([point.line for point in points])
+    nowhere = np.zeros((len(q), 0, 3))
+    data = Measurements(
+        q, nowhere, (), robot.prismatic, lines, {}, notices=notices, source=str(path)
+    )
+    return Program(text, language, points, grip, table, robot, data)
+
+
+def check_used(language: ModuleType, text: Text, tool: str, work: str) -> None:
+    """Raise OptionError for a move with another tool or work object than was named."""
+    for line, moved, on in language.used(text):
+        for used, given, option, none in (
+            (moved, tool, "--tool", "tool0"),
+            (on, work, "--wobj", "wobj0"),
+        ):
+            if "," not in given and used.lower() != (given or none).lower():
+                raise OptionError(
+                    f"{text.source}:{line}: moves with {used}, not with {given or none}; give "
+                    f"{option} {used}, or its frame as x,y,z,q1,q2,q3,q4, and correct modules of "
+                    "several tools one by one"
+                )
+
+
+def frame_of(given: str, known: dict[str, Array], option: str) -> Array:
+    """(4, 4) of a name or numbers.  Raises OptionError."""
+    if not given:
+        return np.eye(4)
+    names = {name.lower(): pose for name, pose in known.items()}
+    if given.lower() in names:
+        return names[given.lower()]
+    try:
+        numbers = np.array([float(part) for part in given.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != 7 or not np.isfinite(numbers).all():
+        there = f" ({', '.join(known)})" if known else ""
+        raise OptionError(
+            f"--{option} {given!r}: give x,y,z,q1,q2,q3,q4 in mm, or a name declared there{there}"
+        )
+    try:
+        return posed(numbers[:3], of_quaternion(numbers[3:], f"--{option}"))
+    except DataError as error:
+        raise OptionError(str(error)) from error
+
+
+def joints_of(
+    points: tuple[Point, ...],
+    language: ModuleType,
+    robot: Robot,
+    tool: Array,
+    work: Array,
+    source: str,
+) -> tuple[Array, tuple[str, ...]]:
+    """(m, n) joints that the controller turns points into, and notices.  Raises DataError."""
+    posed_points = [point for point in points if point.pose is not None]
+    goals = [work @ point.pose @ np.linalg.inv(tool) for point in posed_points]
+    ways = iter(all_ways(robot, np.array(goals).reshape(-1, 4, 4)))
+    out, doubtful = [], []
+    before = np.clip(np.zeros(robot.joints), robot.lower, robot.upper)
+    for point in points:
+        if point.pose is None:
+            before = point.joints
+        else:
+            found = next(ways)
+            if not len(found):
+                raise DataError(
+                    f"{source}:{point.line}: {point.kind} {point.name} is out of reach of "
+                    f"{robot.name}: check tool and work object, units and the robot"
+                )
+            fitting = np.array([q for q in found if language.stands(point, q)])
+            if not len(fitting):
+                doubtful.append(point.line)
+            several = fitting if len(fitting) else found
+            before = several[np.argmin(np.abs(several - before).max(axis=1))]
+        out.append(before)
+    if not doubtful:
+        return np.array(out), ()
+    shown = ", ".join(map(str, doubtful[:8])) + (" ..." if len(doubtful) > 8 else "")
+    said = (
+        f"{source}: at line {shown} no way of {robot.name} stands as the configuration says; the "
+        "one nearest to the point before is taken"
+    )
+    return np.array(out), (said,)
+
+
+def all_ways(robot: Robot, goals: Array) -> Iterator[Array]:
+    """For each goal (4, 4) of the flange the different joints (s, n) that reach it."""
+    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    begin = np.random.default_rng(0).uniform(lower, upper, (STARTS, robot.joints))
+    lever, signs = LEVER * robot.reach(), robot.sign
+    for first in range(0, len(goals), CHUNK):
+        chunk = np.repeat(goals[first : first + CHUNK], STARTS, axis=0)
+
+        def look(rows: Array, q: Array, goal: Array = chunk) -> tuple[Array, Array]:
+            return missing(robot.mdh, q * signs, robot.prismatic, signs, goal[rows], lever)
+
+        start = np.tile(begin, (len(chunk) // STARTS, 1))
+        box = (np.broadcast_to(end, start.shape) for end in (robot.lower, robot.upper))
+        q = nearest(look, start, *box)
+        left = np.linalg.norm(look(np.arange(len(q)), q)[0], axis=1)
+        for ways, off in zip(
+            q.reshape(-1, STARTS, robot.joints), left.reshape(-1, STARTS), strict=True
+        ):
+            yield turned(robot, distinct(ways[off <= NEAR]))
+
+
+def distinct(ways: Array) -> Array:
+    """The different ones."""
+    _, first = np.unique(np.round(ways / SAME).astype(int), axis=0, return_index=True)
+    return np.asarray(ways[np.sort(first)])
+
+
+def turned(robot: Robot, ways: Array) -> Array:
+    """The same with each of the joints a turn further either way, within its limits."""
+    for joint in range(robot.joints):
+        steps = 2.0 * np.pi * np.eye(robot.joints)[joint]
+        more = np.concatenate([ways, ways - steps, ways + steps])
+        inside = (more >= robot.lower - SAME) & (more <= robot.upper + SAME)
+        near = np.abs(more[:, joint]) <= 2.0 * np.pi
+        ways = more[inside.all(axis=1) & near]
+    return distinct(ways) if len(ways) else ways

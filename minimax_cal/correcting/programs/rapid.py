@@ -1,0 +1,166 @@
+"""RAPID modules of ABB: robtargets and jointtargets, declared or in a move.
+
+robtarget: [[x,y,z],[q1,q2,q3,q4],[cf1,cf4,cf6,cfx],[external axes]]; jointtarget: [[six joints in
+degrees],[external axes]].  cf is the quarter turn that a joint stands in [ABB RAPID reference].
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.correcting.programs.points import (
+    Number,
+    Point,
+    Text,
+    blanked,
+    checked,
+    of_quaternion,
+    posed,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
+DECLARED = re.compile(
+    r"\b(robtarget|jointtarget)\s+(\w{1,32})\s*(?:\{[^}]{0,40}\}\s*)?:=\s*", re.IGNORECASE
+)
+MOVE = re.compile(r"\bMove(?:L|J|C|AbsJ)\w{0,8}\b([^;]{0,2000});", re.IGNORECASE)
+BRACKETS = re.compile(r"\[[^\[\]]*\]")
+LITERAL = re.compile(r"\[(?:\s*\[[^\[\]]*\]\s*,?){2,4}\s*\]")
+FRAME = re.compile(r"\b(tooldata|wobjdata)\s+(\w{1,32})\s*:=\s*", re.IGNORECASE)
+QUARTERED = (0, 3, 5)  # joints whose quarter turns cf1, cf4, cf6 tell
+SIZES = {"robtarget": (3, 4, 4, 6), "jointtarget": (6, 6)}
+ORIGINS = ("tool0", "wobj0")
+
+
+def read(text: str, source: str) -> Text:
+    """A module."""
+    return Text(text, blanked(text, ASIDE), source)
+
+
+def points(program: Text) -> Iterator[Point]:
+    """Every target with numbers, in the order of the module.  Raises DataError."""
+    declared = set()
+    for found in DECLARED.finditer(program.bare):
+        kind, name = found[1].lower(), found[2]
+        literals = list(rows(program, found.end()))
+        if not literals:
+            continue  # made from other values: these are corrected where they stand
+        for start, stop in literals:
+            declared.add(start)
+            yield point(program, kind, name, start, stop)
+    for move in MOVE.finditer(program.bare):
+        for literal in LITERAL.finditer(program.bare, move.start(1), move.end(1)):
+            kind = "jointtarget" if "absj" in move[0][:9].lower() else "robtarget"
+            if literal.start() not in declared and sizes(literal[0]) == SIZES[kind]:
+                yield point(program, kind, "", literal.start(), literal.end())
+
+
+def rows(program: Text, at: int) -> Iterator[tuple[int, int]]:
+    """Where the value of a declaration stands, or those of an array."""
+    end = program.bare.find(";", at)
+    stop = len(program.bare) if end < 0 else end
+    for literal in LITERAL.finditer(program.bare, at, stop):
+        yield literal.span()
+
+
+def sizes(literal: str) -> tuple[int, ...]:
+    """How many values stand in each inner bracket."""
+    return tuple(part.count(",") + 1 for part in BRACKETS.findall(literal))
+
+
+def point(program: Text, kind: str, name: str, start: int, stop: int) -> Point:
+    """One target.  Raises DataError."""
+    line = program.line(start)
+    where = f"{program.source}:{line}: {kind} {name}".rstrip()
+    inner = list(BRACKETS.finditer(program.bare, start + 1, stop - 1))
+    if tuple(found[0].count(",") + 1 for found in inner) != SIZES[kind]:
+        want = ", ".join(map(str, SIZES[kind]))
+        raise DataError(f"{where}: must hold {want} numbers in its brackets")
+    parts = [program.numbers(f.start() + 1, f.end() - 1, f"{kind} {name}".strip()) for f in inner]
+    checked([n for part in parts[:2] for n in part if part is not parts[-1]], where)
+    if kind == "jointtarget":
+        joints = np.radians([number.value for number in parts[0]])
+        return Point(kind, name, line, tuple(parts[0]), None, joints)
+    turn = of_quaternion(np.array([n.value for n in parts[1]]), where)
+    pose = posed(np.array([n.value for n in parts[0]]), turn)
+    place = (*parts[0], *parts[1])
+    return Point(kind, name, line, place, pose, np.zeros(0), tuple(parts[2][:3]))
+
+
+def numbers_of(pose: Array, point: Point) -> list[str]:
+    """A pose as the numbers of a robtarget, the quaternion with the sign of the one before."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    q = np.array([w, x, y, z])
+    q = q if q @ [n.value for n in point.place[3:]] >= 0.0 else -q
+    return [f"{1e3 * v:.6f}" for v in pose[:3, 3]] + [f"{v:.9f}" for v in q]
+
+
+def stands(point: Point, q: Array) -> bool:
+    """Whether joints (n,) stand the way that a target says."""
+    return all(
+        quarter(q[joint]) == number.value
+        for joint, number in zip(QUARTERED, point.way, strict=True)
+    )
+
+
+def ways(point: Point, before: Array, after: Array) -> list[tuple[Number, str]]:
+    """The quarter turns that a correction changed."""
+    return [
+        (number, str(quarter(after[joint])))
+        for joint, number in zip(QUARTERED, point.way, strict=True)
+        if quarter(before[joint]) == number.value and quarter(after[joint]) != number.value
+    ]
+
+
+def quarter(angle: float) -> int:
+    """The quarter turn that an angle [rad] lies in: 0 from 0 to 90 degrees, -1 below."""
+    return int(np.floor(angle / (0.5 * np.pi) + 1e-12))
+
+
+def frames(program: Text) -> dict[str, Array]:
+    """Tools and work objects that the module declares with numbers: (4, 4) by name [m].
+
+    Without tools that stand still and work objects that the robot holds.
+    """
+    out = {name: np.eye(4) for name in ORIGINS}
+    for found in FRAME.finditer(program.bare):
+        kind, name = found[1].lower(), found[2]
+        end = max(program.bare.find(";", found.end()), found.end())
+        value = program.bare[found.end() : end]
+        held = value.lstrip("[ \t\r\n").partition(",")[0].strip().upper()
+        inner = list(BRACKETS.finditer(program.bare, found.end(), end))
+        pairs = [p for p in pairwise(inner) if [f[0].count(",") for f in p] == [2, 3]]
+        poses = [frame(program, name, *pair) for pair in pairs]
+        if kind == "tooldata" and held == "TRUE" and poses:
+            out[name] = poses[0]
+        elif kind == "wobjdata" and held == "FALSE" and len(poses) > 1:
+            out[name] = poses[0] @ poses[1]
+    return out
+
+
+def frame(program: Text, name: str, place: re.Match[str], turn: re.Match[str]) -> Array:
+    """(4, 4) of a position and a quaternion in brackets [m]."""
+    where = f"{program.source}:{program.line(place.start())}: {name}"
+    xyz, quaternion = (
+        np.array([n.value for n in program.numbers(f.start() + 1, f.end() - 1, name)])
+        for f in (place, turn)
+    )
+    return posed(xyz, of_quaternion(quaternion, where))
+
+
+def used(program: Text) -> Iterator[tuple[int, str, str]]:
+    """Line, tool and work object of each move."""
+    for move in MOVE.finditer(program.bare):
+        body = LITERAL.sub("", move[1])
+        last = body.rsplit(",", 1)[-1]
+        tool, *more = re.split(r"\\", last)
+        object_ = [part.partition(":=")[2] for part in more if part.lower().startswith("wobj")]
+        name = tool.strip()
+        if re.fullmatch(r"\w{1,32}", name):
+            yield program.line(move.start()), name, (object_[0].strip() if object_ else "wobj0")

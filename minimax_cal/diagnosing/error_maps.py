@@ -1,0 +1,195 @@
+"""Joints whose error is a curve of their own angle that no formula tells: sought after the names.
+
+A map enters where groups of poses that are left out tell that it helps, beside geometry, the
+effects that were named, and more than slow laws of the same joint do: a gain, one to three waves.
+Where its curve is one wave, that wave is named instead.  Laws of the same angle that the map makes
+needless leave: lines of a free frequency are a series for such a curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.remainder import (
+    SHAPES,
+    Beside,
+    Block,
+    Left,
+    begun,
+    by_joint,
+    gain_chance,
+)
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.maps import FINEST, range_of, sines
+from minimax_cal.modelling.effects.scene import BESIDE, Scene, joint_of
+from minimax_cal.modelling.effects.table import Term
+
+LEVEL = 1e-3  # chance that groups gain so much by a map of a joint that has none
+OF_ANGLE = ("gear_error", "gear_ripple", "encoder_gain")
+USUAL = 1e-3  # size of slow laws [rad]
+SLOW = 4.0  # waves a turn of the slowest that is called a ripple
+ONE_WAVE = 0.9  # share of a curve's square that makes it a wave
+NEEDLESS = 2e-2  # of what maps and laws of these angles explain: a rise that is none
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """terms: what is found, the largest gain first.  chances: that groups gain so much by accident.
+
+    gains: of the square left out, over its variance.  again: share of the parts left out that are
+    met better.  needless: terms that they replace.
+    """
+
+    terms: tuple[Term, ...] = ()
+    chances: tuple[float, ...] = ()
+    gains: tuple[float, ...] = ()
+    again: tuple[float, ...] = ()
+    needless: tuple[Term, ...] = ()
+
+    def beside(self, effects: Sequence[Sequence[Term]]) -> list[Sequence[Term]]:
+        """The effects of a ladder with the maps, without what these replace."""
+        gone = {term.key for term in self.needless}
+        kept = [terms for terms in effects if terms[0].key not in gone]
+        return [*kept, *((term,) for term in self.terms)]
+
+    def findings(self, named: Sequence[Finding], scene: Scene) -> list[Finding]:
+        """`beside` for findings; values are those of a fit that comes."""
+        gone = {term.key for term in self.needless}
+        out = [finding for finding in named if finding.term.key not in gone]
+        for i, term in enumerate(self.terms):
+            columns = term.columns(scene)
+            none = (0.0,) * len(columns.names)
+            names, units, chance = columns.names, columns.units, self.chances[i]
+            new = Finding((term,), names, units, none, none, self.gains[i], chance)
+            out.append(replace(new, fixed=columns.fixed, again=self.again[i]))
+        return out
+
+
+NO_MAPS = Mapped()
+
+
+def error_maps(fit: Joint) -> Mapped:
+    """The error maps that a fit of geometry and named effects lacks."""
+    left = Left.of(fit)
+    if not len(left.parts):
+        return Mapped()
+    usual = begun(left).usual
+    found = chosen(fit, left.take(usual))
+    if not found:
+        return Mapped()
+    blocks = [block for block, _ in found]
+    needless = replaced(fit, left, usual, blocks)
+    at = begun(without(fit, left, needless).take(usual))
+    terms, gains, again = [], [], []
+    for block in blocks:
+        wide = at.with_block(block)
+        terms.append(term_of(fit, block, wide, at.variance))
+        gains.append((at.square - wide.square) / wide.variance)
+        fell = (at.error**2 - wide.error**2).sum(axis=1)
+        again.append(float(np.mean([fell[part].sum() > 0.0 for part in at.parts])))
+        at = wide
+    chances = tuple(chance for _, chance in found)
+    return Mapped(tuple(terms), chances, tuple(gains), tuple(again), needless)
+
+
+def chosen(fit: Joint, left: Left) -> list[tuple[Block, float]]:
+    """Blocks of the joints that have a map, the weightiest first, and the chance of each."""
+    sliding, at = fit.study.scene.robot.prismatic, begun(left)
+    waiting = [block for block in by_joint(left) if not sliding[joint_of(block.place)]]
+    out: list[tuple[Block, float]] = []
+    tries = len(waiting)
+    while waiting:
+        tried = [at.with_block(block) for block in waiting]
+        for number in np.argsort([one.square for one in tried]).tolist():
+            plain = at.with_block(slow(left, waiting[number].place))
+            each = [gain_chance(base, tried[number], left.group) for base in (at, plain)]
+            chance = tries * max(each)
+            if chance < LEVEL:
+                at = tried[number]
+                out.append((waiting.pop(number), chance))
+                break
+        else:
+            return out
+    return out
+
+
+def slow(left: Left, place: str) -> Block:
+    """The laws of a joint's own angle that have a name: its gain, and slow waves."""
+    joint = joint_of(place)
+    q = left.q[:, joint]
+    laws = np.stack([q, *(f(k * q) for k in (1, 2, 3) for f in (np.cos, np.sin))], axis=1)
+    columns = left.arm[:, :, joint, None] * laws[:, None]
+    return Block(place, columns, np.full((1, laws.shape[1]), USUAL))
+
+
+def term_of(fit: Joint, block: Block, at: Beside, variance: float) -> Term:
+    """The map of a block that was just fitted, or the wave that it is.
+
+    variance: of a coordinate, with which its prior was weighed [m^2].
+    """
+    q, (size, length) = fit.study.scene.q[joint_of(block.place)], SHAPES[at.picked]
+    low, high = range_of(q)
+    x = np.linspace(q.min(), q.max(), 8 * block.columns.shape[-1])
+    curve = at.value[-block.columns.shape[-1] :] @ sines(x, low, high, block.columns.shape[-1])
+    turns, share = strongest_wave(x, curve)
+    if share > ONE_WAVE:
+        return Term("gear_ripple", block.place, {"turns": turns})
+    size *= BESIDE / float(np.sqrt(variance))
+    choice = {"low": low, "high": high, "length": length, "size": size}
+    return Term("joint_error_map", block.place, choice)
+
+
+def strongest_wave(x: Array, curve: Array) -> tuple[float, float]:
+    """Waves a turn that come nearest to a curve (g,), and the share of its square they explain."""
+    least, most = 2.0 * np.pi / np.ptp(x), 2.0 * np.pi / FINEST
+    turns = np.arange(max(least, SLOW), most, 0.1 * least)
+    best, bare = (0.0, 0.0), curve - np.polyval(np.polyfit(x, curve, 1), x)
+    for k in turns:
+        columns = np.stack([np.ones_like(x), x, np.cos(k * x), np.sin(k * x)], axis=1)
+        rest = curve - columns @ np.linalg.lstsq(columns, curve, rcond=None)[0]
+        best = max(best, (1.0 - float(rest @ rest) / max(float(bare @ bare), 1e-300), float(k)))
+    return best[1], best[0]
+
+
+# ---- laws that a map makes needless ------------------------------------------------------------
+
+
+def replaced(fit: Joint, left: Left, usual: Array, blocks: Sequence[Block]) -> tuple[Term, ...]:
+    """Named laws of the same angles without which groups left out are met as well."""
+    places = {block.place for block in blocks}
+    own = [t for t in fit.terms if t.effect in OF_ANGLE and t.place in places]
+    least = squared(left, usual, blocks)
+    bare = begun(without(fit, left, own).take(usual)).square
+    gone: tuple[Term, ...] = ()
+    for key in dict.fromkeys((t.effect, t.place) for t in own):
+        fewer = (*gone, *(t for t in own if (t.effect, t.place) == key))
+        if squared(without(fit, left, fewer), usual, blocks) - least < NEEDLESS * (bare - least):
+            gone = fewer
+    return gone
+
+
+def squared(left: Left, usual: Array, blocks: Sequence[Block]) -> float:
+    """The square of poses left out with maps of some joints [m^2]."""
+    at = begun(left.take(usual))
+    for block in blocks:
+        at = at.with_block(block)
+    return at.square
+
+
+def without(fit: Joint, left: Left, gone: Sequence[Term]) -> Left:
+    """What is left once some effects of a fit are not in it."""
+    if not gone:
+        return left
+    scene, count = fit.study.scene, fit.model.names.geometric
+    texts = {term.text for term in gone}
+    owner = [t.text in texts for t in fit.terms for _ in t.columns(scene).names]
+    names = np.concatenate([np.zeros(count, dtype=bool), owner])
+    own = names[fit.estimator.model.active]
+    value = np.concatenate([np.zeros(count), fit.state.effects])[fit.estimator.model.active]
+    back = left.columns[..., own] @ value[own]
+    return replace(left, y=left.y + back, columns=left.columns[..., ~own])

@@ -1,0 +1,350 @@
+"""How much of what is left can be predicted without a name, where it lives, and what nothing tells.
+
+Beside geometry and the effects that were named, blocks of free functions are tried in turn: of each
+joint a smooth turn by its own angle, then a shift of all targets that is smooth in all joints.  A
+block has a Gaussian prior [Rasmussen and Williams 2006], so that it is a ridge regression.  Its
+length and size are those that meet groups of poses left out best, and it stays only where those
+groups tell that it helps: what is fitted judges nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
+
+from minimax_cal.diagnosing.gap import folds
+from minimax_cal.diagnosing.joint import FOLDS, Joint
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.floor import Floor
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.modelling.effects.maps import range_of, sines, spread, waves_over
+from minimax_cal.modelling.effects.scene import Scene
+
+FEWEST = 10  # groups that can say anything
+LEVEL = 1e-3  # chance that groups gain so much by one block that tells nothing
+LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0]).tolist()  # of a joint's curve [rad]
+SHAPES = list(product((5e-5, 2e-4, 8e-4), LENGTHS))  # its size, beside what is left, and length
+LEAST_SWEEP = np.radians(10.0)  # a joint must turn so far to have a curve
+LEAST_LEVER = 0.1  # of the largest: joints that move the targets less count so much
+CENTRES = 150  # poses about which the functions of all joints are built, at most
+WIDTHS = (1.0, 2.0, 4.0, 8.0)  # of them, in typical distances between those poses
+SHIFTS = (3e-5, 1e-4, 3e-4)  # sizes of the shift [m]
+FAR_OUT = 10.0  # times the median error of a pose: one that does not judge
+JITTER = 1e-8  # added to a correlation, so that it is one for any poses
+RIDGE = 1e-10  # of a parameter's own weight: what poses do not tell stays where it is
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What is left beneath the names, on groups of training poses left out in turn.
+
+    predictable_mm: RMS distance that free functions of the joints predict, 0 where they do not.
+    where: place and share of each, the largest first.  unpredictable_mm: RMS distance that stays.
+    floor_mm: ends of what noise alone leaves, None where nothing tells.
+    """
+
+    predictable_mm: float
+    where: tuple[tuple[str, float], ...]
+    unpredictable_mm: float
+    floor_mm: tuple[float, float] | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "predictable_mm": self.predictable_mm,
+            "where": [{"place": place, "share": share} for place, share in self.where],
+            "unpredictable_mm": self.unpredictable_mm,
+            "floor_mm": list(self.floor_mm) if self.floor_mm else None,
+        }
+
+
+def remainder(last: Joint, floor: Floor) -> Remainder:
+    """What could be predicted beside the effects of a fit, judged by groups of its poses.
+
+    floor: what noise alone would leave.
+    """
+    left = Left.of(last)
+    if not len(left.parts):
+        return Remainder(0.0, (), last.train.rms_mm, floor.ends)
+    left = left.take(begun(left).usual)
+    rungs, places = climbed(left)
+    if not rungs[-1].usual.all():  # what stands out now spoils what is fitted and judged
+        left = left.take(rungs[-1].usual)
+        rungs, places = climbed(left)
+    squares, points = [rung.square for rung in rungs], float((left.root**2).sum()) / 3.0
+    gains = -np.diff(squares)
+    order = np.argsort(-gains)
+    return Remainder(
+        1e3 * float(np.sqrt(gains.sum() / points)),
+        tuple((places[i], float(gains[i] / gains.sum())) for i in order),
+        1e3 * float(np.sqrt(squares[-1] / points)),
+        floor.ends,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Left:
+    """What a fit leaves at its poses, linear there.
+
+    y: (m, r) errors, columns: (m, r, p) their derivatives by what was fitted, arm: (m, r, n) motion
+    of the points by the joints, root: (m, r) root of each weight [m, rad].  q: (m, n) joints, of a
+    slide its place in the arm's reach [rad].  group: (m,).  parts: (f, m) masks, left out in turn.
+    """
+
+    y: Array
+    columns: Array
+    arm: Array
+    root: Array
+    q: Array
+    group: Array
+    parts: Array
+
+    @staticmethod
+    def of(last: Joint) -> Left:
+        """At the end of a fit, with the parts that it can do without."""
+        scene, poses, data = last.study.scene, last.poses, last.study.data
+        part, unit = folds(data, FOLDS), joint_units(scene)
+        parts = np.array(last.spared([part == number for number in range(FOLDS)]))
+        return Left(
+            y=poses.error,
+            columns=poses.jacobian,
+            arm=poses.arm * unit,
+            root=np.repeat(np.sqrt(last.model.weight), 3, axis=0).T,
+            q=(scene.q / unit[:, None]).T,
+            group=clusters(data),
+            parts=parts.reshape(-1, data.poses),
+        )
+
+    def take(self, rows: Array) -> Left:
+        """Some of the poses.  rows: mask (m,)."""
+        parts = self.parts[:, rows]
+        return Left(
+            y=self.y[rows],
+            columns=self.columns[rows],
+            arm=self.arm[rows],
+            root=self.root[rows],
+            q=self.q[rows],
+            group=self.group[rows],
+            parts=parts[parts.any(axis=1)],
+        )
+
+    @property
+    def groups(self) -> int:
+        """How many stand apart."""
+        return len(np.unique(self.group))
+
+
+def joint_units(scene: Scene) -> Array:
+    """(n,) what counts as a radian of each joint: of a slide the arm's reach [m]."""
+    return np.where(scene.robot.prismatic, scene.robot.reach(), 1.0)
+
+
+def begun(left: Left) -> Beside:
+    """The fit as it is."""
+    return Beside.of(left.parts, left.y, left.columns)
+
+
+def climbed(left: Left) -> tuple[list[Beside], list[str]]:
+    """The fit, then with each block that helps; their places."""
+    rungs, places = [begun(left)], []
+    for blocks in (by_joint(left), by_all(left)):
+        waiting = list(blocks)
+        while waiting:
+            tried = [rungs[-1].with_block(block) for block in waiting]
+            best = min(range(len(tried)), key=lambda i: tried[i].square)
+            if gain_chance(rungs[-1], tried[best], left.group) > LEVEL:
+                break
+            place = waiting[best].place
+            waiting = [block for block in waiting if block.place != place]
+            rungs.append(tried[best])
+            places.append(place)
+    return rungs, places
+
+
+def gain_chance(before: Beside, after: Beside, group: Array) -> float:
+    """Chance that groups of poses left out gain so much by what tells nothing.  group: (m,).
+
+    By the sum of their gains, or by their ranks, which a few poses far from all others do not sway.
+    """
+    names = np.unique(group, return_inverse=True)[1].reshape(-1)
+    gains = np.bincount(names, (before.error**2 - after.error**2).sum(axis=1))
+    if len(gains) < FEWEST or not gains.sum() > 0.0:
+        return 1.0
+    mean = stats.ttest_1samp(gains, 0.0, alternative="greater").pvalue
+    ranks = stats.wilcoxon(gains, alternative="greater").pvalue
+    return min(2.0 * float(min(mean, ranks)), 1.0)
+
+
+# ---- free functions ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Free functions at a place.
+
+    columns: (m, r, c) motion of the points per unit of each.  priors: (h, c) their standard
+    deviations, of which one row is chosen.
+    """
+
+    place: str
+    columns: Array
+    priors: Array
+
+
+def by_joint(left: Left) -> Iterator[Block]:
+    """A turn of each joint that is smooth in its own angle; of a slide, in its place."""
+    for j, q in enumerate(left.q.T):
+        if np.ptp(q) < LEAST_SWEEP:
+            continue
+        low, high = range_of(q)
+        count = max(min(waves_over(high - low), left.groups // 2), 1)
+        columns = left.arm[:, :, j, None] * sines(q, low, high, count).T[:, None]
+        priors = [size * spread(length, high - low, count) for size, length in SHAPES]
+        yield Block(f"J{j + 1}", columns, np.array(priors))
+
+
+def by_all(left: Left) -> Iterator[Block]:
+    """A shift of all targets that is smooth in all joints, for several widths.
+
+    A joint counts by how far it moves the targets.  Functions are those of a process that is known
+    at some of the poses [Quinonero-Candela and Rasmussen 2005].
+    """
+    lever = np.sqrt((left.arm**2).mean(axis=(0, 1)))
+    q = left.q * np.maximum(lever / max(lever.max(), 1e-300), LEAST_LEVER)
+    centre = far_apart(q, min(CENTRES, left.groups // 2))
+    if len(centre) < FEWEST:
+        return
+    between, away = cdist(centre, centre), cdist(q, centre)
+    usual = float(np.median(np.partition(between, 1, axis=1)[:, 1]))
+    axes = np.tile(np.eye(3), (left.y.shape[1] // 3, 1))
+    for width in WIDTHS:
+        square = matern(between / (width * usual)) + JITTER * np.eye(len(centre))
+        known = matern(away / (width * usual)).T
+        smooth = solve_triangular(np.linalg.cholesky(square), known, lower=True)
+        columns = np.einsum("mr,ra,cm->mrca", left.root, axes, smooth)
+        columns = columns.reshape(*left.root.shape, -1)
+        yield Block("all", columns, np.repeat(np.array(SHIFTS)[:, None], columns.shape[-1], axis=1))
+
+
+def matern(s: Array) -> Array:
+    """Matern's correlation of order 3/2.  s: distance over length."""
+    return np.asarray((1.0 + np.sqrt(3.0) * s) * np.exp(-np.sqrt(3.0) * s))
+
+
+def far_apart(q: Array, count: int) -> Array:
+    """(count, n) of the poses (m, n) those that lie farthest from each other."""
+    chosen, away = [0], np.full(len(q), np.inf)
+    for _ in range(count - 1):
+        away = np.minimum(away, np.linalg.norm(q - q[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return np.asarray(q[chosen])
+
+
+# ---- fits without each part of the poses -------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A fit of some columns, and what it predicts of each part of the poses without that part.
+
+    parts: (f, m) masks of the poses left out.  y: (m, r) what is fitted.  columns: (m, r, p), with
+    weights `ridge` (p,) of a prior of mean 0.  error: (m, r) what is left of each pose without its
+    part.  picked: which prior of the last block.
+    """
+
+    parts: Array
+    y: Array
+    columns: Array
+    ridge: Array
+    error: Array
+    picked: int = 0
+
+    @staticmethod
+    def of(parts: Array, y: Array, columns: Array) -> Beside:
+        """Columns that are fitted freely."""
+        nothing = Beside(parts, y, columns[..., :0], np.zeros(0), y)
+        return nothing.with_free(columns)
+
+    @property
+    def variance(self) -> float:
+        """Of a coordinate that is left out [m^2]."""
+        return self.square / self.y.size
+
+    @cached_property
+    def value(self) -> Array:
+        """(p,) with all poses."""
+        gram = product_of(self.columns, self.columns) + np.diag(self.ridge)
+        pull = product_of(self.columns, self.y[..., None])
+        return np.asarray(np.linalg.solve(gram, pull)[:, 0])
+
+    @property
+    def usual(self) -> Array:
+        """(m,) True for poses that some fit does without, and that do not stand far out."""
+        judged, size = self.parts.any(axis=0), (self.error**2).sum(axis=1)
+        return np.asarray(judged & (size <= FAR_OUT**2 * np.median(size[judged])))
+
+    @property
+    def square(self) -> float:
+        """Sum of squares at the poses left out [m^2]."""
+        return float((self.error**2).sum())
+
+    @cached_property
+    def grams(self) -> Array:
+        """(f, p, p) products of the columns at all poses but those of each part, and the ridge."""
+        return np.asarray(self.without(self.columns, self.columns) + np.diag(self.ridge))
+
+    def without(self, one: Array, other: Array) -> Array:
+        """(f, c, d) products of columns (m, r, c) and (m, r, d) at all poses but a part's."""
+        own = np.array([product_of(one[part], other[part]) for part in self.parts])
+        return np.asarray(product_of(one, other) - own)
+
+    def cleared(self, columns: Array) -> tuple[Array, Array]:
+        """What this fit does not predict of columns (m, r, c), each pose without its part.
+
+        And the products (f, p, c) of its own with them.
+        """
+        cross = self.without(self.columns, columns)
+        out = np.zeros_like(columns)
+        for part, value in zip(self.parts, np.linalg.solve(self.grams, cross), strict=True):
+            out[part] = columns[part] - self.columns[part] @ value
+        return out, cross
+
+    def with_block(self, block: Block) -> Beside:
+        """The fit with a block besides, by that prior of it which meets the parts best."""
+        both = np.concatenate([block.columns, self.y[..., None]], axis=-1)
+        clear, cross = self.cleared(both)
+        fall = np.swapaxes(cross, 1, 2) @ np.linalg.solve(self.grams, cross)
+        left = (self.without(both, both) - fall)[:, None]
+        ridge = self.variance / block.priors**2
+        eye = np.eye(ridge.shape[1])
+        value = np.linalg.solve(left[..., :-1, :-1] + ridge[:, :, None] * eye, left[..., :-1, -1:])
+        error = np.zeros((len(ridge), *self.y.shape))
+        for part, one in zip(self.parts, value[..., 0], strict=True):
+            free, rest = clear[part, :, :-1], clear[part, :, -1]
+            told = one @ free.reshape(-1, len(eye)).T
+            error[:, part] = rest - told.reshape(len(ridge), *rest.shape)
+        best = int(np.argmin((error**2).sum(axis=(1, 2))))
+        columns = np.concatenate([self.columns, block.columns], axis=-1)
+        ridge = np.append(self.ridge, ridge[best])
+        return Beside(self.parts, self.y, columns, ridge, error[best], best)
+
+    def with_free(self, columns: Array) -> Beside:
+        """The fit with columns (m, r, c) besides that nothing holds."""
+        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
+        both = np.concatenate([self.columns, columns / np.maximum(size, 1e-300)], axis=-1)
+        ridge = np.append(self.ridge, np.full(len(size), RIDGE))
+        bare = Beside(self.parts, self.y, both, ridge, self.y)
+        return replace(bare, error=bare.cleared(self.y[..., None])[0][..., 0])
+
+
+def product_of(one: Array, other: Array) -> Array:
+    """(c, d) products of columns (m, r, c) and (m, r, d)."""
+    return np.asarray(one.reshape(-1, one.shape[-1]).T @ other.reshape(-1, other.shape[-1]))

@@ -1,0 +1,88 @@
+"""The verdict: what is established, whether it is enough, and whether anything else is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.diagnosing.causes import Causes
+from minimax_cal.diagnosing.gap import Ladder
+from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of
+from minimax_cal.diagnosing.remainder import Remainder
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import CERTAIN, HALF, MATTERS, STRUCTURE, WORTH
+
+OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+
+Structure = tuple[str, float]
+
+
+def judged(
+    findings: Sequence[Finding], causes: Causes, study: Study, ladder: Ladder, rest: Remainder
+) -> tuple[str, Structure]:
+    """The verdict; where what remains has structure, and the probability of that by chance.
+
+    findings: as the ladder took them, with the faults.
+    """
+    traces = causes.traces
+    worst = min(traces, key=lambda trace: trace.p)
+    structure = (worst.name, min(1.0, worst.p * len(traces)))
+    sure = [found for found in findings if found.established]
+    loud = heard(traces, explained(study, causes), study.rows.count)
+    if loud:
+        return "unknown", (loud.name, structure[1])
+    if patched([found for found in sure if np.isfinite(found.size)]):
+        return "unknown", ("two laws for one joint may stand for one that is not known",
+                           structure[1])  # fmt: skip
+    if any(not found.established and found.p_value < CERTAIN for found in causes.effects):
+        return "unknown", ("names that change with the poses", structure[1])
+    if not closes_enough(sure, ladder, rest):
+        return "unknown", ("a curve of the joints that has no name", structure[1])
+    if not sure:
+        return "none", structure
+    return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
+
+
+def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None:
+    """The least probable structure that matters, beside what was explained and beside the noise.
+
+    explained: weighed square that the effects explain.  count: of rows.
+    """
+    least = max(MATTERS * explained, WORTH * count)
+    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
+    return min(loud, key=lambda trace: trace.p, default=None)
+
+
+def explained(study: Study, causes: Causes) -> float:
+    """Weighed square that the effects explain."""
+    none = np.zeros((len(study.rows.error), 0))
+    without, left = (
+        rest_of(study.rows, causes.choice.noise, known).total
+        for known in (none, causes.choice.known)
+    )
+    return without - left
+
+
+def patched(findings: Sequence[Finding]) -> bool:
+    """Whether the weightiest effect needs another law of its joint's angle: likely one unknown."""
+    if not findings:
+        return False
+    first = max(findings, key=lambda found: found.size).term
+    if first.effect not in OF_ANGLE:
+        return False
+    others = [f.term for f in findings if f.term.effect in OF_ANGLE and f.term is not first]
+    return any("all" in (first.place, t.place) or t.place == first.place for t in others)
+
+
+def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> bool:
+    """Whether what is established closes half of what groups left out show to be predictable."""
+    if rest.predictable_mm**2 <= WORTH * rest.unpredictable_mm**2:
+        return True
+    fit, geometric = ladder.last, ladder.fits[0]
+    count = float(fit.model.weight.sum())
+    told = fit.spared(ladder.parts)
+    both = [1e6 * one.cross_validated(told) / count for one in (geometric, fit)]  # [mm^2]
+    closed = both[0] - both[1] if sure else 0.0
+    return bool(closed >= HALF * (closed + rest.predictable_mm**2))

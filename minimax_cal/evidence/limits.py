@@ -1,0 +1,40 @@
+"""Every threshold of the decision layer, and what set it.
+
+The budget of errors is 1 % of sound arms: half of it for names, half for structure.  `study` below
+is `python -m experiments.machine_gap`, with seeds other than that of the printed table.
+"""
+
+# ---- what is named -------------------------------------------------------------------------------
+
+LEVEL = 0.005  # chance of any name on data without an effect: half of the budget
+EXACT = 1e-8  # noise below which data were computed, not measured [m]
+LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
+TIE = 2.0  # of evidence that a replacement must gain, so that choices do not go round
+REFINED = 6  # effects among which each is compared anew with all others: more change nothing
+NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
+TUNINGS = 3  # rounds of a finer search
+MOST = 30  # effects: the IRB 120 has about twenty
+
+# ---- what else it could be -----------------------------------------------------------------------
+
+BAND = 12.0  # of evidence: what fits worse by less may be the truth (blind_gap: in 99.9 % of sets)
+LIGHT = 4.0  # of fit, in the same sense, parameters charged lightly
+ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
+
+# ---- what is established -------------------------------------------------------------------------
+
+FOLDS = 5  # fifths of the groups of poses
+AGAIN = 0.2  # chance of a false name in four fifths: the name is known, only its place is contested
+DIFFER = 1e-3  # chance that parameters of four fifths differ so much from those of all poses
+SAME = 0.05  # of their square: a smaller difference is none, however sure they are (real arms)
+FIRM = 1.0  # share of the parts without which an effect is found again, to be established
+WEAK = 0.5  # the same, for what is found less often not to be spoken of
+
+# ---- what is unknown -----------------------------------------------------------------------------
+
+STRUCTURE = 0.005  # chance that noise alone is called structure: the other half of the budget
+MATTERS = 0.015  # share of what was explained below which structure is of no account: laws of
+# machines are not quite ours (study, saturating and loaded forms), real arms leave 1 %
+WORTH = 0.02  # of the noise: structure that would lower the RMS by less than 1 % is of no account
+CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
+HALF = 0.5  # of the predictable gap, which what is established must close

@@ -1,0 +1,164 @@
+"""Two calibrations of an arm side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.watching.moved import joint_of
+from minimax_cal.measuring.accuracy import Accuracy
+
+
+@dataclass(frozen=True)
+class Difference:
+    """B minus A of one parameter, in a common choice of what is kept [SI].
+
+    sigma: NaN, with a reason, where it cannot be compared.
+    """
+
+    parameter: str
+    unit: str
+    a: float
+    b: float
+    sigma: float
+    reason: str = ""
+
+    @property
+    def by(self) -> float:
+        """B minus A [SI]."""
+        return self.b - self.a
+
+    @property
+    def sigmas(self) -> float:
+        """The same in sigmas."""
+        return self.by / self.sigma
+
+    @property
+    def scale(self) -> tuple[float, str]:
+        """As people read it."""
+        return (1e3, "mm") if self.unit == "m" else (1e3, "mrad")
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A parameter whose change explains what differs.  others: would explain it nearly as well."""
+
+    parameter: str
+    by: float
+    sigma: float
+    unit: str
+    p_value: float
+    others: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two calibrations side by side.
+
+    differences: of every link parameter.  changed: those that explain them, the clearest first.
+    accuracy: of A and of B on the poses of A and of B, base and reflectors placed anew for both.
+    same: chance of such differences where nothing changed.
+    """
+
+    names: tuple[str, str]
+    robot: str
+    differences: tuple[Difference, ...]
+    changed: tuple[Changed, ...]
+    accuracy: tuple[tuple[str, Accuracy, Accuracy], ...]
+    same: float
+    notices: tuple[str, ...]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """That changed, as J3."""
+        return tuple(dict.fromkeys(joint_of(c.parameter) for c in self.changed))
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        a, b = self.names
+        if not self.changed:
+            return f"{self.robot}: no joint differs between {a} and {b} by more than chance allows."
+        told = ", ".join(
+            f"{c.parameter} by {1e3 * c.by:+.3f} {'mm' if c.unit == 'm' else 'mrad'}"
+            for c in self.changed
+        )
+        return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
+
+    def tables(self) -> tuple[Table, ...]:
+        """Which joints changed, accuracy on common poses, every parameter."""
+        changed = Table(
+            "what explains the differences",
+            ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
+            tuple(
+                (c.parameter, joint_of(c.parameter), "mm" if c.unit == "m" else "mrad",
+                 1e3 * c.by, 1e3 * c.sigma, c.p_value, ", ".join(c.others))
+                for c in self.changed
+            ),
+            ("", "", "", "+.4f", ".2g", ".2g", ""),
+        )  # fmt: skip
+        common = Table(
+            "the same poses, base and reflectors placed anew",
+            ("poses", "count", "A RMS mm", "A max mm", "B RMS mm", "B max mm"),
+            tuple(
+                (where, one.poses, one.rms_mm, one.max_mm, other.rms_mm, other.max_mm)
+                for where, one, other in self.accuracy
+            ),
+            ("", "d", *[".4f"] * 4),
+        )
+        each = Table(
+            f"A: {self.names[0]}, B: {self.names[1]}",
+            ("parameter", "unit", "A", "B", "B - A", "sigma", "in sigmas", "not compared because"),
+            tuple(
+                (d.parameter, d.scale[1], d.scale[0] * d.a, d.scale[0] * d.b, d.scale[0] * d.by,
+                 d.scale[0] * d.sigma, d.sigmas, d.reason)
+                for d in self.differences
+            ),
+            ("", "", ".4f", ".4f", "+.4f", ".2g", "+.1f", ""),
+        )  # fmt: skip
+        return tuple(table for table in (changed, common, each) if table.rows)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: lengths in mm, angles in rad."""
+
+        def unit(each: Difference | Changed) -> tuple[float, str]:
+            return (1e3, "mm") if each.unit == "m" else (1.0, each.unit)
+
+        def difference(d: Difference) -> dict[str, Any]:
+            scale, name = unit(d)
+            told = {"parameter": d.parameter, "unit": name, "a": scale * d.a, "b": scale * d.b}
+            told |= {"by": scale * d.by, "sigma": scale * d.sigma, "sigmas": d.sigmas}
+            return told | ({"reason": d.reason} if d.reason else {})
+
+        def changed(c: Changed) -> dict[str, Any]:
+            scale, name = unit(c)
+            return {
+                "parameter": c.parameter, "joint": joint_of(c.parameter), "by": scale * c.by,
+                "sigma": scale * c.sigma, "unit": name, "p_value": c.p_value,
+                "alternatives": list(c.others),
+            }  # fmt: skip
+
+        return dict(
+            plain(
+                {
+                    "schema": 1,
+                    "kind": "comparison",
+                    "robot": self.robot,
+                    "a": self.names[0],
+                    "b": self.names[1],
+                    "changed": [changed(c) for c in self.changed],
+                    "p_value_nothing_changed": self.same,
+                    "parameters": [difference(d) for d in self.differences],
+                    "accuracy": [
+                        {"poses": where, "a": one.to_dict(), "b": other.to_dict()}
+                        for where, one, other in self.accuracy
+                    ],
+                    "notices": list(self.notices),
+                }
+            )
+        )

@@ -1,0 +1,234 @@
+"""What differs between two calibrations of an arm: before and after a repair, this month and last.
+
+Parameters that move the points alike (d1 and the base's z) can be traded for each other at no cost.
+Both arms are therefore told with the same ones kept at the drawing: x' = x - N N_g^-1 x_g, with N
+the motions of the links that base and reflectors imitate and g the parameters that are kept.  What
+is left can be compared, in sigmas of both covariances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.fitting import identify
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.judging.watching.compared import Changed, Comparison, Difference
+from minimax_cal.judging.watching.moved import CLEARER, LEVEL, LIKEWISE, MOST, ZEROS
+from minimax_cal.judging.watching.opening import watched_of
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import links_of
+from minimax_cal.solvers.least_squares import solve_normal
+
+TINY = 1e-300  # in place of a zero
+SMALLEST = 1e-12  # share of a variance below which a sigma is rounding
+ALIKE = 1e-9  # two drawings are one to this [m, rad]
+
+
+def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
+    """What differs between two calibrations of an arm.
+
+    a, b: calibrations with their covariance, or their files, the earlier first.  Instrument and
+    reflectors may stand anew.  Raises CalibrationError for wrong input.
+
+    >>> print(mc.compare("may.json", "june.json").summary())
+    """
+    fits = tuple(fit if isinstance(fit, Fit) else load_fit(fit) for fit in (a, b))
+    one, other = fits
+    names = tuple("calibration" if isinstance(each, Fit) else str(each) for each in (a, b))
+    names = (f"{names[0]} A", f"{names[1]} B") if names[0] == names[1] else names
+    check_alike(one, other)
+    kept, motion = common_gauge(one, other)
+    n = one.robot.joints
+    turn = np.eye(5 * n)
+    turn[:, kept] -= motion
+    drawn = links_of(one.before.robot.mdh)
+    value = [drawn + turn @ (links_of(fit.robot.mdh) - drawn) for fit in fits]
+    covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
+    told = [told_by(fit, kept, n) for fit in fits]
+    listed = tuple(differences(one, value, np.asarray(covariance), kept, told))
+    free = np.flatnonzero([not d.reason for d in listed_by_column(listed, n)])
+    found, same = explained(one, value[1] - value[0], np.asarray(covariance), free)
+    return Comparison(
+        names=(names[0], names[1]),
+        robot=one.robot.name,
+        differences=listed,
+        changed=found,
+        accuracy=tuple(on_common(one, other)),
+        same=same,
+        notices=tuple(remarks(one, other)),
+    )
+
+
+def check_alike(one: Fit, other: Fit) -> None:
+    """Raise OptionError unless both are of one kind of arm, and tell how sure they are."""
+    for fit in (one, other):
+        _ = fit.known, fit.before
+    a, b = one.robot, other.robot
+    if a.joints != b.joints or np.any(a.sign != b.sign) or np.any(a.prismatic != b.prismatic):
+        raise OptionError(
+            f"{a.name} ({a.joints} joints) and {b.name} ({b.joints}) differ in number, signs or "
+            "types of joints; compare calibrations of one arm"
+        )
+
+
+def common_gauge(one: Fit, other: Fit) -> tuple[Array, Array]:
+    """Link parameters to be kept as drawn: (d,); what else moves with each unseen: (5n, d).
+
+    What base and reflectors imitate on plenty of poses, of the arm whose reflectors show less.
+    """
+    return max((gauge(fit) for fit in (one, other)), key=lambda found: len(found[0]))
+
+
+def gauge(fit: Fit) -> tuple[Array, Array]:
+    """`common_gauge` of one."""
+    state, n = replace(fit.cell.state, effects=np.zeros(0)), 5 * fit.robot.joints
+    model = identify.plenty_of_poses(fit.robot, model_of(fit.robot, fit.data))
+    gram = identify.gram_of(model, state)
+    order = identify.drop_order(fit.before.robot, model.names)
+    everything = np.ones(model.names.count, dtype=bool)
+    gone = np.array(identify.redundant(gram, everything, order, identify.RANK), dtype=int)
+    size = np.sqrt(np.maximum(np.diag(gram), TINY))
+    _, vectors = np.linalg.eigh(gram / np.outer(size, size))
+    null = vectors[:, : len(gone)] / size[:, None]
+    return gone[gone < n], null[:n, :] @ np.linalg.pinv(null[gone])[:, gone < n]
+
+
+def links_covariance(fit: Fit) -> Array:
+    """(5n, 5n) of the link parameters; zero where they were kept."""
+    n = 5 * fit.robot.joints
+    return np.nan_to_num(fit.known.covariance[:n, :n])
+
+
+def told_by(fit: Fit, kept: Array, joints: int) -> Array:
+    """(5n,) True where a fit tells a parameter, or any other that moves the points alike."""
+    names = fit.known.names.all[: 5 * joints]
+    reasons = {p.name: p.reason for p in fit.parameters}
+    alike = identify.SAME_MOTION.partition("{")[0].strip()
+    return np.array(
+        [
+            bool(fit.identification.active[i]) or reasons.get(name, "").startswith(alike)
+            for i, name in enumerate(names)
+        ]
+    )
+
+
+def differences(
+    fit: Fit, value: list[Array], covariance: Array, kept: Array, told: list[Array]
+) -> Iterator[Difference]:
+    """Every link parameter, link by link."""
+    n = fit.robot.joints
+    names, sigma = fit.known.names.all, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    for i in (kind * n + joint for joint in range(n) for kind in range(5)):
+        missing = [which for which, known in zip("AB", told, strict=True) if not known[i]]
+        reason = ""
+        if i in kept:
+            reason = "base, reflectors or neighbours imitate it: kept as drawn"
+        elif missing or sigma[i] == 0.0:
+            reason = f"not identified in {' and '.join(missing) or 'A and B'}"
+        size = math.nan if reason else float(sigma[i])
+        unit = "m" if i < 2 * n else "rad"
+        yield Difference(names[i], unit, float(value[0][i]), float(value[1][i]), size, reason)
+
+
+def listed_by_column(listed: tuple[Difference, ...], n: int) -> list[Difference]:
+    """The same in the order of the columns."""
+    return [listed[joint * 5 + kind] for kind in range(5) for joint in range(n)]
+
+
+def explained(
+    fit: Fit, change: Array, covariance: Array, free: Array
+) -> tuple[tuple[Changed, ...], float]:
+    """Which parameters' changes explain all differences, the clearest first; chance of none.
+
+    free: (c,) those that can be compared.  A parameter counts by what it explains of the whole
+    [Rao 1948]; the level is shared among all, zero positions first.
+    """
+    n, names = fit.robot.joints, fit.known.names.all
+    zeros = np.arange(n) + np.where(fit.robot.prismatic, n, 2 * n)
+    if not len(free):
+        return (), math.nan
+    sigma = np.sqrt(np.diag(covariance)[free])
+    inverse = np.linalg.pinv(
+        covariance[np.ix_(free, free)] / np.outer(sigma, sigma), rcond=SMALLEST, hermitian=True
+    )
+    off, is_zero = change[free] / sigma, np.isin(free, zeros)
+    shares = np.where(
+        is_zero, ZEROS / max(is_zero.sum(), 1), (1 - ZEROS) / max((~is_zero).sum(), 1)
+    )
+    total = float(off @ inverse @ off)
+    same = float(stats.chi2.sf(total, np.linalg.matrix_rank(inverse)))
+    chosen: list[int] = []
+    told: list[tuple[float, tuple[str, ...]]] = []
+    while len(chosen) < min(MOST, len(free)):
+        columns = inverse[:, chosen]
+        gram = inverse[np.ix_(chosen, chosen)]
+        rest = inverse - columns @ solve_normal(gram, columns.T)
+        score, size = rest @ off, np.diag(rest)
+        open_ = (size > SMALLEST * np.diag(inverse)) & ~np.isin(np.arange(len(free)), chosen)
+        square = np.where(open_, score**2 / np.where(open_, size, 1.0), 0.0)
+        p_value = np.asarray(stats.chi2.sf(square, 1))
+        passed = p_value <= LEVEL * shares
+        if not passed.any():
+            break
+        zero, link = (
+            int(np.argmax(np.where(passed & k, square, -1.0))) for k in (is_zero, ~is_zero)
+        )
+        better = passed[link] and square[link] > square[zero] + CLEARER
+        pick = link if better or not passed[zero] else zero
+        lost = square[pick] - square
+        near = [i for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick and open_[i]]
+        chosen.append(pick)
+        told.append((float(p_value[pick]), tuple(names[free[i]] for i in near)))
+    spread = np.linalg.inv(inverse[np.ix_(chosen, chosen)]) if chosen else np.zeros((0, 0))
+    by = (spread @ (inverse[chosen] @ off)) * sigma[chosen]
+    sure = np.sqrt(np.diag(spread)) * sigma[chosen]
+    return tuple(
+        Changed(
+            names[free[i]],
+            float(by[row]),
+            float(sure[row]),
+            "m" if free[i] < 2 * n else "rad",
+            *told[row],
+        )
+        for row, i in enumerate(chosen)
+    ), same
+
+
+def on_common(one: Fit, other: Fit) -> Iterator[tuple[str, Accuracy, Accuracy]]:
+    """Both on the poses of each: on those that its own fit did not see, if there are any."""
+    for name, fit in (("A", one), ("B", other)):
+        if not fit.data.poses:
+            continue
+        held = fit.held if fit.held.any() else ~fit.held
+        data = fit.data.take(held)
+        found = []
+        for arm in (one, other):
+            watched, _ = watched_of(arm, replace(data, frames={}), ())
+            model, state = watched.start
+            found.append(accuracy(model.error(state)))
+        which = "held-out" if fit.held.any() else "training"
+        yield f"{which} poses of {name}", found[0], found[1]
+
+
+def remarks(one: Fit, other: Fit) -> Iterator[str]:
+    """What the reader should know."""
+    if np.array_equal(one.data.y, other.data.y, equal_nan=True):
+        yield (
+            "both are fitted to the same measurements: what differs is the way of fitting, and "
+            "the sigmas, which take them for independent, say nothing of it"
+        )
+    effects = [[t.label for t in fit.cell.effects.terms] for fit in (one, other)]
+    if effects[0] != effects[1]:
+        told = " against ".join(", ".join(labels) or "none" for labels in effects)
+        yield f"they hold different effects ({told}): geometry takes over part of what one lacks"
+    if np.abs(one.before.robot.mdh - other.before.robot.mdh).max() > ALIKE:
+        yield "they start from different drawings: what neither identifies differs by that alone"

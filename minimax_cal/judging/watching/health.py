@@ -1,0 +1,153 @@
+"""Is a calibration still valid after a knock or a service?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
+from minimax_cal.fitting.options import listed
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
+from minimax_cal.judging.watching.moved import Search, search
+from minimax_cal.judging.watching.opening import in_names, own_rows, watched_of
+from minimax_cal.judging.watching.prospects import hidden, prospects
+from minimax_cal.judging.watching.refit import refit
+from minimax_cal.judging.watching.result import Health, Verdict
+from minimax_cal.judging.watching.watched import Watched
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.parameters import State
+
+KNOWN = ("frame", "targets")  # what may still be where it was
+SURE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
+STATED = (0.5, 0.9995)  # confidences that are told
+NOISIER = 5.0  # standard deviations of a mean square that are worth a word
+WIDE = 1.5  # so much wider sigmas are too
+
+
+def check(
+    fit: Fit | Path | str,
+    data: Measurements | Path | str,
+    tolerance: str,
+    *,
+    known: str | Sequence[str] = (),
+    seed: int = 0,
+) -> Health:
+    """Whether a calibration is still valid, and what has moved, from a few new poses.
+
+    fit: a calibration with its covariance, or its file.  data: new measurements.  tolerance: what
+    is required of the error, in mm, as "rms 0.2, max 0.5".  known: what is where it was at the
+    calibration: frame (the instrument), targets (the reflectors); reflectors on the foot, columns
+    base1_x_mm ... of both, tell the frame too.  All else is placed anew.  seed: of samples behind
+    the intervals.  Raises CalibrationError for wrong input.
+
+    >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
+    """
+    limits = limits_of(tolerance)
+    if not limits:
+        raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
+    known = tuple(listed(known))
+    for part in known:
+        if part not in KNOWN:
+            raise OptionError(f"known: {part!r} is none of {', '.join(KNOWN)}")
+    fit = fit if isinstance(fit, Fit) else load_fit(fit)
+    data = data if isinstance(data, Measurements) else read_measurements(data)
+    watched, said = watched_of(fit, data, known)
+    links = in_names(fit, watched, fit.identification.active)
+    found = search(watched, links, own_rows(fit, watched), seed)
+    error = watched_error(watched, found.first.state)
+    open_count = int(watched.open.sum())
+    verdicts = tuple(verdict(limit, error, watched.data, open_count, seed) for limit in limits)
+    after = refit(fit, watched, found)
+    spread, enough, asked = prospects(watched, found)
+    return Health(
+        robot=fit.robot.name,
+        verdicts=verdicts,
+        moved=found.named,
+        hidden=tuple(hidden(watched, found)),
+        accuracy=accuracy(error),
+        refitted=after.accuracy["train"],
+        findable=spread,
+        sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.robot.prismatic)),
+        enough=enough,
+        asked=asked,
+        noise=math.sqrt(found.last.mean_square),
+        poses=watched.data.poses,
+        fit=replace(after, notices=(*after.notices, *said)),
+        notices=(*data.notices, *said, *remarks(watched, found)),
+    )
+
+
+# ---- valid or not ------------------------------------------------------------------------------
+
+
+def watched_error(watched: Watched, state: State) -> Array:
+    """(k, m, 3) errors at a state [m]."""
+    model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
+    return model.error(state) @ state.rotation.T
+
+
+def verdict(limit: Limit, error: Array, data: Measurements, free: int, seed: int) -> Verdict:
+    """One requirement against errors (k, m, 3) that `free` parameters were fitted to."""
+    count = 3 * int(np.isfinite(error[..., 0]).sum())
+    grown = error * math.sqrt(count / max(count - free, 1))  # what placing took off
+    group, rms = groups(data), limit.kind == "rms"
+    kind = rms_interval if rms else max_interval
+
+    def interval(level: float) -> Interval:
+        return kind(grown, group, level, rng=np.random.default_rng(seed))
+
+    found = accuracy(grown)
+    value = found.rms_mm if rms else found.max_mm
+    ends = interval(2.0 * SURE - 1.0)
+    low, high = 1e3 * ends.low, 1e3 * ends.high
+    poses = len(np.unique(group))
+    told = partial(Verdict, limit, value, low, high)
+    seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
+    if math.isnan(low):
+        return told(None, STATED[0], f"{seen}, and {poses} poses are too few to say")
+    if not rms and accuracy(error).max_mm > limit.size_mm:
+        return told(
+            False, STATED[1], f"{accuracy(error).max_mm:.3f} mm was seen, {limit.size_mm:g}"
+        )
+    if not rms and chance_of_larger(poses) > CHANCE:
+        return told(None, STATED[0], f"{seen}, and a maximum needs at least {FEWEST} poses")
+    sure = confidence(interval, 1e-3 * limit.size_mm, above=value > limit.size_mm)
+    decided = None if sure < SURE else value <= limit.size_mm
+    return told(decided, sure, seen if decided is not None else f"{seen}: more poses may decide")
+
+
+def confidence(interval: Any, size: float, *, above: bool) -> float:
+    """The largest one-sided confidence at which an interval lies on one side of a size."""
+    low, high = STATED
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        ends = interval(2.0 * middle - 1.0)
+        holds = ends.low > size if above else ends.high < size
+        low, high = (middle, high) if holds else (low, middle)
+    return low
+
+
+def remarks(watched: Watched, found: Search) -> Iterator[str]:
+    """What the reader should know."""
+    if found.last.mean_square > 1.0 + NOISIER * math.sqrt(2.0 / found.last.dof):
+        yield (
+            f"what is left is {math.sqrt(found.last.mean_square):.2g} times as large as the "
+            "calibration's noise: the instrument is noisier now, or more changed than is named"
+        )
+    wider = float(found.looked.wider.max(initial=1.0))
+    if wider > WIDE:
+        yield (
+            f"the model lacks something: sigmas are widened, by up to {wider:.2g}, as the "
+            "calibration's own poses ask for; a diagnosis says what"
+        )

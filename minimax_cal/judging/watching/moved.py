@@ -1,0 +1,195 @@
+"""What of a calibrated arm has moved since: score tests of its parameters on a few new poses.
+
+A parameter has moved where its score is larger than chance allows once frame, reflectors, noise and
+what the calibration did not know are taken out [Rao 1948], the largest first; the level is shared
+among all parameters that are looked at [Bonferroni].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.judging.watching.watched import Rows, Watched
+from minimax_cal.modelling.parameters import links_of
+from minimax_cal.solvers.least_squares import solve_normal
+
+LEVEL = 0.005  # chance that anything at all is named on an arm that did not move
+ZEROS = (
+    0.8  # share of it for zero positions, which a knock or a service changes; links have the rest
+)
+APART = 1e-6  # share of a motion that frame and reflectors do not imitate, of what can be told
+CLEARER = 9.0  # by how much a link must explain more than a zero position, in squared sigmas
+LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
+MOST = 4  # parameters that are named; where more moved, the arm wants a calibration
+SAMPLES = 200  # of the calibration's own poses, as many at a time as are new
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A parameter that has moved.  by, sigma: [SI].  others: would explain it nearly as well."""
+
+    parameter: str
+    by: float
+    sigma: float
+    unit: str
+    p_value: float
+    others: tuple[str, ...] = ()
+
+    @property
+    def joint(self) -> str:
+        """Its joint, as J3."""
+        return joint_of(self.parameter)
+
+
+def joint_of(parameter: str) -> str:
+    """The joint of a link's parameter, as J3."""
+    return "J" + parameter.lstrip("abcdefghijklmnopqrstuvwxyz")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Parameters that may have moved.
+
+    column: (c,) which.  zero: (c,) True for zero positions.  level: (c,) chance that each is named
+    where nothing moved.  wider: (c,) by how much its scores spread more than the noises say, as
+    the calibration's own poses have them: what the model lacks is no noise.
+    """
+
+    column: Array
+    zero: Array
+    level: Array
+    wider: Array
+
+    @staticmethod
+    def of(watched: Watched, rows: Rows, links: Array) -> Candidates:
+        """Those that frame and reflectors cannot imitate.
+
+        links: (p,) True for link parameters that the calibration identified.
+        """
+        zeros = watched.zeros
+        others = np.setdiff1d(np.flatnonzero(links & watched.names.links), zeros)
+        kinds = [kind[rows.share(kind, watched.open) > APART] for kind in (zeros, others)]
+        zero = np.repeat([True, False], [len(kind) for kind in kinds])
+        shares = np.where(
+            zero, ZEROS / max(len(kinds[0]), 1), (1.0 - ZEROS) / max(len(kinds[1]), 1)
+        )
+        return Candidates(np.concatenate(kinds), zero, LEVEL * shares, np.ones(len(zero)))
+
+    def without(self, chosen: list[int]) -> Candidates:
+        """Fewer."""
+        kept = ~np.isin(self.column, chosen)
+        return Candidates(*(part[kept] for part in vars(self).values()))
+
+    def sizes(self, rows: Rows) -> tuple[Array, int]:
+        """How large each score is, in sigmas, by the noise that the others leave: (c,); its dof."""
+        by, sigma = rows.scores(self.column)
+        square = np.nan_to_num((by / sigma * rows.scale) ** 2)
+        dof = max(rows.dof - 1, 1)  # what is explained is no noise
+        noise = np.maximum((rows.dof * rows.mean_square - square) / dof, 1.0)
+        return np.asarray(np.sqrt(square / noise) / self.wider), dof
+
+    def widened(self, own: Rows, poses: int, rng: np.random.Generator) -> Candidates:
+        """The same with `wider` from samples of so many of the calibration's own poses.
+
+        own: of these, about the calibration itself.
+        """
+        gram, counts = own.by_pose(self.column)
+        drawn = np.zeros((SAMPLES, len(gram)))
+        for row in drawn:
+            row[rng.permutation(len(gram))[: min(poses, len(gram) // 2)]] = 1.0
+        whole, c = np.tensordot(drawn, gram, 1), len(self.column)
+        q = whole.shape[-1] - c - 1  # what is free, and what was not known
+        r = own.latent.shape[1]
+        whole[:, q - r : q, q - r : q] += np.eye(r)
+        kept, rest = whole[:, :q, :q], whole[:, :q, q:]
+        left = whole[:, q:, q:] - np.swapaxes(rest, 1, 2) @ solve_normal(kept, rest)
+        score, size = left[:, :c, c], np.einsum("dcc->dc", left)[:, :c]
+        dof = np.maximum(drawn @ counts - (q - r) - 1.0, 1.0)[:, None]
+        square = score**2 / np.where(size > 0.0, size, np.inf)
+        noise = np.maximum((left[:, c, c, None] - square) / dof, 1.0)
+        return replace(self, wider=np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
+
+    def clearest(self, rows: Rows) -> tuple[int, float, tuple[int, ...]] | None:
+        """The one that explains most, its p-value and its rivals; None where all may be chance.
+
+        A zero position goes before links that are not clearly better.
+        """
+        size, dof = self.sizes(rows)
+        p_value = np.asarray(2.0 * stats.t.sf(size, dof))
+        passed = p_value <= self.level
+        if not passed.any():
+            return None
+        zero, link = (
+            int(np.argmax(np.where(passed & kind, size, -1.0))) for kind in (self.zero, ~self.zero)
+        )
+        clearer = size[link] ** 2 > size[zero] ** 2 + CLEARER
+        pick = link if not passed[zero] or (passed[link] and clearer) else zero
+        lost = size[pick] ** 2 - size**2
+        near = [i for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick]
+        return int(self.column[pick]), float(p_value[pick]), tuple(self.column[near].tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What was looked for and what was found.
+
+    named: what moved, the clearest first.  first: the rows with nothing moved; last: with all that
+    did free.  looked: what was looked for.
+    """
+
+    named: tuple[Moved, ...]
+    first: Rows
+    last: Rows
+    looked: Candidates
+
+
+def search(watched: Watched, links: Array, own: Rows | None, seed: int) -> Search:
+    """What moved.
+
+    links: (p,) as in `Candidates.of`.  own: rows of the calibration's own poses, where they are
+    known.  seed: of samples of these.  Raises DataError for too few poses.
+    """
+    _, state = watched.start
+    rows = first = watched.rows(watched.open, state)
+    if rows.count <= int(watched.open.sum()):
+        raise DataError(
+            f"{watched.data.source}: {watched.data.poses} poses do not even tell where instrument "
+            "and reflectors are; measure more"
+        )
+    looked = Candidates.of(watched, rows, links)
+    if own is not None:
+        looked = looked.widened(own, watched.data.poses, np.random.default_rng(seed))
+    names = watched.names.all
+    chosen: list[int] = []
+    found: list[Moved] = []
+    while len(chosen) < MOST and (picked := looked.without(chosen).clearest(rows)):
+        column, p_value, others = picked
+        chosen.append(column)
+        found.append(Moved(names[column], 0.0, 0.0, "", p_value, tuple(names[i] for i in others)))
+        active = watched.open.copy()
+        active[chosen] = True
+        rows = watched.rows(active, rows.state)
+    return Search(sized(watched, rows, found), first, rows, looked)
+
+
+def critical(level: float, dof: float) -> float:
+    """Sigmas that chance exceeds, either way, with the probability given [Student]."""
+    return float(stats.t.isf(0.5 * level, dof))
+
+
+def sized(watched: Watched, rows: Rows, found: list[Moved]) -> tuple[Moved, ...]:
+    """The same with how far each moved, all of them together, and how sure that is."""
+    names, state = watched.names, rows.state.step(rows.step)
+    change = links_of(state.mdh - watched.cell.robot.mdh)
+    sigma = np.linalg.norm(rows.factor(np.zeros_like(watched.root)), axis=1)
+    out = []
+    for each in found:
+        i = names.index(each.parameter)
+        unit = "m" if names.linear[i] else "rad"
+        out.append(replace(each, by=float(change[i]), sigma=float(sigma[i]), unit=unit))
+    return tuple(out)

@@ -1,0 +1,127 @@
+"""New measurements beside a calibration: what is open, and what the calibration's own poses say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.judging.watching.watched import Rows, Watched
+from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import labels
+from minimax_cal.modelling.effects.table import Fitted
+
+# effects of the session in which the calibration was measured; they end with it
+PAST = frozenset({"frame_drift", "session_jump", "target_shift"})
+LEAST_FOOT = 3  # reflectors on the foot tell where it stands
+LEAST_OWN = 12  # poses of the calibration, half of which tell how scores spread
+LEAST_NOISE = 1e-9  # of a coordinate: data that were computed, not measured [m]
+
+
+def watched_of(
+    fit: Fit, data: Measurements, known: Sequence[str]
+) -> tuple[Watched, tuple[str, ...]]:
+    """The new measurements beside the calibration; what was left out.  Raises CalibrationError."""
+    known_by = fit.known
+    check_joints(fit.robot, data)
+    if len(np.unique(labels(data))) > 1:
+        raise DataError(f"{data.source}: holds several sessions; check them one by one")
+    cell, frame, tool = fit.cell, "frame" in known, "targets" in known
+    data = (with_history(data) if cell.effects.terms else data).keep(
+        np.asarray(data.seen.any(axis=0))
+    )
+    if not data.poses:
+        raise DataError(f"{data.source}: no target was measured")
+    strange = [name for name in data.target_names if name not in cell.target_names]
+    if tool and strange:
+        raise DataError(
+            f"{data.source}: target {strange[0]} is not one of the calibration's; leave targets "
+            "out of known"
+        )
+    foot, foot_now = feet(fit, data)
+    place = dict(zip(cell.target_names, cell.target_positions, strict=True))
+    kept = [
+        (term, value)
+        for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
+        if term.effect not in PAST
+        and (term.place not in cell.target_names or term.place in data.target_names)
+    ]
+    terms, values = tuple(term for term, _ in kept), tuple(value for _, value in kept)
+    gone = [term.label for term in cell.effects.terms if term not in terms]
+    said = (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
+    ratio = usual_u95(data) / usual_u95(fit.data)
+    variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
+    watched = Watched(
+        cell=replace(
+            cell,
+            target_names=data.target_names,
+            target_positions=np.array([place.get(t, np.zeros(3)) for t in data.target_names]),
+            effects=Fitted(terms, values),
+            sessions=cell.sessions if frame else replace(cell.sessions, frames={}),
+        ),
+        data=cell.placed(data) if frame else data,
+        known=known_by.root,
+        names_old=known_by.names,
+        variance=max(variance, LEAST_NOISE**2),
+        jitter=known_by.noise.jitter,
+        frame=frame,
+        tool=tool,
+        foot=foot,
+        foot_now=foot_now,
+    )
+    return watched, said if gone else ()
+
+
+def feet(fit: Fit, data: Measurements) -> tuple[Array, Array]:
+    """Reflectors on the foot that both saw: (f, 3) in the base as calibrated, and as seen now [m].
+
+    None where they are too few to tell where the foot stands.
+    """
+    now, then = foot_of(data), foot_of(fit.data)
+    both = [name for name in now if name in then]
+    if len(both) < LEAST_FOOT:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    base = np.linalg.inv(fit.cell.base)
+    old = np.array([base[:3, :3] @ then[name] + base[:3, 3] for name in both])
+    return old, np.array([now[name] for name in both])
+
+
+def usual_u95(data: Measurements) -> float:
+    """The typical u95 of the points; NaN where the data do not tell it."""
+    column = data.columns.get("u95", np.zeros(0))
+    return float(np.nanmedian(column)) if np.isfinite(column).any() else math.nan
+
+
+def foot_of(data: Measurements) -> dict[str, Array]:
+    """Where each reflector on the foot stood on the mean: (3,) by name [m]."""
+    stems = [name[:-2] for name in data.columns if name.startswith("base") and name.endswith("_x")]
+    out = {}
+    for stem in stems:
+        names = [f"{stem}_{axis}" for axis in "xyz"]
+        three = [data.columns[name] for name in names if name in data.columns]
+        if len(three) == 3 and all(np.isfinite(column).any() for column in three):
+            out[stem] = np.array([np.nanmean(column) for column in three])
+    return out
+
+
+def own_rows(fit: Fit, watched: Watched) -> Rows | None:
+    """The calibration's own poses, with the same open; None where its file has none."""
+    if fit.data.poses < LEAST_OWN:
+        return None
+    everything = np.zeros(fit.known.names.count, dtype=bool)
+    own = replace(watched, cell=fit.cell, data=fit.data, foot=watched.foot[:0])
+    rows = own.rows(everything, fit.cell.state)
+    return replace(rows, active=own.open)
+
+
+def in_names(fit: Fit, watched: Watched, flags: Array) -> Array:
+    """(p,) flags by the names of the calibration as flags by those of now."""
+    old = dict(zip(fit.known.names.all, flags, strict=True))
+    return np.array([bool(old.get(name, False)) for name in watched.names.all])

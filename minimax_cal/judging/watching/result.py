@@ -1,0 +1,200 @@
+"""What a few new poses say of a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.tolerance import KINDS, Limit
+from minimax_cal.judging.watching.moved import Moved
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.solvers.status import Status
+
+VALID, NOT_VALID, NOT_DECIDED = "valid", "not valid", "not decided"
+WORDS = {True: VALID, False: NOT_VALID, None: NOT_DECIDED}
+SHIFT = 2e-4  # of a zero position, whose discovery is asked of the poses [rad]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One requirement.  valid: None where it is not decided; confidence: of that; why: a clause."""
+
+    limit: Limit
+    value_mm: float
+    low_mm: float
+    high_mm: float
+    valid: bool | None
+    confidence: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A zero position whose shift these data cannot tell.  like: what moves everything alike."""
+
+    parameter: str
+    like: str
+    needs: str
+
+
+@dataclass(frozen=True, eq=False)
+class Health:
+    """What a few new poses say of a calibration.
+
+    verdicts: of each requirement.  moved: parameters that have.  hidden: those that nobody could
+    tell.  accuracy: of the calibrated arm, with what is open placed anew, as if nothing had moved;
+    refitted: with what moved corrected.  findable: smallest shift of each zero position that these
+    poses find in 95 of 100 cases [rad, m].  enough: how many of these poses would have been
+    enough to find SHIFT in every joint; asked: about how many would be, where these are not.
+    noise: by how much what is left is noisier than the calibration was.  fit: refitted.
+    """
+
+    robot: str
+    verdicts: tuple[Verdict, ...]
+    moved: tuple[Moved, ...]
+    hidden: tuple[Hidden, ...]
+    accuracy: Accuracy
+    refitted: Accuracy
+    findable: Mapping[str, float]
+    sliding: frozenset[str]
+    enough: int | None
+    asked: int | None
+    noise: float
+    poses: int
+    fit: Fit
+    notices: tuple[str, ...] = field(default=())
+
+    @property
+    def valid(self) -> bool | None:
+        """Whether the calibration keeps all that is required; None where it is not decided."""
+        found = [verdict.valid for verdict in self.verdicts]
+        return False if False in found else None if None in found else True
+
+    @property
+    def word(self) -> str:
+        """The verdict in words."""
+        return WORDS[self.valid]
+
+    @property
+    def confidence(self) -> float:
+        """In the verdict."""
+        every = [v.confidence for v in self.verdicts if v.valid == self.valid]
+        return max(every) if self.valid is False else min(every)
+
+    @property
+    def status(self) -> Status:
+        """Of the refit."""
+        return self.fit.status
+
+    def headline(self) -> str:
+        """The result in a few sentences."""
+        said = [f"The calibration of {self.robot} is {self.word}", *(v.why for v in self.verdicts)]
+        text = f"{said[0]} ({'; '.join(said[1:])}; confidence {100 * self.confidence:.1f} %). "
+        if self.moved:
+            joints = ", ".join(dict.fromkeys(m.joint for m in self.moved))
+            text += (
+                f"Moved: {joints}.  With that corrected RMS {self.accuracy.rms_mm:.3f} -> "
+                f"{self.refitted.rms_mm:.3f} mm on these {self.poses} poses."
+            )
+        else:
+            text += "No joint is found to have moved."
+        return text
+
+    def tables(self) -> tuple[Table, ...]:
+        """What was required, what moved, what could have been found."""
+        required = Table(
+            f"required of {self.robot}, on {self.poses} poses",
+            ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
+            tuple(
+                (KINDS[v.limit.kind], v.limit.size_mm, v.value_mm, v.low_mm, v.high_mm,
+                 WORDS[v.valid], 100 * v.confidence)
+                for v in self.verdicts
+            ),
+            ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
+        )  # fmt: skip
+        moved = Table(
+            "moved since the calibration",
+            ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
+            tuple(
+                (m.parameter, m.joint, "mm" if m.unit == "m" else "mrad", 1e3 * m.by,
+                 1e3 * m.sigma, m.p_value, ", ".join(m.others))
+                for m in self.moved
+            ),
+            ("", "", "", "+.4f", ".2g", ".2g", ""),
+        )  # fmt: skip
+        found = Table(
+            "smallest shift that these poses find in 95 of 100 cases",
+            ("zero position", "unit", "shift"),
+            tuple(
+                (name, "mm" if name in self.sliding else "mrad", 1e3 * size)
+                for name, size in self.findable.items()
+            ),
+            ("", "", ".3f"),
+        )
+        hidden = Table(
+            "not told by these data",
+            ("zero position", "moves all like", "told by"),
+            tuple((h.parameter, h.like, h.needs) for h in self.hidden),
+        )
+        return tuple(table for table in (required, moved, found, hidden) if table.rows)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more: lengths in mm, angles in rad."""
+
+        def scaled(name: str, size: float) -> dict[str, Any]:
+            slides = name in self.sliding
+            unit = "mm" if slides else "rad"
+            return {"parameter": name, "size": 1e3 * size if slides else size, "unit": unit}
+
+        def moved(m: Moved) -> dict[str, Any]:
+            scale, unit = (1e3, "mm") if m.unit == "m" else (1.0, m.unit)
+            return {
+                "parameter": m.parameter, "joint": m.joint, "by": scale * m.by,
+                "sigma": scale * m.sigma, "unit": unit, "p_value": m.p_value,
+                "alternatives": list(m.others),
+            }  # fmt: skip
+
+        return dict(
+            plain(
+                {
+                    "schema": 1,
+                    "kind": "check",
+                    "valid": self.valid,
+                    "confidence": self.confidence,
+                    "moved": [moved(m) for m in self.moved],
+                    "required": [
+                        {"kind": v.limit.kind, "limit_mm": v.limit.size_mm, "seen_mm": v.value_mm,
+                         "ci95_mm": [v.low_mm, v.high_mm], "valid": v.valid,
+                         "confidence": v.confidence, "why": v.why}
+                        for v in self.verdicts
+                    ],
+                    "not_separable": [vars(h) for h in self.hidden],
+                    "accuracy": self.accuracy.to_dict(),
+                    "accuracy_refitted": self.refitted.to_dict(),
+                    "smallest_found": [scaled(n, s) for n, s in self.findable.items()],
+                    "poses": {"given": self.poses, "enough": self.enough, "needed": self.asked,
+                              "to_find_rad": SHIFT},
+                    "noise_ratio": self.noise,
+                    "notices": list(self.notices),
+                }
+            )
+        )  # fmt: skip
+
+    def fit_dict(self) -> dict[str, Any]:
+        """The refitted calibration as its file, with this answer."""
+        told = self.to_dict()
+        first = {key: told[key] for key in ("valid", "confidence", "moved")}
+        return {**self.fit.to_dict(), **first, "check": told}
+
+    def save(self, path: Path | str) -> None:
+        """Write the refitted calibration, with this answer; never a half-written file."""
+        write_whole(path, json_text(self.fit_dict()))

@@ -1,0 +1,259 @@
+"""New measurements of a calibrated arm as rows of a linear problem, in units of their noise.
+
+The new errors e of a calibrated arm are J_n x + J_k u + noise.  x is open: where the instrument
+stands now, where the reflectors sit, and what has moved.  u is what the calibration did not know,
+with its covariance; the noise is that of its instrument and joints [evidence.noise].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.evidence.noise import orthonormal
+from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.table import names_of
+from minimax_cal.modelling.joint_fit import extended
+from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.solvers import least_squares
+
+PLACINGS = 3  # passes that place an arm with effects
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """New measurements of a calibrated arm, and what of it is open.
+
+    cell: as calibrated, with the targets of the data.  known: (p_old, r) root of the calibration's
+    covariance, p_old its parameters by `names_old`.  variance, jitter: of its noise [m^2, rad].
+    frame, tool: whether the instrument stands, and the reflectors sit, where they did.
+    foot: (f, 3) reflectors of the foot in the base as calibrated, and foot_now: as seen now [m].
+    """
+
+    cell: Cell
+    data: Measurements
+    known: Array
+    names_old: Names
+    variance: float
+    jitter: float
+    frame: bool
+    tool: bool
+    foot: Array
+    foot_now: Array
+
+    @cached_property
+    def names(self) -> Names:
+        """Of all parameters now."""
+        robot, targets = self.cell.robot, self.cell.target_names
+        scene = self.cell.scene(still(np.zeros((1, robot.joints)), targets, robot))
+        return Names(robot.joints, targets, names_of(self.cell.effects.terms, scene)[0])
+
+    @cached_property
+    def open(self) -> Array:
+        """(p,) True for base and targets that are not known from the calibration."""
+        names, n = self.names, self.cell.robot.joints
+        place = np.arange(names.count)
+        base = (place >= 5 * n) & (place < 5 * n + 6)
+        spots = (place >= 5 * n + 6) & (place < names.geometric)
+        return np.asarray((base & (not self.frame)) | (spots & (not self.tool)))
+
+    @cached_property
+    def root(self) -> Array:
+        """(p, r) of what is kept: rows of what is open are zero."""
+        old = {name: row for row, name in enumerate(self.names_old.all)}
+        rows = np.array([old.get(name, -1) for name in self.names.all])
+        kept = np.where((rows >= 0)[:, None], self.known[rows], 0.0)
+        return np.where(self.open[:, None], 0.0, kept)
+
+    @property
+    def zeros(self) -> Array:
+        """(n,) the parameters that say where each joint's zero is."""
+        n = self.cell.robot.joints
+        return np.arange(n) + np.where(self.cell.robot.prismatic, n, 2 * n)
+
+    @cached_property
+    def start(self) -> tuple[Model, State]:
+        """The arm as calibrated, where it fits the data best."""
+        state = self.cell.state
+        if not self.frame:
+            found = fit_base(model_of(self.cell.robot, self.data), self.cell.robot.mdh).state
+            state = replace(state, rotation=found.rotation, origin=found.origin)
+            if not self.tool:
+                state = replace(state, target_positions=found.target_positions)
+        return self.fitted(self.open, state)
+
+    def fitted(self, active: Array, state: State) -> tuple[Model, State]:
+        """Least squares over some parameters from a state that is near, and the model there."""
+        terms, robot = self.cell.effects.terms, self.cell.robot
+        plain = model_of(robot, self.data)
+        for _ in range(PLACINGS if terms else 1):
+            model = plain
+            if terms:
+                model, state = extended(plain, robot, self.data, state, terms)
+            model = model.only(active)
+            points = float(model.counts.sum())
+            if active.any():
+                found = least_squares.solve(
+                    SumOfSquares(model), state.batch(), 1, points,
+                    least_squares.METHODS["snllm"], least_squares.NEAR, trace=False,
+                )  # fmt: skip
+                state = found.x.take(np.array(0))
+        return model, state
+
+    def rows(self, active: Array, state: State) -> Rows:
+        """The errors linear about the best fit with some parameters free."""
+        model, state = self.fitted(active, state)
+        every = model.only(np.ones(model.names.count, dtype=bool))
+        poses = Poses.of(Estimator(every, np.ones(len(model.y))), state)
+        m, r, p = poses.jacobian.shape
+        wide = self.jitter**2 * poses.arm @ np.swapaxes(poses.arm, 1, 2)
+        half = np.linalg.cholesky(wide + self.variance * np.eye(r))
+        whole = np.concatenate([poses.error[..., None], poses.jacobian], axis=2)
+        white = np.linalg.solve(half, whole).reshape(m * r, p + 1)
+        jacobian = white[:, 1:]
+        error, latent = white[:, 0], -jacobian @ self.root
+        row = np.repeat(np.arange(m), r)
+        if len(self.foot) and not self.frame:
+            more, columns = self.of_foot(state)
+            n = self.cell.robot.joints
+            past = self.known[5 * n : 5 * n + 6]
+            error = np.concatenate([error, more])
+            latent = np.concatenate([latent, columns[:, 5 * n : 5 * n + 6] @ past])
+            jacobian = np.concatenate([jacobian, columns])
+            row = np.concatenate([row, np.full(len(more), -1)])
+        count = 3 * int(model.counts.sum()) + 3 * len(self.foot)
+        return Rows(error, jacobian, latent, active, state, count, row)
+
+    def of_foot(self, state: State) -> tuple[Array, Array]:
+        """What the reflectors on the foot say of the base, in units of their noise: errors, slope.
+
+        Each was seen once by then and once by now.
+        """
+        n, f = self.cell.robot.joints, len(self.foot)
+        error = (self.foot_now - state.origin) @ state.rotation - self.foot
+        slope = np.zeros((f, 3, self.names.count))
+        slope[..., 5 * n : 5 * n + 3] = np.eye(3)
+        turned = np.cross(np.eye(3)[None], self.foot[:, None])  # (f, turn, 3)
+        slope[..., 5 * n + 3 : 5 * n + 6] = np.swapaxes(turned, 1, 2)
+        size = np.sqrt(2.0 * self.variance)
+        return error.reshape(-1) / size, slope.reshape(3 * f, -1) / size
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """New errors in units of their noise, linear in all parameters.
+
+    error: (N,).  jacobian: (N, p).  latent: (N, r) by what the calibration did not know, each of
+    variance 1.  active: (p,) what is free.  state: about which.  count: coordinates that were
+    measured.  pose: (N,) number of each row's pose, -1 for the foot.
+    """
+
+    error: Array
+    jacobian: Array
+    latent: Array
+    active: Array
+    state: State
+    count: int
+    pose: Array
+
+    @cached_property
+    def whole(self) -> Array:
+        """(N + r, free + r) columns of what is free and of what was not known, with its prior."""
+        r = self.latent.shape[1]
+        free = self.jacobian[:, self.active]
+        return np.block([[free, self.latent], [np.zeros((r, free.shape[1])), np.eye(r)]])
+
+    @cached_property
+    def basis(self) -> Array:
+        """(N + r, q) orthonormal span of `whole`."""
+        return orthonormal(self.whole)
+
+    @cached_property
+    def left(self) -> Array:
+        """(N + r,) what they leave of the error."""
+        error = np.pad(self.error, (0, self.latent.shape[1]))
+        return np.asarray(error - self.basis @ (self.basis.T @ error))
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of what is left."""
+        return max(self.count - int(self.basis.shape[1] - self.latent.shape[1]), 1)
+
+    @property
+    def mean_square(self) -> float:
+        """Of what is left, in units of the noise."""
+        return float(self.left @ self.left) / self.dof
+
+    @property
+    def scale(self) -> float:
+        """By how much the noise is larger than it was, at least 1."""
+        return float(np.sqrt(max(self.mean_square, 1.0)))
+
+    def apart(self, columns: Array, basis: Array) -> Array:
+        """(N + r, c) what of some parameters' motion a basis does not hold."""
+        motion = np.pad(self.jacobian[:, columns], ((0, self.latent.shape[1]), (0, 0)))
+        rest = motion - basis @ (basis.T @ motion)
+        return np.asarray(rest - basis @ (basis.T @ rest))  # twice is enough
+
+    def by_pose(self, columns: Array) -> tuple[Array, Array]:
+        """Products of each pose's rows: (m, q, q), and its coordinates: (m,).
+
+        q: what is free, what was not known, some more parameters, and the error last.
+        """
+        free, more = self.jacobian[:, self.active], self.jacobian[:, columns]
+        every = np.concatenate([free, self.latent, more, self.error[:, None]], axis=1)
+        poses = np.unique(self.pose[self.pose >= 0])
+        parts = [every[self.pose == pose] for pose in poses]
+        seen = [int(np.count_nonzero(part.any(axis=1))) for part in parts]
+        return np.array([part.T @ part for part in parts]), np.array(seen, dtype=float)
+
+    def share(self, columns: Array, held: Array) -> Array:
+        """(c,) share of each motion that other parameters, (p,) True in held, do not imitate."""
+        size = (self.jacobian[:, columns] ** 2).sum(axis=0)
+        rest = size
+        if held.any():
+            basis = orthonormal(self.jacobian[:, held])
+            off = self.jacobian[:, columns] - basis @ (basis.T @ self.jacobian[:, columns])
+            rest = (off**2).sum(axis=0)
+        return np.asarray(rest / np.where(size > 0.0, size, np.inf))
+
+    def scores(self, columns: Array) -> tuple[Array, Array]:
+        """Each parameter's change if it alone moved besides, and its sigma: (c,) each [SI]."""
+        rest = self.apart(columns, self.basis)
+        size = (rest**2).sum(axis=0)
+        size = np.where(size > 0.0, size, np.nan)
+        return rest.T @ self.left / size, self.scale / np.sqrt(size)
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(free + r, N + r) from errors, and zeros for what was not known, to parameters."""
+        norm = np.linalg.norm(self.whole, axis=0)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        return np.asarray(np.linalg.pinv(self.whole / norm, rcond=1e-10) / norm[:, None])
+
+    @cached_property
+    def step(self) -> Array:
+        """(p,) from the state to where what is free explains the errors best, the rest kept."""
+        out = np.zeros(len(self.active))
+        found = self.inverse @ np.pad(self.error, (0, self.latent.shape[1]))
+        out[self.active] = found[: int(self.active.sum())]
+        return out
+
+    def factor(self, root: Array) -> Array:
+        """F (p, r + N) with FF' the covariance of all parameters after `step`.
+
+        root: (p, r) of what is kept, before.
+        """
+        count, r = int(self.active.sum()), self.latent.shape[1]
+        noise, unknown = np.split(self.inverse[:count], [len(self.error)], axis=1)
+        out = np.concatenate([root, np.zeros((len(root), len(self.error)))], axis=1)
+        out[self.active, :r] -= unknown
+        out[self.active, r:] = self.scale * noise
+        return out

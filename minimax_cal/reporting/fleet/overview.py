@@ -1,0 +1,129 @@
+"""A fleet of cells, calibrated or checked in one go, and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.fitting.options import silent
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import check_writable, json_text, write_whole
+from minimax_cal.ground.optional import optional
+from minimax_cal.ground.tables import Table
+from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
+from minimax_cal.judging.watching.result import NOT_VALID, VALID
+from minimax_cal.reporting.fleet.cells import MOST, read_cells
+from minimax_cal.reporting.fleet.work import FAILED, NEEDED, Row, arriving, checked_folder
+from minimax_cal.reporting.html.page import part, policy
+
+GOOD, BAD = (PASSED, VALID), (NOT_PASSED, NOT_VALID, FAILED)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What became of all cells, in the order of the file."""
+
+    rows: tuple[Row, ...]
+    source: str
+
+    @property
+    def failed(self) -> tuple[Row, ...]:
+        """Cells without a result."""
+        return tuple(row for row in self.rows if row.failed)
+
+    def headline(self) -> str:
+        """All cells in a sentence."""
+        kept = sum(row.verdict in GOOD for row in self.rows)
+        asked = sum(bool(row.verdict) for row in self.rows)
+        changed = [row.cell for row in self.rows if row.changed]
+        text = f"{len(self.rows)} cells: {kept} of {asked} keep what is required"
+        text += f", {len(changed)} changed ({', '.join(changed)})" if changed else ""
+        return text + f"; {len(self.failed)} failed."
+
+    def table(self) -> Table:
+        """A row a cell."""
+        header = ("cell", "robot", "work", "verdict", "before RMS mm", "RMS mm", "max mm",
+                  "changed", "why")  # fmt: skip
+        rows = tuple(
+            (row.cell, row.robot, row.work, FAILED if row.failed else row.verdict, row.before_mm,
+             row.rms_mm, row.max_mm, ", ".join(row.changed), row.why)
+            for row in self.rows
+        )  # fmt: skip
+        formats = ("", "", "", "", ".3f", ".3f", ".3f", "", "")
+        return Table(f"cells of {self.source}", header, rows, formats)
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return f"{self.headline()}\n\n{self.table().text(width)}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        rows = [row.to_dict() for row in self.rows]
+        counts = {"cells": len(rows), "failed": len(self.failed)}
+        return {"schema": 1, "kind": "fleet", "source": self.source, **counts, "rows": rows}
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def html(self) -> str:
+        """One page that needs nothing else.  Raises OptionError without jinja2."""
+        jinja = optional("jinja2", "an overview page", NEEDED)
+        from markupsafe import Markup
+
+        pages = jinja.Environment(
+            autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True
+        )
+        text = (resources.files("minimax_cal.reporting.fleet") / "fleet.html.jinja").read_text()
+        table = self.table()
+        whole: str = pages.from_string(text).render(
+            fleet=self,
+            policy=policy().replace("script-src ", "script-src 'none'"),
+            style=Markup(part("page.css")),
+            header=table.header[:-1],
+            rows=list(zip(self.rows, table.cells(), strict=True)),
+            good=GOOD,
+            bad=BAD,
+        )
+        return whole
+
+
+def fleet(
+    path: Path | str,
+    *,
+    out: Path | str | None = None,
+    page: Path | str | None = None,
+    processes: int = -1,
+    cluster: str = "",
+    progress: Callable[[str], None] = silent,
+) -> Fleet:
+    """Calibrate, or check, a folder of cells in one go; a cell that fails is one row.
+
+    path: a TOML file with ``[[cells]]``, each with name, robot and data, or fit and check, and what
+    ``[defaults]`` gives all; files are named from its folder.  out: folder for each cell's
+    calibration.  page: of the overview, HTML.  processes: on this machine, -1 for one a core.
+    cluster: address of a Dask scheduler instead.  progress: told of each cell.  Raises
+    CalibrationError for what is wrong with the file itself.
+
+    >>> print(mc.fleet("cells.toml", page="fleet.html").summary())
+    """
+    if processes == 0 or not -1 <= processes <= MOST:
+        raise OptionError(f"processes {processes:.6g}: give their number, or -1 for one a core")
+    if page is not None:
+        check_writable(page, (".html", ".htm"))
+        optional("jinja2", "an overview page", NEEDED)
+    folder = Path(out).resolve() if out is not None else None
+    jobs = read_cells(path, folder)
+    checked_folder(folder)
+    rows: dict[str, Row] = {}
+    progress(f"cells: 1 of {len(jobs)}")
+    for row in arriving(jobs, processes, cluster):
+        rows[row.cell] = row
+        progress(f"cells: {min(len(rows) + 1, len(jobs))} of {len(jobs)}")
+    found = Fleet(tuple(rows[job.told.name] for job in jobs), Path(path).name)
+    if page is not None:
+        write_whole(page, found.html())
+    return found

@@ -1,0 +1,163 @@
+"""One cell done, whatever becomes of it, and all of them: here, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.optional import optional
+from minimax_cal.judging.tolerance import judge, limits_of, overall, within
+from minimax_cal.judging.watching.comparison import compare
+from minimax_cal.judging.watching.health import check
+from minimax_cal.reporting.fleet.cells import Job
+from minimax_cal.solvers.status import Status
+
+FAILED = "failed"
+NEEDED = "minimax-cal[fleet]"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of a cell.
+
+    work: calibrated or checked.  status: of the numbers, or failed.  verdict: of the tolerance, ""
+    where none is required.  before, rms, largest: on poses that no fit had seen [mm], NaN where
+    unknown.  changed: joints that moved, against the calibration given.  why: in a sentence.
+    """
+
+    cell: str
+    robot: str
+    work: str
+    status: str
+    verdict: str
+    before_mm: float
+    rms_mm: float
+    max_mm: float
+    changed: tuple[str, ...]
+    file: str
+    why: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no result."""
+        return self.status == FAILED
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return dict(plain(asdict(self)))
+
+
+def done(job: Job) -> Row:
+    """One cell; what goes wrong with it is its row."""
+    work = "checked" if job.told.check else "calibrated"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CalibrationWarning)  # the result's notices say the same
+            return checked(job) if job.told.check else calibrated(job)
+    except (CalibrationError, np.linalg.LinAlgError, MemoryError) as error:
+        why = " ".join(str(error).split()) or "not enough memory"
+        nan = math.nan
+        return Row(job.told.name, "", work, FAILED, "", nan, nan, nan, (), "", why)
+
+
+def calibrated(job: Job) -> Row:
+    """Calibrate, judge, and compare with an earlier calibration where there is one."""
+    told = job.told
+    fit = calibrate(
+        job.path(told.robot), job.path(told.data), told.objective, holdout=told.holdout,
+        seed=told.seed, effects=told.effects, fix=told.fix,
+    )  # fmt: skip
+    if fit.status is Status.FAILED:
+        raise CalibrationError(f"the fit failed: {fit.status.advice}")
+    found = fit.within
+    claim = within(found.where, found.before, found.after, (found.rms, found.largest), found.poses)
+    judged = tuple(judge(limit, claim) for limit in limits_of(told.tolerance))
+    changed: tuple[str, ...] = ()
+    said = [one.sentence() for one in judged]
+    if told.fit:
+        other = compare(load_fit(job.path(told.fit)), fit)
+        changed = other.joints
+        said.append(other.headline())
+    return Row(
+        told.name, fit.robot.name, "calibrated", str(fit.status),
+        overall(judged) if judged else "", found.before.rms_mm, found.after.rms_mm,
+        found.after.max_mm, changed, saved(job, fit), " ".join(said),
+    )  # fmt: skip
+
+
+def checked(job: Job) -> Row:
+    """Check an earlier calibration."""
+    told = job.told
+    found = check(job.path(told.fit), job.path(told.check), told.tolerance, seed=told.seed)
+    return Row(
+        told.name, found.robot, "checked", str(found.status), found.word, math.nan,
+        found.accuracy.rms_mm, found.accuracy.max_mm,
+        tuple(dict.fromkeys(m.joint for m in found.moved)), saved(job, found.fit),
+        found.headline(),
+    )  # fmt: skip
+
+
+def saved(job: Job, fit: Fit) -> str:
+    """The calibration's file in the folder of results, if there is one."""
+    if job.out is None:
+        return ""
+    path = job.out / f"{job.told.name}.json"
+    fit.save(path)
+    return path.name
+
+
+# ---- where cells are done ----------------------------------------------------------------------
+
+
+def arriving(jobs: Sequence[Job], processes: int, cluster: str) -> Iterator[Row]:
+    """The rows of all jobs as they are done.
+
+    processes: on this machine, -1 for one a core; one needs no other package.  cluster: address of
+    a Dask scheduler whose workers see the same folders.  Raises OptionError.
+    """
+    if cluster:
+        yield from on_cluster(jobs, cluster)
+    elif processes == 1 or len(jobs) == 1:
+        yield from map(done, jobs)
+    else:
+        joblib = optional("joblib", "several cells at a time", NEEDED)
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            parallel = joblib.Parallel(
+                n_jobs=min(processes, len(jobs)), return_as="generator_unordered"
+            )
+            yield from parallel(joblib.delayed(done)(job) for job in jobs)
+
+
+def on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Row]:
+    """On the workers of a Dask cluster.  Raises CalibrationError where nobody answers."""
+    distributed = optional("distributed", "a cluster", "minimax-cal[distributed]")
+    try:
+        client = distributed.Client(cluster, timeout="5s", set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise CalibrationError(
+            f"no Dask scheduler at {cluster!r}; start one with python -m dask scheduler and give "
+            "its address as tcp://host:port"
+        ) from error
+    with client:
+        for future in distributed.as_completed(client.map(done, jobs, pure=False)):
+            yield future.result()
+
+
+def checked_folder(path: Path | None) -> Path | None:
+    """The folder of results, made where it is not there.  Raises CalibrationError."""
+    if path is not None:
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be made ({error.strerror})") from error
+    return path

@@ -1,0 +1,303 @@
+"""What the page shows of a session: how each step stands, and what the commands wrote."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from numpy import nan_to_num
+
+from minimax_cal.diagnosing.result import load_diagnosis
+from minimax_cal.fitting.fit import load_fit
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import visible
+from minimax_cal.reporting.html.more_charts import waterfall
+from minimax_cal.reporting.html.page import figure_data, needed, part
+from minimax_cal.robots.robot import builtin_robots, load_robot
+from minimax_cal.serving.cell import Point, points_of
+from minimax_cal.serving.sessions import GIVEN, SCRIPT, Choices, Session, mark
+from minimax_cal.serving.steps import (
+    CORRECTED,
+    DIAGNOSIS,
+    FIT,
+    MJCF,
+    NEXT,
+    POSES,
+    REPORT,
+    STEPS,
+    UNDERSTOOD,
+    URDF,
+    USED,
+    Command,
+)
+from minimax_cal.serving.work import Job, Record, record_of
+
+MOST_POINTS = 300  # rows of the table; the worst come first
+MOST_ROWS = 60
+KEPT = 16  # results in memory
+WHAT = {
+    SCRIPT: "all that was done here, as command lines",
+    POSES: "the measurements, as they were understood",
+    USED: "the measurements without the points that were left out",
+    UNDERSTOOD: "what was understood of the files",
+    FIT: "the calibration",
+    DIAGNOSIS: "the diagnosis",
+    REPORT: "the report to sign",
+    NEXT: "the poses to measure next",
+    URDF: "the calibrated robot",
+    MJCF: "the calibrated robot for MuJoCo",
+    CORRECTED: "the joint targets, corrected",
+}
+Panel = dict[str, Any]
+Tile = tuple[str, str, str]  # name, before, after
+
+
+def state_of(at: Session, job: Job | None) -> dict[str, Any]:
+    """All that the page shows, in JSON."""
+    chosen = at.choices
+    return {
+        "name": at.name,
+        "choices": chosen.model_dump(mode="json"),
+        "robots": robots(at),
+        "steps": {name: how(at, chosen, name, job) for name in STEPS},
+        "panels": panels(at, chosen, job),
+        "views": views(at),
+    }
+
+
+def robots(at: Session) -> list[tuple[str, str]]:
+    """Value and label of every robot to choose: those built in, and files that were dropped."""
+    known = at.choices.files() - {at.choices.robot}
+    dropped = [(name, name) for name in at.given() if name not in known]
+    return [*dropped, *builtins()]
+
+
+@lru_cache(maxsize=1)
+def builtins() -> tuple[tuple[str, str], ...]:
+    """Value and label of the built-in robots."""
+    return tuple((name, load_robot(name).name) for name in builtin_robots())
+
+
+def how(at: Session, chosen: Choices, name: str, job: Job | None) -> dict[str, Any]:
+    """How a step stands: waiting, ready, working, done, old or failed; and its command lines."""
+    record = record_of(at, name)
+    commands: tuple[Command, ...] = ()
+    waits = ""
+    try:
+        commands = STEPS[name].commands(at, chosen)
+    except CalibrationError as error:
+        waits = str(error)
+    lines = [command.line() for command in commands]
+    out = {"lines": lines, "waits": waits, "error": "", "notices": [], "state": "ready"}
+    if job and job.step == name:
+        return out | {"state": "working"}
+    if record is None:
+        return out | {"state": "waiting" if waits else "ready"}
+    kept = {"error": record.error, "notices": list(record.notices), "seconds": record.seconds}
+    if record.code:
+        return out | kept | {"state": "failed"}
+    return out | kept | {"state": "old" if is_old(at, record, lines) else "done"}
+
+
+def is_old(at: Session, record: Record, lines: list[str]) -> bool:
+    """Whether a step would do something else now: other words, or other files."""
+    changed = (at.digest(path) != digest for path, digest in record.inputs.items())
+    return list(record.commands) != lines or any(changed)
+
+
+# ---- parts of the page -------------------------------------------------------------------------
+
+
+def panels(at: Session, chosen: Choices, job: Job | None) -> dict[str, str]:
+    """HTML by the name of its place."""
+    out = {}
+    for name, made in PANELS.items():
+        try:
+            content = made(at, chosen, job)
+        except CalibrationError as error:
+            out[name] = written("problem", {"text": str(error)})
+        else:
+            out[name] = written(name, content) if content is not None else ""
+    return out
+
+
+def written(name: str, content: Panel) -> str:
+    """A part of the page, by the macro of its name."""
+    return str(getattr(macros(), name)(**content))
+
+
+@lru_cache(maxsize=1)
+def macros() -> Any:
+    """The macros that write the parts."""
+    from markupsafe import Markup
+
+    jinja, _ = needed()
+    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
+    pages.globals["grid"] = lambda table: Markup(table.html())
+    return pages.from_string(part("panels.html.jinja", "minimax_cal.serving")).module
+
+
+def files_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
+    """The measured files, each with its part."""
+    sizes = [(name, (at.folder / GIVEN / name).stat().st_size) for name in chosen.measured]
+    return {"files": sizes, "joints": chosen.joints}
+
+
+def understood_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """What the importer said."""
+    path = at.folder / UNDERSTOOD
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_bytes())
+        headline = (
+            f"{content['poses']} poses, {content['joints']} joints, "
+            f"targets {', '.join(map(str, content['targets']))}"
+        )
+        tables = [understood(each) for each in content["files"]]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CalibrationError(f"{path}: is not the JSON of an import") from error
+    return {"headline": visible(headline), "tables": tables, "notices": content["notices"]}
+
+
+def understood(file: dict[str, Any]) -> tuple[str, Table]:
+    """A file in a line, and its columns."""
+    line = f"{file['file']}: {file['format']}, {file['rows']} rows, {file['delimiter']}, "
+    line += f"decimal {file['decimal']}, {file['encoding']}"
+    columns = file["columns"]
+    header = tuple(columns[0]) if columns else ("column",)
+    rows = tuple(tuple(visible(str(v)) for v in column.values()) for column in columns)
+    return visible(line), Table(str(file["file"]), header, rows)
+
+
+def fit_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """The calibration in a sentence, and its numbers in large letters."""
+    path = at.folder / FIT
+    if not path.is_file():
+        return None
+    headline, tiles, _ = fit_words(*mark(path))
+    return {"headline": headline, "tiles": tiles}
+
+
+def accuracy_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """The calibration's table of accuracy."""
+    path = at.folder / FIT
+    return {"table": fit_words(*mark(path))[2]} if path.is_file() else None
+
+
+@lru_cache(maxsize=KEPT)
+def fit_words(path: str, moment: int, size: int) -> tuple[str, list[Tile], Table]:
+    """Headline, numbers and accuracy of a calibration's file as it was at a moment."""
+    fit = load_fit(path)
+    seen = fit.within
+    known = sum(parameter.identifiable for parameter in fit.parameters)
+    tiles = [
+        ("RMS", f"{seen.before.rms_mm:.3f}", f"{seen.after.rms_mm:.3f} mm"),
+        ("largest", f"{seen.before.max_mm:.3f}", f"{seen.after.max_mm:.3f} mm"),
+        ("parameters known", "", f"{known} of {len(fit.parameters)}"),
+    ]
+    return fit.headline(), tiles, fit.accuracy_table()
+
+
+def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """Every point with its error, the worst first."""
+    fit, poses = at.folder / FIT, at.folder / POSES
+    if not (fit.is_file() and poses.is_file()):
+        return None
+    found = points_of(*mark(fit), *mark(poses))
+    left = set(chosen.left_out)
+
+    def order(point: Point) -> tuple[bool, float]:
+        return point.key not in left, -nan_to_num(point.after)
+
+    shown = sorted(found, key=order)[: MOST_POINTS + len(left)]
+    over = [p for p in found if chosen.most and p.after > chosen.most and p.key not in left]
+    return {"points": shown, "left": left, "limit": chosen.most, "over": len(over),
+            "more": len(found) - len(shown), "count": len(found)}  # fmt: skip
+
+
+def ladder_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """The diagnosis: while it is at work the rungs so far, then what it says."""
+    if job and job.step == "diagnose":
+        return {"rungs": job.rungs, "headline": "", "tables": []}
+    path = at.folder / DIAGNOSIS
+    if not path.is_file():
+        return None
+    headline, tables, _ = diagnosis_words(*mark(path))
+    return {"rungs": [], "headline": headline, "tables": tables}
+
+
+@lru_cache(maxsize=KEPT)
+def diagnosis_words(path: str, moment: int, size: int) -> tuple[str, list[Table], dict[str, Any]]:
+    """Headline, tables and chart of a diagnosis' file as it was at a moment."""
+    gap = load_diagnosis(path)
+    tables = [gap.ladder_table(), gap.effects_table(), gap.rival_table()]
+    return gap.headline(), [table for table in tables if table.rows], figure_data(waterfall(gap))
+
+
+def verdict_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """What the report printed: passed, not passed or not stated, and why."""
+    record = record_of(at, "judge")
+    if not record or record.code:
+        return None
+    lines = record.told.splitlines()
+    verdict = lines[0] if lines else ""
+    return {"verdict": verdict, "lines": lines[1:], "base": base(at)}
+
+
+def plan_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+    """What the plan promises, and its poses."""
+    record, path = record_of(at, "plan"), at.folder / NEXT
+    if not record or record.code or not path.is_file():
+        return None
+    promise, _, _ = record.told.partition("\n\n")
+    rows = list(csv.reader(path.read_text("utf-8").splitlines()))
+    header = rows[0] if rows else []
+    kept = [i for i, name in enumerate(header) if name.startswith(("pose", "q"))]
+    body = tuple(tuple(row[i] for i in kept) for row in rows[1 : MOST_ROWS + 1])
+    return {"promise": promise, "table": Table(NEXT, tuple(header[i] for i in kept), body)}
+
+
+def told_panel(step: str) -> Callable[[Session, Choices, Job | None], Panel | None]:
+    """What the command of a step printed."""
+
+    def made(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
+        record = record_of(at, step)
+        return {"text": record.told} if record and record.told else None
+
+    return made
+
+
+def downloads_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:
+    """Every file that the commands wrote."""
+    files = [(p.name, p.stat().st_size, WHAT.get(p.name, "")) for p in at.files()]
+    return {"files": files, "base": base(at)}
+
+
+def base(at: Session) -> str:
+    """Where the files of a session are."""
+    return f"/s/{at.name}/file"
+
+
+PANELS: dict[str, Callable[[Session, Choices, Job | None], Panel | None]] = {
+    "files": files_panel,
+    "understood": understood_panel,
+    "fit": fit_panel,
+    "accuracy": accuracy_panel,
+    "points": points_panel,
+    "ladder": ladder_panel,
+    "verdict": verdict_panel,
+    "plan": plan_panel,
+    "told": told_panel("correct"),
+    "downloads": downloads_panel,
+}
+
+
+def views(at: Session) -> dict[str, str]:
+    """The charts that there are, each with a name that changes when it does."""
+    paths = {"workspace": at.folder / FIT, "ladder": at.folder / DIAGNOSIS}
+    return {name: "-".join(map(str, mark(p)[1:])) for name, p in paths.items() if p.is_file()}

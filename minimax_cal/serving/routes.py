@@ -1,0 +1,287 @@
+"""What the page asks for: sessions, their state, choices, files, and work."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+from functools import lru_cache, wraps
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.reporting.html.charts import PALETTE
+from minimax_cal.reporting.html.page import needed, part
+from minimax_cal.serving.cell import view_of
+from minimax_cal.serving.panels import diagnosis_words, state_of
+from minimax_cal.serving.sessions import (
+    GIVEN,
+    MOST_BYTES,
+    Session,
+    mark,
+    new_session,
+    session,
+    sessions,
+)
+from minimax_cal.serving.steps import DIAGNOSIS, FIT, REPORT, STEPS
+from minimax_cal.serving.work import Work
+
+MOST_WORDS = 1 << 20  # bytes of choices
+SEALED = "sandbox allow-scripts allow-downloads allow-modals"  # a report has no part in the page
+KINDS = {"css": "text/css", "js": "text/javascript"}
+Answer = Callable[[Request], Awaitable[Response]]
+
+
+def application(root: Path) -> Starlette:
+    """The page of all sessions in a folder."""
+    work = Work()
+
+    @asynccontextmanager
+    async def living(app: Starlette) -> AsyncIterator[None]:
+        yield
+        await work.close()
+
+    app = Starlette(routes=ROUTES, lifespan=living)
+    app.state.root, app.state.work = root, work
+    return app
+
+
+def said(error: CalibrationError, status: int = 400) -> Response:
+    """What is wrong, in a line; nothing more is read of what comes with the request."""
+    return JSONResponse({"error": str(error)}, status, {"Connection": "close"})
+
+
+def asked(answer: Answer) -> Answer:
+    """An answer whose errors of the user are one line."""
+
+    @wraps(answer)
+    async def answered(request: Request) -> Response:
+        try:
+            return await answer(request)
+        except CalibrationError as error:
+            return said(error)
+        except ClientDisconnect:
+            return Response(status_code=400)
+
+    return answered
+
+
+def session_of(request: Request) -> Session:
+    """The session that an address names.  Raises OptionError."""
+    return session(request.app.state.root, request.path_params["session"])
+
+
+def work_of(request: Request) -> Work:
+    """The processes."""
+    found: Work = request.app.state.work
+    return found
+
+
+async def words_of(request: Request) -> dict[str, Any]:
+    """The JSON object that a request brings.  Raises OptionError."""
+    raw = b""
+    async for chunk in request.stream():
+        raw += chunk
+        if len(raw) > MOST_WORDS:
+            raise OptionError("that is too much for choices")
+    try:
+        content = json.loads(raw)
+    except ValueError:
+        content = None
+    if not isinstance(content, dict):
+        raise OptionError("expected a JSON object")
+    return content
+
+
+# ---- pages -------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4)
+def page(name: str) -> Any:
+    """A template of this package."""
+    jinja, _ = needed()
+    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
+    return pages.from_string(part(name, "minimax_cal.serving"))
+
+
+@asked
+async def start_page(request: Request) -> Response:
+    """All sessions."""
+    found = [one.name for one in sessions(request.app.state.root)]
+    return HTMLResponse(page("start.html.jinja").render(sessions=found))
+
+
+@asked
+async def session_page(request: Request) -> Response:
+    """A session."""
+    at = session_of(request)
+    made = page("page.html.jinja").render(
+        name=at.name, folder=str(at.folder), palette=" ".join(PALETTE), most=MOST_BYTES
+    )
+    return HTMLResponse(made)
+
+
+@asked
+async def static(request: Request) -> Response:
+    """Styles and scripts, those of the report among them."""
+    name = request.path_params["name"]
+    if name == "plotly.js":
+        headers = {"Content-Encoding": "gzip", "Cache-Control": "private, max-age=86400"}
+        return Response(packed_plotly(), media_type="text/javascript", headers=headers)
+    own = {"serve.css", "serve.js", "start.js"}
+    if name not in own | {"page.css", "drawing.js"}:
+        return said(OptionError("no such file"), 404)
+    text = part(name, "minimax_cal.serving" if name in own else "minimax_cal.reporting.html")
+    return Response(text, media_type=KINDS[name.rpartition(".")[2]])
+
+
+@lru_cache(maxsize=1)
+def packed_plotly() -> bytes:
+    """plotly.js, compressed."""
+    _, offline = needed()
+    return gzip.compress(str(offline.get_plotlyjs()).encode(), 6, mtime=0)
+
+
+# ---- state and choices -------------------------------------------------------------------------
+
+
+@asked
+async def state(request: Request) -> Response:
+    """All that the page shows; of what it has seen already only the work that goes on."""
+    at = session_of(request)
+    job = work_of(request).jobs.get(at.name)
+    marks = (at.stamp(), job and (job.step, job.began, len(job.rungs)))
+    now = sha256(repr(marks).encode()).hexdigest()[:16]
+    working = {"stamp": now, "job": job.state() if job else None}
+    if request.query_params.get("seen") == now:
+        return JSONResponse(working)
+    return JSONResponse({**await run_in_threadpool(state_of, at, job), **working})
+
+
+@asked
+async def view(request: Request) -> Response:
+    """A chart: traces and layout as plotly draws them."""
+    at, name = session_of(request), request.path_params["name"]
+    path = at.folder / {"workspace": FIT, "ladder": DIAGNOSIS}.get(name, "")
+    if not path.is_file():
+        return said(OptionError("no such chart"), 404)
+    if name == "workspace":
+        return JSONResponse(await run_in_threadpool(view_of, *mark(path)))
+    return JSONResponse((await run_in_threadpool(diagnosis_words, *mark(path)))[2])
+
+
+@asked
+async def begin(request: Request) -> Response:
+    """A new session."""
+    title = (await words_of(request)).get("title", "")
+    made = new_session(request.app.state.root, title if isinstance(title, str) else "")
+    return JSONResponse({"name": made.name})
+
+
+@asked
+async def choose(request: Request) -> Response:
+    """Choices."""
+    changes = await words_of(request)
+    session_of(request).choose(changes)
+    return JSONResponse({})
+
+
+# ---- files -------------------------------------------------------------------------------------
+
+
+@asked
+async def put(request: Request) -> Response:
+    """A file that is dropped; whole, or not at all."""
+    at = session_of(request)
+    path = at.file(GIVEN, request.query_params.get("name", ""))
+    room = at.room(path.name)
+    told = request.headers.get("content-length", "0")
+    too_large = OptionError(
+        f"{path.name}: is larger than {room >> 20} MiB; that is no file of measurements"
+    )
+    if not told.isdigit() or int(told) > room:
+        return said(too_large, 413)
+    part_of_it = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
+    size = 0
+    try:
+        with part_of_it.open("wb") as stream:
+            async for chunk in request.stream():
+                size += len(chunk)
+                if size > room:
+                    return said(too_large, 413)
+                stream.write(chunk)
+        os.replace(part_of_it, path)
+    except OSError as error:
+        raise OptionError(f"{path.name}: cannot be kept ({error.strerror})") from error
+    finally:
+        with suppress(OSError):
+            part_of_it.unlink(missing_ok=True)
+    return JSONResponse({"name": path.name, "bytes": size})
+
+
+@asked
+async def drop(request: Request) -> Response:
+    """Remove a file that was dropped."""
+    session_of(request).remove(request.query_params.get("name", ""))
+    return JSONResponse({})
+
+
+@asked
+async def fetch(request: Request) -> Response:
+    """A file of the session, to keep; the report also to look at, with no rights of this page."""
+    at, name = session_of(request), request.path_params["name"]
+    path = at.file(name)
+    if not path.is_file():
+        return said(OptionError(f"there is no {path.name}"), 404)
+    if name == REPORT and "look" in request.query_params:
+        made = f"{SEALED}; frame-ancestors 'none'"
+        headers = {"Content-Security-Policy": made}
+        return FileResponse(path, media_type="text/html", headers=headers)
+    return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+
+# ---- work --------------------------------------------------------------------------------------
+
+
+@asked
+async def run(request: Request) -> Response:
+    """Begin a step."""
+    at, name = session_of(request), request.path_params["step"]
+    if name not in STEPS:
+        raise OptionError("there is no such step")
+    commands = STEPS[name].commands(at, at.choices)
+    job = work_of(request).start(at, name, commands)
+    return JSONResponse({"lines": [command.line() for command in job.commands]})
+
+
+@asked
+async def cancel(request: Request) -> Response:
+    """End the work of a session."""
+    at = session_of(request)
+    await work_of(request).cancel(at.name)
+    return JSONResponse({})
+
+
+ROUTES = [
+    Route("/", start_page),
+    Route("/static/{name}", static),
+    Route("/sessions", begin, methods=["POST"]),
+    Route("/s/{session}", session_page),
+    Route("/s/{session}/state", state),
+    Route("/s/{session}/view/{name}", view),
+    Route("/s/{session}/choices", choose, methods=["PATCH"]),
+    Route("/s/{session}/given", put, methods=["PUT"]),
+    Route("/s/{session}/given", drop, methods=["DELETE"]),
+    Route("/s/{session}/file/{name:path}", fetch),
+    Route("/s/{session}/run/{step}", run, methods=["POST"]),
+    Route("/s/{session}/cancel", cancel, methods=["POST"]),
+]

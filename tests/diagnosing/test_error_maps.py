@@ -1,0 +1,125 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from test_remainder import geometric, rigid
+
+import minimax_cal as mc
+from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
+from minimax_cal.diagnosing.joint import joint
+from minimax_cal.diagnosing.study import SUM, studied
+from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.modelling.effects.maps import sines, spread
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.robots.robot import Robot
+
+NODES = np.arange(-2.0, 3.0, 0.15)
+HEIGHTS = 3e-4 * np.random.default_rng(2).normal(size=len(NODES))
+
+
+def bumps(q: Array) -> Array:
+    """A curve of no period."""
+    return np.asarray(np.interp(q, NODES, HEIGHTS))
+
+
+def saw(q: Array) -> Array:
+    """A curve with many lines."""
+    return 3e-4 * (np.mod(q, 0.5) / 0.25 - 1.0)
+
+
+@pytest.mark.parametrize("length", [0.1, 0.5])
+def test_the_sines_are_a_matern_process(length: float) -> None:
+    x, span = np.linspace(1.4, 1.6, 5), 3.0  # far from the ends, where it is pinned to nothing
+    part = sines(x, 0.0, span, 2000) * spread(length, span, 2000)[:, None]
+    s = np.sqrt(3.0) * np.abs(x[:, None] - x) / length
+    assert_allclose(part.T @ part, (1.0 + s) * np.exp(-s), atol=2e-3)  # 0.1 lengths to the ends
+
+
+def test_a_curve_is_nothing_where_nothing_was_measured() -> None:
+    assert_allclose(sines(np.array([-1.0, 0.0, 2.0, 9.0]), 0.0, 2.0, 7), 0.0, atol=1e-14)
+
+
+def test_curves_of_two_joints_are_found_and_hold_at_new_poses(robot: Robot) -> None:
+    sim = rigid(robot, 260, 2, 3)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 1], turn[:, 2] = saw(sim.data.q[:, 1]), saw(sim.data.q[:, 2])
+    whole = geometric(robot, sim, turn).study
+    old, new = whole.data.take(np.arange(200)), whole.data.take(np.arange(200, 260))
+    bare = joint(studied(robot, old, fit_cell(robot, old, SUM, silent)), ())
+    found = error_maps(bare)
+    assert {term.label for term in found.terms} == {"joint_error_map:J2", "joint_error_map:J3"}
+    assert max(found.chances) < 1e-3
+    before, after = (
+        accuracy(fit.cell.error(new)).rms_mm for fit in (bare, joint(bare.study, found.terms))
+    )
+    assert after < 0.6 * before
+
+
+def test_a_single_wave_is_told_as_one(robot: Robot) -> None:
+    sim = rigid(robot, 220, 2, 4)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 0] = 2e-4 * np.sin(17.0 * sim.data.q[:, 0])
+    (term,) = error_maps(geometric(robot, sim, turn)).terms
+    assert term.label == "gear_ripple:J1"
+    assert abs(term.choice["turns"] - 17.0) < 0.2
+
+
+def test_slow_laws_of_the_same_angle_need_no_map(robot: Robot) -> None:
+    sim = rigid(robot, 120, 2, 5)
+    q = sim.data.q
+    turn = np.zeros_like(q)
+    turn[:, 2] = 1e-3 * q[:, 2] + 3e-4 * np.cos(2.0 * q[:, 2])
+    assert error_maps(geometric(robot, sim, turn)).terms == ()
+
+
+def test_lines_that_a_map_makes_needless_leave(robot: Robot) -> None:
+    sim = rigid(robot, 220, 2, 6)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 1] = bumps(sim.data.q[:, 1])
+    bare = geometric(robot, sim, turn)
+    line, _ = strongest_wave(NODES, HEIGHTS)
+    named = joint(bare.study, [Term("gear_ripple", "J2", {"turns": line})])
+    found = error_maps(named)
+    assert [term.label for term in found.terms] == ["joint_error_map:J2"]
+    assert [term.label for term in found.needless] == ["gear_ripple:J2"]
+
+
+def test_the_strongest_wave_of_a_curve() -> None:
+    x = np.linspace(-2.0, 1.5, 400)
+    turns, share = strongest_wave(x, 0.3 + 0.1 * x + np.sin(21.3 * x + 0.4))
+    assert abs(turns - 21.3) < 0.1
+    assert share > 0.99
+    assert strongest_wave(x, np.abs(np.sin(9.0 * x)) + np.sin(17.0 * x))[1] < 0.9
+
+
+def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_path: Path) -> None:
+    sim = rigid(robot, 220, 1, 3)
+    q = sim.data.q
+    turn = np.zeros_like(q)
+    turn[:, 1] = bumps(q[:, 1])
+    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+    told = mc.diagnose(robot, data, quick=True)
+    (found,) = [f for f in told.findings if f.term.label == "joint_error_map:J2"]
+    x, y, band = found.curve
+    inside = (x > q[:, 1].min()) & (x < q[:, 1].max())
+    off = (y - bumps(x))[inside]  # geometry may take a constant turn
+    assert np.mean(np.abs(off - off.mean()) < 3.0 * band[inside]) > 0.9
+    assert [p["name"] for p in found.parameters()] == ["RMS", "largest"]
+    again = mc.Diagnosis.from_dict(json.loads(told.json()))
+    assert json.loads(again.json())["effects"] == json.loads(told.json())["effects"]
+
+    told.save(tmp_path / "diagnosis.json")
+    fit = mc.calibrate(robot, data, objective="sum", effects=tmp_path / "diagnosis.json")
+    assert fit.accuracy["holdout"].rms_mm < 0.5 * told.ladder[1].holdout.rms_mm
+    rows = fit.effect_table().rows
+    assert [row[0] for row in rows] == ["joint_error_map:J2 RMS"]
+    fit.save(tmp_path / "fit.json")
+    loaded = mc.load_fit(tmp_path / "fit.json")
+    assert_allclose(loaded.predict(q), fit.predict(q), atol=1e-12)
+    fixed = mc.compensate(loaded, q[:10])
+    assert fixed.distance.max() < 2e-5

@@ -1,0 +1,100 @@
+"""What a verdict rests on: names found again, structure that matters, what is left to predict."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import minimax_cal as mc
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing import established
+from minimax_cal.diagnosing.lack_of_fit import Trace
+from minimax_cal.diagnosing.remainder import Remainder
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.verdict import heard, patched
+from minimax_cal.evidence import limits
+from minimax_cal.evidence.bench import Added
+from minimax_cal.evidence.library import Candidate
+from minimax_cal.modelling.effects.table import Term
+
+
+def finding(effect: str, place: str, size: float = 100.0, again: float = 1.0) -> Finding:
+    none = (0.0,)
+    return Finding((Term(effect, place),), ("a",), ("rad",), none, none, size, 1e-9, again=again)
+
+
+def added(effect: str, place: str, value: float, sigma: float) -> Added:
+    none = np.zeros(0, dtype=int)
+    c = Candidate(Term(effect, place), np.zeros(1, dtype=int), none, none)
+    return Added(c, 1.0, 1.0, 0.0, 1.0, np.array([value]), np.array([sigma]))
+
+
+def test_parameters_agree_within_the_sigmas_of_both() -> None:
+    whole = added("gear_error", "J1", 1.0, 0.1)
+    for value, agree in ((1.1, True), (1.4, True), (2.0, False), (0.0, False), (-1.0, False)):
+        assert established.agree(added("gear_error", "J1", value, 0.1), whole) == agree
+    sure = added("gear_error", "J1", 1.0, 1e-6)
+    assert established.agree(added("gear_error", "J1", 1.1, 1e-6), sure)  # a tenth is no other law
+    assert not established.agree(added("gear_error", "J1", 1.5, 1e-6), sure)
+
+
+def test_structure_must_be_improbable_and_of_account() -> None:
+    rare, small = limits.STRUCTURE / 10.0, 1.0
+    assert heard([Trace("a", rare, 500.0), Trace("b", 0.5, 900.0)], 1000.0, 900).name == "a"  # type: ignore[union-attr]
+    assert heard([Trace("a", rare, small)], 0.0, 900) is None  # nothing beside the noise
+    assert heard([Trace("a", rare, 100.0)], 1e5, 900) is None  # nothing beside what was explained
+    assert heard([Trace("a", limits.STRUCTURE, 500.0)] * 2, 0.0, 900) is None  # two were asked
+
+
+def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
+    assert not patched([])
+    assert not patched([finding("gear_error", "J2")])
+    assert patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J2")])
+    assert patched([finding("gear_error", "all", 300.0), finding("encoder_gain", "J2")])
+    assert not patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J3")])
+    heavy = [finding("joint_compliance", "J2", 900.0), finding("gear_error", "J2", 100.0)]
+    assert not patched([*heavy, finding("encoder_gain", "J2", 50.0)])  # beside the main cause
+
+
+@pytest.fixture(scope="module")
+def two_orders() -> mc.Diagnosis:
+    causes = (Cause("gear_error", "J3", 300.0, 0), Cause("gear_error", "J3", 300.0, 1))
+    made = make(Case("irb2600", "single", causes, seed=3))
+    return mc.diagnose(made.robot, made.data, quick=True)
+
+
+def test_two_orders_of_one_gear_are_one_effect(two_orders: mc.Diagnosis) -> None:
+    assert two_orders.verdict in ("named", "one_of")
+    (one,) = two_orders.findings
+    assert one.term.key == ("gear_error", "J3")
+    assert one.established
+    assert sorted(term.choice["turns"] for term in one.terms) == [1.0, 2.0]
+    assert len(one.names) == len(set(one.names)) == 4
+
+
+def test_the_file_tells_what_is_established_and_what_remains(two_orders: mc.Diagnosis) -> None:
+    said = json.loads(two_orders.json())
+    assert [e["established"] for e in said["effects"]] == [True]
+    assert set(said["remainder"]) == {"predictable_mm", "where", "unpredictable_mm", "floor_mm"}
+    assert said["remainder"]["predictable_mm"] < said["remainder"]["unpredictable_mm"]
+    again = mc.Diagnosis.from_dict(said)
+    assert isinstance(again.remainder, Remainder)
+    assert again.remainder == two_orders.remainder
+    assert json.loads(again.json())["effects"][0]["established"] is True
+    said["effects"][0] |= {"established": False, "found_again": 0.8}
+    kept = json.loads(mc.Diagnosis.from_dict(said).json())["effects"][0]
+    assert (kept["established"], kept["found_again"]) == (False, 0.8)
+
+
+def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None:
+    said = json.loads(two_orders.json())
+    del said["effects"][0]["established"], said["effects"][0]["found_again"], said["remainder"]
+    again = mc.Diagnosis.from_dict(said)
+    assert all(found.established for found in again.findings)
+    assert again.remainder is None
+
+
+def test_a_name_that_is_not_found_again_is_tentative() -> None:
+    assert finding("backlash", "J1", again=1.0).established
+    assert not replace(finding("backlash", "J1"), again=0.8).established

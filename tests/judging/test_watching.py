@@ -1,0 +1,284 @@
+"""A calibration watched: what moved is found, what cannot be told is said, no more is named."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from experiments.watch import SHIFT, Trial, seen_anew, shifted
+from experiments.watch import run as trial
+from minimax_cal.judging.watching.moved import search
+from minimax_cal.judging.watching.opening import watched_of
+from minimax_cal.modelling.simulate import Simulation, Truth, random_poses, simulate
+
+TRUTH = Truth(compliance=0.0)
+SIGMAS = 4.0  # that an estimate may be off: one of 16 000 is
+
+
+@pytest.fixture(scope="module")
+def made(robot: mc.Robot) -> Simulation:
+    return simulate(robot, 50, 3, 3, TRUTH)
+
+
+@pytest.fixture(scope="module")
+def fit(made: Simulation) -> mc.Fit:
+    return mc.calibrate("irb2600", made.data, "sum")
+
+
+def poses(made: Simulation, count: int, joint: int = 0, by: float = 0.0, seed: int = 1):  # type: ignore[no-untyped-def]
+    """Poses of the arm with the zero of a joint, counted from 1, shifted; the tracker anew."""
+    rng = np.random.default_rng(seed)
+    q = random_poses(made.cell.robot, count, rng)
+    return seen_anew(shifted(made.cell, joint - 1, by), q, TRUTH, rng)
+
+
+@pytest.fixture(scope="module")
+def knocked(fit: mc.Fit, made: Simulation):  # type: ignore[no-untyped-def]
+    return mc.check(fit, poses(made, 10, 3, SHIFT), "rms 0.5")
+
+
+# ---- check ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", ["irb120", "ur10"])
+def test_a_shifted_joint_is_found_and_nothing_else(arm: str) -> None:
+    """The short form of `python -m experiments watch`."""
+    for seed in (0, 1):
+        found = trial(Trial(arm, seed, 0.0))
+        assert found.named == (found.joint,)
+        assert found.alarms == ()
+        assert "theta1" in found.hidden
+        assert found.hidden[-1] == "theta6"
+
+
+@pytest.mark.slow
+def test_rates_are_those_promised() -> None:
+    results = [trial(Trial(arm, seed, 0.0)) for arm in ("irb2600", "ur10") for seed in range(150)]
+    assert np.mean([r.joint in r.named for r in results]) >= 0.95
+    assert np.mean([bool(r.alarms) for r in results]) < 0.01
+
+
+def test_the_size_of_the_shift_is_told(knocked) -> None:  # type: ignore[no-untyped-def]
+    (moved,) = knocked.moved
+    assert moved.parameter == "theta3"
+    assert abs(moved.by - SHIFT) < SIGMAS * moved.sigma
+    assert moved.sigma < 0.1 * SHIFT
+    assert knocked.valid is True
+    assert knocked.confidence > 0.975
+    assert {h.parameter: h.like for h in knocked.hidden} == {
+        "theta1": "the measurement frame",
+        "theta6": "the tool",
+    }
+
+
+def test_the_refit_is_a_calibration_that_holds(
+    knocked, fit: mc.Fit, made: Simulation, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    knocked.save(tmp_path / "refit.json")
+    again = mc.load_fit(tmp_path / "refit.json")
+    change = again.robot.mdh - fit.robot.mdh
+    assert change[2, 2] == pytest.approx(knocked.moved[0].by, abs=1e-15)
+    change[2, 2] = 0.0
+    assert not change.any()  # the rest is as it was
+    other = mc.check(again, poses(made, 10, 3, SHIFT, seed=9), "rms 0.1")
+    assert other.moved == ()
+    assert other.valid
+    back = mc.check(again, poses(made, 10, seed=9), "rms 0.1")
+    assert [m.joint for m in back.moved] == ["J3"]
+
+
+def test_not_valid_and_not_decided(fit: mc.Fit, made: Simulation) -> None:
+    far = mc.check(fit, poses(made, 10, 4, 0.02), "rms 0.2, max 1")
+    assert far.valid is False
+    assert [m.joint for m in far.moved] == ["J4"]
+    close = mc.check(fit, poses(made, 10), f"rms {1.01 * far.refitted.rms_mm}, max 5")
+    assert close.valid is None
+    assert [v.valid for v in close.verdicts] == [None, None]  # ten poses tell no maximum
+    assert close.confidence < 0.975
+
+
+def test_sigmas_of_the_search_are_those_of_many_runs(fit: mc.Fit, made: Simulation) -> None:
+    """z of joints that did not move spread by 1, once for a perfect calibration, once for one
+    that is off as its covariance says.
+    """  # fmt: skip
+    rng, found = np.random.default_rng(5), ([], [])
+    root = fit.known.root
+    for seed in range(30):
+        data = poses(made, 10, seed=100 + seed)
+        watched, _ = watched_of(fit, data, ())
+        noise = 10e-6 + 2.5e-6 * np.linalg.norm(data.y, axis=-1).mean()
+        off = root @ rng.normal(size=root.shape[1])
+        wrong = made.cell.robot.mdh + off[:30].reshape(5, 6).T
+        for kind, mdh, known in ((0, made.cell.robot.mdh, 0.0 * root), (1, wrong, root)):
+            cell = replace(watched.cell, robot=watched.cell.robot.with_mdh(mdh))
+            arm = replace(watched, cell=cell, known=known, variance=noise**2, jitter=0.0)
+            first = search(arm, np.zeros(arm.names.count, dtype=bool), None, 0).first
+            by, sigma = first.scores(arm.zeros[1:5])
+            found[kind].append(by / sigma * first.scale)
+    for kind in found:
+        assert abs(np.sqrt(np.mean(np.square(kind))) - 1.0) < SIGMAS / np.sqrt(2 * 120)
+
+
+def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
+    rng = np.random.default_rng(4)
+    q = random_poses(made.cell.robot, 10, rng)
+    cell = shifted(made.cell, 0, SHIFT)
+    y = cell.predict(q) + 15e-6 * rng.normal(size=(10, 3, 3))
+    found = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame,targets")
+    assert [m.parameter for m in found.moved] == ["theta1"]
+    assert found.hidden == ()
+    assert mc.check(fit, mc.measurements(q, y), "rms 0.5").moved == ()
+
+
+def test_reflectors_on_the_foot_tell_joint_one(made: Simulation) -> None:
+    foot = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.4, 0.1]])
+    rng = np.random.default_rng(8)
+
+    def with_foot(data: mc.Measurements, base: np.ndarray) -> mc.Measurements:
+        spots = foot @ base[:3, :3].T + base[:3, 3] + 15e-6 * rng.normal(size=(data.poses, 3, 3))
+        more = {
+            f"base{i + 1}_{axis}": spots[:, i, j] for i in range(3) for j, axis in enumerate("xyz")
+        }
+        return replace(data, columns={**data.columns, **more})
+
+    fit = mc.calibrate("irb2600", with_foot(made.data, made.cell.base), "sum")
+    q = random_poses(made.cell.robot, 10, rng)
+    base = made.cell.base.copy()
+    base[:3, 3] += 0.2
+    cell = replace(shifted(made.cell, 0, SHIFT), base=base)
+    y = cell.predict(q) + 15e-6 * rng.normal(size=(10, 3, 3))
+    found = mc.check(fit, with_foot(mc.measurements(q, y), base), "rms 0.5")
+    assert [m.parameter for m in found.moved] == ["theta1"]
+    assert [h.parameter for h in found.hidden] == ["theta6"]
+    assert abs(found.moved[0].by - SHIFT) < SIGMAS * found.moved[0].sigma
+
+
+def test_few_poses_suffice(fit: mc.Fit, made: Simulation) -> None:
+    data = poses(made, 12)
+    found = mc.check(fit, data, "rms 0.2")
+    assert found.enough is not None
+    assert found.enough < 12
+    assert max(found.findable.values()) <= SHIFT
+    few = mc.check(fit, data.take(np.arange(3)), "rms 0.2")
+    assert few.asked is not None
+    assert few.asked > 3 or few.enough == 3
+
+
+def test_the_command_says_what_the_function_says(
+    fit: mc.Fit, made: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit.save(tmp_path / "fit.json")
+    mc.write_measurements(tmp_path / "new.csv", poses(made, 10, 3, SHIFT))
+    words = ["check", tmp_path / "fit.json", tmp_path / "new.csv", "--tolerance"]
+    assert run(*words, "rms 0.5", "--json", "-o", tmp_path / "refit.json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["valid"] is True
+    assert [m["parameter"] for m in told["moved"]] == ["theta3"]
+    assert told["moved"][0]["unit"] == "rad"
+    kept = json.loads((tmp_path / "refit.json").read_text())
+    assert kept["check"]["moved"] == kept["moved"] == told["moved"]
+    assert run(*words, "rms 0.05") == 1
+    out, err = capsys.readouterr()
+    assert "not valid" in out
+    (line,) = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert "not valid" in line
+    assert run("evaluate", tmp_path / "refit.json", tmp_path / "new.csv") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--tolerance", "0.2"], "write it in mm"),
+        (["--tolerance", ""], "write it in mm"),
+        (["--tolerance", "rms 0.2", "--known", "foot"], "none of frame, targets"),
+        ([], "Missing option"),
+    ],
+)
+def test_a_wrong_option_is_one_line(
+    fit: mc.Fit,
+    made: Simulation,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    said: str,
+) -> None:
+    fit.save(tmp_path / "fit.json")
+    mc.write_measurements(tmp_path / "new.csv", poses(made, 10))
+    assert run("check", tmp_path / "fit.json", tmp_path / "new.csv", *options) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.splitlines()) == 1
+
+
+def test_data_that_say_nothing_are_one_line(fit: mc.Fit, made: Simulation) -> None:
+    data = poses(made, 2)
+    with pytest.raises(mc.DataError, match="measure more"):
+        mc.check(fit, data.take(np.arange(1)), "rms 0.2")
+    two = replace(data, columns={"session": np.array(["a", "b"])})
+    with pytest.raises(mc.DataError, match="several sessions"):
+        mc.check(fit, two, "rms 0.2")
+    odd = replace(data, target_names=("smr1", "smr2", "smr9"))
+    with pytest.raises(mc.DataError, match="smr9"):
+        mc.check(fit, odd, "rms 0.2", known="targets")
+    with pytest.raises(mc.CalibrationError, match="covariance"):
+        mc.check(replace(fit, uncertainty=None), data, "rms 0.2")
+
+
+# ---- compare ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def repaired(made: Simulation) -> mc.Fit:
+    return mc.calibrate("irb2600", poses(made, 40, 4, 3e-4, seed=21), "sum")
+
+
+def test_a_repair_is_named(fit: mc.Fit, repaired: mc.Fit) -> None:
+    found = mc.compare(fit, repaired)
+    (changed,) = found.changed
+    assert changed.parameter == "theta4"
+    assert abs(changed.by - 3e-4) < SIGMAS * changed.sigma
+    assert found.same < 1e-6
+    told = {d.parameter: d for d in found.differences}
+    assert told["theta1"].reason
+    assert told["d1"].reason
+    others = [d.sigmas for d in found.differences if not d.reason and d.parameter != "theta4"]
+    assert np.sqrt(np.mean(np.square(others))) < 2.0
+    (_, a_on_a, b_on_a), (_, a_on_b, b_on_b) = found.accuracy
+    assert a_on_a.rms_mm < b_on_a.rms_mm
+    assert b_on_b.rms_mm < a_on_b.rms_mm
+
+
+def test_which_parameters_were_kept_does_not_matter(made: Simulation, fit: mc.Fit) -> None:
+    """d1 in place of the base's z: nothing moved, and nothing is told to have."""
+    data = poses(made, 40, seed=33)
+    usual, odd = (mc.calibrate("irb2600", data, "sum", free=free) for free in ("", "d6,theta6"))
+    assert np.abs(usual.robot.mdh - odd.robot.mdh).max() > 1e-5
+    one, other = mc.compare(fit, usual), mc.compare(fit, odd)
+    assert one.changed == other.changed == ()
+    for a, b in zip(one.differences, other.differences, strict=True):
+        assert_allclose(a.b, b.b, rtol=0, atol=5e-7)  # to first order
+    assert mc.compare(usual, odd).notices
+
+
+def test_compare_command(
+    fit: mc.Fit, repaired: mc.Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit.save(tmp_path / "a.json")
+    repaired.save(tmp_path / "b.json")
+    assert run("compare", tmp_path / "a.json", tmp_path / "b.json", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [c["joint"] for c in told["changed"]] == ["J4"]
+    assert run("compare", tmp_path / "a.json", tmp_path / "b.json") == 0
+    assert "J4 changed" in capsys.readouterr().out
+    (tmp_path / "c.json").write_text("{}")
+    for name in ("c.json", "none.json"):
+        assert run("compare", tmp_path / "a.json", tmp_path / name) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+    ur10 = mc.calibrate("scara_600", mc.simulate("scara_600", 30).data, "sum")
+    with pytest.raises(mc.OptionError, match="compare calibrations of one arm"):
+        mc.compare(fit, ur10)

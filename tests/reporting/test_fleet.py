@@ -1,0 +1,133 @@
+"""Ten cells in one go: each is one row, a broken one too, and the page escapes what cells say."""
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from experiments.watch import shifted
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.reporting.fleet.overview import Fleet
+from minimax_cal.reporting.fleet.work import Row
+
+pytest.importorskip("jinja2", reason="needs pip install minimax-cal[fleet]")
+
+CELLS = """
+[defaults]
+robot = "irb120"
+tolerance = "rms 0.5"
+objective = "sum"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten cells: eight calibrations (one after a repair), a check, and a file that is broken."""
+    folder = tmp_path_factory.mktemp("fleet")
+    lines = [CELLS]
+    for number in range(8):
+        made = simulate("irb120", 24, 3, number, Truth(compliance=0.0))
+        mc.write_measurements(folder / f"{number}.csv", made.data)
+        lines.append(f'[[cells]]\nname = "cell {number}"\ndata = "{number}.csv"')
+        if number == 0:
+            fit = mc.calibrate("irb120", made.data, "sum")
+            fit.save(folder / "old.json")
+            cell = shifted(made.cell, 2, 1e-3)
+            data = mc.measurements(made.data.q, made.data.y + cell.predict(made.data.q)
+                                   - made.cell.predict(made.data.q))  # fmt: skip
+            mc.write_measurements(folder / "0.csv", data)
+            lines.append('fit = "old.json"')
+            mc.write_measurements(folder / "ten.csv", made.data.take(made.data.q[:, 0] > 0))
+    lines.append('[[cells]]\nname = "checked"\nfit = "old.json"\ncheck = "ten.csv"')
+    (folder / "broken.csv").write_text("q1_rad,smr1_x_mm\n1,<script>\n")
+    lines.append('[[cells]]\nname = "broken"\ndata = "broken.csv"')
+    (folder / "cells.toml").write_text("\n".join(lines))
+    return folder
+
+
+def test_ten_cells(folder: Path, tmp_path: Path) -> None:
+    found = mc.fleet(
+        folder / "cells.toml", out=tmp_path / "fits", page=tmp_path / "page.html", processes=1
+    )
+    assert [row.cell for row in found.rows] == [
+        *(f"cell {i}" for i in range(8)),
+        "checked",
+        "broken",
+    ]
+    assert [row.cell for row in found.failed] == ["broken"]
+    told = {row.cell: row for row in found.rows}
+    assert told["cell 0"].changed == ("J3",)
+    assert told["checked"].verdict == "valid"
+    alone = mc.calibrate("irb120", folder / "3.csv", "sum")
+    assert told["cell 3"].rms_mm == alone.within.after.rms_mm
+    kept = mc.load_fit(tmp_path / "fits" / "cell 3.json")
+    assert (kept.robot.mdh == alone.robot.mdh).all()
+    page = (tmp_path / "page.html").read_text()
+    for row in found.rows:
+        assert f">{row.cell}<" in page
+    assert "<script" not in page
+
+
+@pytest.mark.slow
+def test_processes_say_what_one_says(folder: Path) -> None:
+    pytest.importorskip("joblib", reason="needs pip install minimax-cal[fleet]")
+    one, two = (mc.fleet(folder / "cells.toml", processes=count).to_dict() for count in (1, 2))
+    assert one == two
+
+
+def test_the_command_goes_on_after_a_failed_cell(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (folder / "cells.toml").read_text().split("[[cells]]")
+    short = folder / "short.toml"
+    short.write_text("\n[[cells]]".join([text[0], text[-1], text[3]]))
+    assert run("fleet", short, "--jobs", "1", "--json") == 1
+    both = capsys.readouterr()
+    told = json.loads(both.out)
+    assert told["failed"] == 1
+    assert [row["status"] for row in told["rows"]] == ["failed", "converged"]
+    assert both.err.splitlines()[-1] == "error: 1 cells failed: broken"
+
+
+def test_what_cells_say_is_escaped() -> None:
+    row = Row("a", "<b>&", "calibrated", "converged", "", 1.0, 1.0, 1.0, (), "", "<img src=x>")
+    page = Fleet((row,), "<i>").html()
+    for bad in ("<b>", "<img", "<i>"):
+        assert bad not in page
+    assert "&lt;img" in page
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("cells = 3", "write [defaults] once"),
+        ("[defaults]\nrobot = 'irb120'", "holds 0 cells"),
+        ("[[cells]]\nname = 'a'", "give data"),
+        ("[[cells]]\nname = 'a'\ndata = 'x.csv'", "needs robot"),
+        ("[[cells]]\nname = '../a'\nrobot = 'b'\ndata = 'x.csv'", "it names a file"),
+        ("[[cells]]\nname = 'a'\nrobt = 'b'\ndata = 'x.csv'", "robt: is not known"),
+        ("[[cells]]\nname = 'a'\nfit = 'b'\ncheck = 'x.csv'", "and tolerance"),
+        ("[[cells]]\nname='a'\nrobot='b'\ndata='x.csv'\ntolerance='0.2'", "write it in mm"),
+        ("[[cells]]\nname='a'\nrobot='b'\ndata='x'\n[[cells]]\nname='A'\nrobot='b'\ndata='x'",
+         "two cells are called"),
+        ("[[cells]", "is not TOML"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_one_line(
+    text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cells.toml").write_text(text)
+    assert run("fleet", tmp_path / "cells.toml") == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_wrong_place_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cells = folder / "cells.toml"
+    assert run("fleet", cells, "--jobs", "0") == 2
+    assert run("fleet", cells, "--page", folder / "page.png") == 2
+    assert run("fleet", folder / "none.toml") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 3

@@ -1,0 +1,334 @@
+"""The page in a real browser: from dropped files to a passed report and a robot to take away."""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import run, shared
+from numpy.testing import assert_allclose
+from served import PATIENCE, Served, serving
+
+import minimax_cal as mc
+
+pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
+DRIVER = shutil.which("chromedriver") or ""
+pytestmark = pytest.mark.skipif(
+    not (BROWSER and DRIVER), reason="no Chromium with its chromedriver on this machine"
+)
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-gpu",
+    "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--window-size=1300,1000",
+    "--force-prefers-reduced-motion",
+)  # fmt: skip
+PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+POSES, TARGETS = 30, 2
+DIGITS = 1e-8  # of measurements that import writes: half a nanometre and a nanoradian [m]
+HUGE = """
+const file = new File(["x"], "huge.csv");
+Object.defineProperty(file, "size", { value: 2 * 2 ** 30 });
+const input = document.getElementById("measured");
+Object.defineProperty(input, "files", { value: [file], configurable: true });
+input.dispatchEvent(new Event("change", { bubbles: true }));
+delete input.files;
+"""
+
+
+@contextmanager
+def browsing(downloads: Path) -> Iterator[Any]:
+    """A browser of its own; what it keeps goes to a folder."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    found = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    try:
+        yield found
+    finally:
+        found.quit()
+
+
+@pytest.fixture(scope="module")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="module")
+def driver(downloads: Path) -> Iterator[Any]:
+    with browsing(downloads) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with serving(tmp_path_factory.mktemp("sessions")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic cell."""
+    path = tmp_path_factory.mktemp("cell") / "tracker.csv"
+    mc.write_measurements(path, mc.simulate("irb120", POSES, TARGETS, seed=4).data)
+    return path
+
+
+# ---- what people do ------------------------------------------------------------------------------
+
+
+def until(what: Callable[[], Any], said: str) -> Any:
+    """What becomes true in time."""
+    end = time.monotonic() + PATIENCE
+    while not (found := what()):
+        assert time.monotonic() < end, said
+        time.sleep(0.1)
+    return found
+
+
+def one(driver: Any, selector: str) -> Any:
+    return driver.find_element("css selector", selector)
+
+
+def begin(driver: Any, server: Served, title: str) -> None:
+    """Open the address that was printed, and begin a session."""
+    driver.get(server.url)
+    one(driver, "#title").send_keys(title)
+    one(driver, "button[type=submit]").click()
+    stamp = "return document.body?.dataset.stamp"
+    until(lambda: driver.execute_script(stamp), "the page came to no state")
+
+
+def state(driver: Any, step: str) -> str:
+    script = "return document.querySelector(arguments[0])?.dataset.state ?? ''"
+    return str(driver.execute_script(script, f"[data-said={step}], [data-badge={step}]"))
+
+
+def wait_for(driver: Any, step: str) -> None:
+    """A step that has just begun is done."""
+    until(lambda: state(driver, step) in ("done", "failed"), f"{step} did not end")
+    said = one(driver, f"[data-said={step}]").get_attribute("textContent")
+    assert state(driver, step) == "done", said
+
+
+def click(driver: Any, selector: str) -> None:
+    """As a person does, once it can be pressed."""
+    button = one(driver, selector)
+    until(button.is_enabled, f"{selector} stays disabled")
+    driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+    button.click()
+
+
+def do(driver: Any, step: str, where: str = "") -> None:
+    click(driver, f"{where} [data-run={step}]")
+    until(lambda: state(driver, step) != "ready", f"{step} did not begin")
+    wait_for(driver, step)
+
+
+def drop(driver: Any, kind: str, *paths: Path) -> None:
+    one(driver, f"[data-drop={kind}] input").send_keys("\n".join(map(str, paths)))
+
+
+def fill(driver: Any, selector: str, value: str) -> None:
+    field = one(driver, selector)
+    field.clear()
+    field.send_keys(value, "\t")
+
+
+def severe(driver: Any) -> list[Any]:
+    return [entry for entry in driver.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+def asked(driver: Any) -> set[str]:
+    """Where the page's requests went."""
+    events = [json.loads(e["message"])["message"] for e in driver.get_log("performance")]
+    urls = [e["params"]["request"]["url"] for e in events
+            if e["method"] == "Network.requestWillBeSent"]  # fmt: skip
+    return {"/".join(url.split("/")[:3]) for url in urls if not url.startswith(("data:", "blob:"))}
+
+
+def session_of(driver: Any, server: Served) -> Path:
+    return server.folder / str(one(driver, "body").get_attribute("data-session"))
+
+
+def same_as_the_command_line(folder: Path, robot: str, elsewhere: Path) -> None:
+    """The fit of the page is that of `calibrate` on its measurements, to the last digit."""
+    out = elsewhere / "fit.json"
+    assert run("calibrate", robot, folder / "poses.csv", "-o", out) == 0
+    ours, theirs = (json.loads(path.read_text()) for path in (folder / "fit.json", out))
+    for key in ("parameters", "accuracy", "base", "targets_mm"):
+        assert ours[key] == theirs[key], key
+
+
+# ---- the whole way -------------------------------------------------------------------------------
+
+
+def test_from_dropped_files_to_a_passed_report(
+    driver: Any, server: Served, poses: Path, downloads: Path, tmp_path: Path
+) -> None:
+    begin(driver, server, "Cell 7")
+    drop(driver, "measured", poses)
+    wait_for(driver, "read")
+    assert f"{POSES} poses, 6 joints" in one(driver, "[data-panel=understood]").text
+    one(driver, "#robot-choice [value=irb120]").click()
+    do(driver, "fit", "#fit")
+    folder = session_of(driver, server)
+    same_as_the_command_line(folder, "irb120", tmp_path)
+    line = f"minimax-cal calibrate irb120 {'poses.csv'} --objective minimax -o fit.json"
+    assert line in one(driver, "[data-said=fit]").text
+
+    until(lambda: one(driver, "#chart-workspace").get_attribute("data-drawn"), "no view")
+    fill(driver, "#cell [name=most]", "0.001")
+    names = "return document.getElementById('chart-workspace').data.map(t => t.name)"
+    until(lambda: "beyond 0.001 mm" in str(driver.execute_script(names)), "no red")
+    count = driver.execute_script("return document.querySelectorAll('tr.beyond').length")
+    assert count > POSES * TARGETS / 2
+
+    fill(driver, "#judge [name=most]", "")
+    fill(driver, "#judge [name=rms]", "5")
+    do(driver, "judge")
+    assert one(driver, "[data-panel=verdict] .banner").text == "Passed"
+
+    do(driver, "urdf")
+    click(driver, "[data-panel=downloads] a[href$='robot.urdf']")
+    kept = downloads / "robot.urdf"
+    until(kept.is_file, "the URDF did not arrive")
+    assert kept.read_bytes() == (folder / "robot.urdf").read_bytes()
+    arm = tmp_path / "arm.urdf"
+    assert run("export", folder / "fit.json", "--to", "urdf", "-o", arm) == 0
+    assert kept.read_bytes() == arm.read_bytes()
+    assert severe(driver) == []
+    assert asked(driver) == {f"http://127.0.0.1:{server.port}"}
+
+
+def test_an_unticked_point_is_out_of_the_next_fit(driver: Any, server: Served) -> None:
+    before = json.loads((session_of(driver, server) / "fit.json").read_text())
+    tick = one(driver, "[data-panel=points] input[data-point]")
+    name = tick.get_attribute("id")
+    click(driver, f"#{name}")
+    until(lambda: state(driver, "fit") == "old", "the choice did not arrive")
+    line, target = name.removeprefix("use-").split("-")
+    assert f"--leave-out={line}:{target}" in one(driver, "[data-said=fit]").text
+    do(driver, "fit", "#points")
+    after = json.loads((session_of(driver, server) / "fit.json").read_text())
+    row, column = after["poses"]["line"].index(int(line)), int(target.removeprefix("smr")) - 1
+    assert after["poses"]["measured_mm"][row][column] == [None, None, None]
+    assert before["poses"]["measured_mm"][row][column] != [None, None, None]
+    assert one(driver, "#points tr.out").get_attribute("id") == f"point-{line}-{target}"
+    assert severe(driver) == []
+
+
+def test_what_is_too_large_is_refused_by_the_page(driver: Any, server: Served) -> None:
+    driver.execute_script(HUGE)
+    problem = one(driver, "#problem")
+    until(problem.is_displayed, "nothing was said")
+    assert problem.text == "huge.csv: is larger than 256 MiB; that is no file of measurements"
+    assert not (session_of(driver, server) / "given" / "huge.csv").exists()
+
+
+def test_a_phone_shows_all_of_it(driver: Any) -> None:
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+    time.sleep(0.5)
+    wide = driver.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert wide[0] <= wide[1]
+
+
+def test_a_wrong_token_is_told(driver: Any, server: Served) -> None:
+    driver.delete_all_cookies()
+    driver.get(f"http://127.0.0.1:{server.port}/?token=wrong")
+    assert one(driver, "body").text.startswith("wrong token: open the address that minimax-cal")
+    driver.get_log("browser")
+
+
+# ---- in full -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_whole_work_in_two_browsers(
+    server: Served, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """One drops and fits, the other sees it, and both go on at once in two sessions."""
+    data, targets = tmp_path / "tracker.csv", tmp_path / "targets.csv"
+    truth = mc.Truth(compliance=1.5e-6)
+    mc.write_measurements(data, mc.simulate("irb120", 60, 3, seed=3, truth=truth).data)
+    targets.write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n10,20,-10,30,40,50\n")
+    with browsing(tmp_path) as left, browsing(tmp_path_factory.mktemp("kept")) as right:
+        begin(left, server, "shared")
+        right.get(server.url)
+        right.get(left.current_url)
+        drop(left, "measured", data)
+        one(left, "#robot-choice [value=irb120]").click()
+        wait_for(right, "read")
+        begin(right, server, "another")
+        drop(right, "measured", data)
+        wait_for(right, "read")
+        one(right, "#robot-choice [value=irb120]").click()
+        for browser in (left, right):
+            click(browser, "#fit [data-run=fit]")
+        for browser in (left, right):
+            until(lambda b=browser: state(b, "fit") != "ready", "the fit did not begin")
+            wait_for(browser, "fit")
+        folders = [session_of(browser, server) for browser in (left, right)]
+        one_fit, other = (json.loads((f / "fit.json").read_text()) for f in folders)
+        assert one_fit["parameters"] == other["parameters"]
+
+        click(left, "[data-run=diagnose]")
+        rung = "return document.querySelector('[data-panel=ladder] tbody th')?.textContent"
+        grown = until(lambda: left.execute_script(rung), "no rung was shown while it worked")
+        assert grown == "nominal"
+        assert state(left, "diagnose") == "working"
+        wait_for(left, "diagnose")
+        until(lambda: one(left, "#chart-ladder").get_attribute("data-drawn"), "no ladder")
+        click(left, "[name=effects]")
+        until(lambda: state(left, "fit") == "old", "the choice did not arrive")
+        do(left, "fit", "#fit")
+        assert "--effects diagnosis.json" in one(left, "[data-said=fit]").text
+        fill(left, "#judge [name=rms]", "0.1")
+        do(left, "judge")
+        assert one(left, "[data-panel=verdict] .banner").text == "Passed"
+        do(left, "plan")
+        do(left, "mjcf")
+        drop(left, "targets", targets)
+        until(lambda: "targets.csv" in one(left, "#targets-told").text, "no targets")
+        do(left, "correct")
+        for name in ("next.csv", "robot.xml", "corrected.csv", "report.html", "commands.sh"):
+            assert (folders[0] / name).stat().st_size > 100, name
+        assert severe(left) == severe(right) == []
+
+        left.get(f"{left.current_url.partition('#')[0]}/file/report.html?look")  # in its sandbox
+        drawn = "return document.body.dataset.drawn"
+        assert until(lambda: left.execute_script(drawn), "the report was not drawn") == "yes"
+        assert left.execute_script("return self.origin") == "null"
+        assert severe(left) == []
+
+
+@pytest.mark.slow
+def test_a_real_arm(driver: Any, server: Served, tmp_path: Path) -> None:
+    robot, data = map(Path, shared("irb120"))
+    begin(driver, server, "irb120")
+    drop(driver, "measured", data)
+    wait_for(driver, "read")
+    drop(driver, "robot", robot)
+    until(lambda: state(driver, "robot") == "done", "no robot")
+    do(driver, "fit", "#fit")
+    folder = session_of(driver, server)
+    same_as_the_command_line(folder, str(robot), tmp_path)
+    assert run("calibrate", robot, data, "-o", tmp_path / "direct.json") == 0
+    ours, direct = (mc.load_fit(p) for p in (folder / "fit.json", tmp_path / "direct.json"))
+    assert_allclose(ours.error, direct.error, rtol=0, atol=DIGITS)  # of the file as it came
+    fill(driver, "#judge [name=rms]", "1")
+    do(driver, "judge")
+    assert one(driver, "[data-panel=verdict] .banner").text == "Passed"
+    do(driver, "urdf")
+    assert (folder / "robot.urdf").stat().st_size > 1000
+    assert severe(driver) == []

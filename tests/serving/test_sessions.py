@@ -1,0 +1,108 @@
+"""A session is a folder; no name leads out of it, and no choice breaks it."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.serving.sessions import (
+    CHOICES,
+    GIVEN,
+    Session,
+    new_session,
+    plain_name,
+    session,
+    sessions,
+)
+
+
+@pytest.fixture
+def at(tmp_path: Path) -> Session:
+    made = new_session(tmp_path, "Cell 7: the blue one")
+    (made.folder / GIVEN / "poses.csv").write_text("q1_deg\n")
+    return made
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../x.csv", "a/b.csv", "a\\b.csv", "/etc/passwd", "..", ".", "", ".hidden", "-o", "con",
+     "NUL.csv", "a\0b", "a\nb", "a.csv ", "a.", "x" * 121, "C:poses.csv", "a\u202egpj.csv"],
+)  # fmt: skip
+def test_names_that_are_refused(at: Session, name: str) -> None:
+    with pytest.raises(OptionError, match=r"^file name "):
+        at.file(GIVEN, name)
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "Meßwerte (2).txt", "smr_1.txt", "T_ROB1.mod"])
+def test_names_that_serve(name: str) -> None:
+    assert plain_name(name) == name
+
+
+def test_a_link_leads_nowhere_else(at: Session, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("x")
+    os.symlink(tmp_path / "secret", at.folder / "fit.json")
+    with pytest.raises(OptionError, match="leads out"):
+        at.file("fit.json")
+
+
+def test_sessions_have_names_of_their_own(at: Session, tmp_path: Path) -> None:
+    other = new_session(tmp_path, "Cell 7: the blue one")
+    assert (at.name, other.name) == ("cell-7-the-blue-one", "cell-7-the-blue-one-2")
+    assert new_session(tmp_path, "../..").folder.parent == tmp_path
+    assert {one.name for one in sessions(tmp_path)} >= {at.name, other.name}
+    for name in ("", "..", "none", "../x", "Cell"):
+        with pytest.raises(OptionError, match="no session"):
+            session(tmp_path, name)
+
+
+def test_choices_are_kept_as_they_were_made(at: Session) -> None:
+    at.choose({"measured": ["poses.csv"], "robot": "irb120", "left_out": ["12:smr2"], "rms": 0.2})
+    again = Session(at.folder).choices
+    assert again.measured == ("poses.csv",)
+    assert again.left_out == ("12:smr2",)
+    assert (again.robot, again.rms, again.most) == ("irb120", 0.2, None)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"measured": ["../x"]}, {"measured": ["none.csv"]}, {"robot": "nobody"}, {"rms": -1},
+     {"rms": float("nan")}, {"left_out": ["x; rm"]}, {"objective": "best"}, {"poses": 0},
+     {"unknown": 1}, {"measured": "poses.csv"}, {"units": "x" * 3000},
+     {"units": "a\0b"}, {"columns": "a\nb"}, {"units": "\ud800"}],
+)  # fmt: skip
+def test_choices_that_are_refused_change_nothing(at: Session, changes: dict[str, object]) -> None:
+    before = at.choose({"measured": ["poses.csv"]})
+    with pytest.raises(OptionError):
+        at.choose(changes)
+    assert at.choices == before
+
+
+def test_a_removed_file_is_chosen_no_more(at: Session) -> None:
+    at.choose({"measured": ["poses.csv"], "joints": "poses.csv"})
+    left = at.remove("poses.csv")
+    assert (left.measured, left.joints) == ((), "")
+    assert at.given() == []
+
+
+def test_a_session_is_full_at_last(at: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert at.room("new.csv") == 256 << 20
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 10)
+    assert at.room("new.csv") == 3  # beside the seven bytes of the one that is there
+    assert at.room("poses.csv") == 10  # in its place
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_FILES", 1)
+    with pytest.raises(OptionError, match="remove some"):
+        at.room("new.csv")
+
+
+def test_choices_that_somebody_broke_are_told(at: Session) -> None:
+    (at.folder / CHOICES).write_text("{")
+    with pytest.raises(OptionError, match=r"session\.json"):
+        at.choices  # noqa: B018
+
+
+def test_the_stamp_changes_with_every_file(at: Session) -> None:
+    before = at.stamp()
+    assert at.stamp() == before
+    (at.folder / "fit.json").write_text("{}")
+    assert at.stamp() != before

@@ -1,0 +1,97 @@
+"""What people read: messages of Python know no command line, and every command's help is whole."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from conftest import ROOT, run
+
+import minimax_cal as mc
+from minimax_cal.cli.commands import ENTRIES
+from minimax_cal.cli.options import RESULT, Grouped, InGroups, in_flags
+from minimax_cal.cli.running import cli
+
+PACKAGE = ROOT / "minimax_cal"
+FLAG = re.compile(r"(?:^|[\s(`'\"])(?:--[a-z]|-[oq]\b)")
+BROWSERS = "pdf.py"  # whose strings are the options of a browser
+
+
+def strings(tree: ast.AST) -> Iterator[ast.Constant]:
+    """Text that the code may show: no docstrings, no names of options."""
+    hidden = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    hidden |= {
+        id(k.value) for k in ast.walk(tree) if isinstance(k, ast.keyword) and k.arg == "flag"
+    }
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in hidden
+        ):
+            yield node
+
+
+def test_messages_of_python_speak_of_no_flag() -> None:
+    theirs = {"cli", "serving"}  # the page writes the command lines that do the same
+    rooms = [path for path in PACKAGE.rglob("*.py") if not theirs & set(path.parts)]
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {node.value!r}"
+        for path in rooms
+        if path.name != BROWSERS
+        for node in strings(ast.parse(path.read_text()))
+        if FLAG.search(node.value)
+    ]
+    assert len(rooms) > 200
+    assert not found, "\n".join(found)
+
+
+def test_the_command_line_calls_arguments_by_its_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = cli.commands["plan"]
+    for said, shown in (
+        ("candidates=5: give more", "--candidates 5: give more"),
+        ("approach='both' is about revisits: give revisit=", "--approach both is about revisits: "
+         "give --revisit"),
+        ("give another tracker=, normals= or reach=.", "give another --tracker, --normals or "
+         "--range."),
+        ("per_metre=-1 must be", "--noise-per-metre -1 must be"),
+        ("units='q=deg' is no option here, nor is q=3", "units='q=deg' is no option here, nor is "
+         "q=3"),
+    ):  # fmt: skip
+        assert in_flags(said, plan) == shown
+    with pytest.raises(mc.OptionError, match=r"^candidates=5: "):
+        mc.plan("irb120", 8, candidates=5)
+    assert run("plan", "irb120", "--poses", 8, "--candidates", 5) == 2
+    assert capsys.readouterr().err.startswith("error: --candidates 5: ")
+    (tmp_path / "raw.csv").write_text("1,2,3,4,5,6,7,8,9\n2,3,4,5,6,7,8,9,1\n")
+    with pytest.raises(mc.DataError, match=r"say what they are, as columns='"):
+        mc.import_files([tmp_path / "raw.csv"])
+    assert run("import", tmp_path / "raw.csv") == 2
+    assert "as --columns smr1_mm,q_deg (6 joints) or --columns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_help_is_in_groups_and_whole_sentences(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = cli.commands[name]
+    assert isinstance(command, InGroups)
+    assert run(name, "--help") == 0
+    out = capsys.readouterr().out
+    titles = re.findall(r"^(\S.*):$", out, re.M)
+    assert titles[-1] == RESULT
+    assert len(titles) == len(set(titles))
+    options = [p for p in command.params if isinstance(p, click.Option)]
+    groups = {p.group or RESULT for p in options if isinstance(p, Grouped)}
+    assert groups <= set(titles)
+    for each in options:
+        text = re.sub(r" \[default: [^]]*\]", "", each.help or "")
+        assert re.match(r"[A-Z]|u95", text), f"{name} {each.name}: {text!r}"
+        assert text.endswith("."), f"{name} {each.name}: {text!r}"
+        assert len(text.split()) > 2, f"{name} {each.name}: {text!r}"
