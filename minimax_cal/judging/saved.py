@@ -69,6 +69,7 @@ def open_saved(
     notices: list[str] = []
     if data:
         measured = read_measurements(data)
+        check_joints(known.cell.robot, measured)
         notices += measured.notices
         if known.placed:
             measured, said = known_targets(measured, known.cell)

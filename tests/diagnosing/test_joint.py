@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -73,6 +74,22 @@ def test_compliances_are_not_negative() -> None:
     assert low[0] == 0.0
     assert low[1] == -high[1]
     assert (high > 0.0).all()
+
+
+def test_a_fit_is_worse_beyond_a_part_in_a_thousand(play: Study) -> None:
+    fit = joint(play, ())
+    for factor, no_worse in ((0.9995, True), (0.998, False), (2.0, True)):
+        other = replace(fit)
+        other.__dict__["train"] = replace(fit.train, rms_mm=factor * fit.train.rms_mm)
+        assert fit.no_worse(other) == no_worse
+
+
+def test_no_effect_moves_a_point_by_more_than_a_fiftieth_of_the_reach(play: Study) -> None:
+    (low, high), scene = bounds(play.scene, (PLAY,))[0], play.scene
+    motion = PLAY.columns(scene).displacement(scene)
+    farthest = np.sqrt((motion**2).sum(axis=2)).max()
+    assert_allclose(high * farthest, 0.02 * scene.robot.reach(), rtol=1e-12)
+    assert low == -high
 
 
 def test_an_effect_that_is_not_there_is_no_rung(play: Study) -> None:

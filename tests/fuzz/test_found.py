@@ -261,3 +261,16 @@ def test_a_backends_process_imports_nothing_from_the_current_folder(
     problem = Problem(np.eye(2), -np.ones(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     found = child.run("qp_backends.via_qpsolvers", problem, "quadprog", 1e-8, 60.0, COLD)
     np.testing.assert_allclose(found.x, 1.0, rtol=0, atol=1e-9)
+
+
+def test_measurements_without_a_joint_are_not_those_of_the_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their joints were looked for among the training poses."""
+    fit, path = tmp_path / "fit.json", tmp_path / "data.csv"
+    fit.write_bytes(material()["fit.json"])
+    rows = [line.split(",") for line in material()["data.csv"].decode().splitlines()]
+    path.write_text("\n".join(",".join(row[:5] + row[6:]) for row in rows))
+    for command in ("iso9283", "map", "evaluate", "check"):
+        more = ("--tolerance", "rms 0.5") if command == "check" else ()
+        assert "has 5 joint columns" in refused(capsys, command, fit, path, *more)

@@ -285,3 +285,9 @@ def test_the_way_down_from_a_flat_point_is_the_steepest() -> None:
         lambda x: np.array([-1e-7 * x[0] ** 2]),
     ):
         assert below(scaled(flat, nowhere), nowhere) is None
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_a_limit_is_the_number_of_programs(most: int) -> None:
+    found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), jac="cs", maxiter=most)
+    assert (found.status, found.nit) == ("iteration_limit", most)
