@@ -36,7 +36,8 @@ def judged(
     if patched([found for found in sure if np.isfinite(found.size)]):
         return "unknown", ("two laws for one joint may stand for one that is not known",
                            structure[1])  # fmt: skip
-    if any(not found.established and found.p_value < CERTAIN for found in causes.effects):
+    loose = sum(f.size for f in causes.effects if not f.established and f.p_value < CERTAIN)
+    if loose > HALF * (loose + sum(f.size for f in sure if np.isfinite(f.size))):
         return "unknown", ("names that change with the poses", structure[1])
     if not closes_enough(sure, ladder, rest):
         return "unknown", ("a curve of the joints that has no name", structure[1])
