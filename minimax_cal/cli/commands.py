@@ -138,7 +138,7 @@ def keeping_inputs(command: Callable[..., Any] | None) -> Callable[..., Any]:
             for name, value in named.items()
             if name not in WRITTEN
             for part in (value if isinstance(value, list | tuple) else [value])
-            if isinstance(part, str | Path)
+            if isinstance(part, str | Path) and str(part)
         ]
         inputs += [part.rpartition("#")[0] for part in map(str, inputs) if "#" in part]  # a link
         for i, path in enumerate(map(Path, outputs)):

@@ -205,8 +205,9 @@ class Output:
         """Print notices on stderr, one a line."""
         shown = () if self.quiet else texts[:MOST_NOTICES]
         for text in shown:
-            command = click.get_current_context().command
-            click.echo(f"notice: {one_line(in_flags(text, command))}", err=True)
+            at = click.get_current_context(silent=True)
+            said = in_flags(text, at.command) if at else text
+            click.echo(f"notice: {one_line(said)}", err=True)
         if shown and len(texts) > MOST_NOTICES:
             click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
 

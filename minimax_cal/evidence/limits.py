@@ -11,6 +11,7 @@ EXACT = 1e-8  # noise below which data were computed, not measured [m]
 LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
 TIE = 2.0  # of evidence that a replacement must gain, so that choices do not go round
 REFINED = 6  # effects among which each is compared anew with all others: more change nothing
+SELDOM = 5  # of more effects each is compared anew after so many, and at the end
 NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so many, are tuned
 TUNINGS = 3  # rounds of a finer search
 MOST = 30  # effects: the IRB 120 has about twenty

@@ -22,6 +22,7 @@ from minimax_cal.evidence.limits import (
     MOST,
     NEAR,
     REFINED,
+    SELDOM,
     TIE,
     TUNINGS,
 )
@@ -91,9 +92,13 @@ def select(lib: Library, most: int = MOST, *, ripple: bool = True, level: float 
         tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table, level)
         if not best:
+            lib, fits = refined(lib, fits, level) if len(fits) > REFINED else (lib, fits)
             break
-        lib, fits = refined(lib, [*fits, *best], level)
+        fits = [*fits, *best]
+        if len(fits) <= REFINED or len(fits) % SELDOM == 0:
+            lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
+    noise = noise_beside(lib, fits)
     benches = []
     for i, one in enumerate(fits):
         chosen, others = without(fits, i)
@@ -179,7 +184,7 @@ def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Adde
 
 def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, list[Added]]:
     """Replace each effect by any that does better, and drop what is no longer needed."""
-    if len(fits) == 1:
+    if len(fits) <= 1:
         return lib, fits
     for _ in range(3):
         changed = False

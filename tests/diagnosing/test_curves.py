@@ -16,11 +16,11 @@ from minimax_cal.diagnosing.curves import (
     order_curve,
     residual_curve,
     turns,
-    value_of,
     without,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.drivers import own_value
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots.kinematics import rotation
@@ -170,7 +170,7 @@ def test_an_offset_is_drawn_along_the_line_of_sight() -> None:
 
 def test_a_slide_is_shown_in_millimetres() -> None:
     left = left_by(NOTHING, "scara_600")
-    label, x = value_of(left.scene, 2)
+    label, x = own_value(left.scene, 2, {})
     assert label == "joint 3 (mm)"
     assert_allclose(x, 1e3 * left.data.q[:, 2], rtol=1e-14)
 

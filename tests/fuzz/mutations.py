@@ -218,6 +218,9 @@ OF_KIND: dict[str, tuple[Callable[[bytes, Rng], bytes], ...]] = {
     "toml": (odd_words,),
     "urdf": (odd_words,),
     "xml": (odd_words,),
+    "mod": (odd_words,),
+    "src": (odd_words,),
+    "dat": (odd_words,),
 }
 
 

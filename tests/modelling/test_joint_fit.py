@@ -104,7 +104,7 @@ MAP = 1e-3 * spread(2.0, 1.5, waves_over(1.5)) * np.random.default_rng(4).normal
 CASES: dict[str, list[float]] = {
     "joint_compliance:J2": [6e-7],
     "cross_compliance:J2:source=3": [8e-7],
-    "gravity_compensator:J3:zero=1.5:eye=0.4:rest=0.45": [2e-3],
+    "gravity_compensator:J2:zero=3.1:eye=0.4:rest=0.45": [2e-3],
     "gravity_compensator:J2:zero=0:eye=0.4:rest=0.45": [2e-3],
     "link_bending:L2": [3e-7],
     "base_flex:frame": [2e-7],

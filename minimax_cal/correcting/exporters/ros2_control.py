@@ -47,6 +47,6 @@ def write(job: Job) -> Export:
     if np.abs(change).max() > SAME:
         said.append(
             "lengths and angles beside the zero positions were fitted too and are not in this "
-            "file; calibrate with --only offsets, or export urdf"
+            "file; calibrate with only='offsets', or export urdf"
         )
     return Export.of(text, *said)

@@ -102,13 +102,13 @@ def check_used(language: ModuleType, text: Text, tool: str, work: str) -> None:
     """Raise OptionError for a move with another tool or work object than was named."""
     for line, moved, on in language.used(text):
         for used, given, option, none in (
-            (moved, tool, "--tool", "tool0"),
-            (on, work, "--wobj", "wobj0"),
+            (moved, tool, "tool", "tool0"),
+            (on, work, "wobj", "wobj0"),
         ):
             if "," not in given and used.lower() != (given or none).lower():
                 raise OptionError(
                     f"{text.source}:{line}: moves with {used}, not with {given or none}; give "
-                    f"{option} {used}, or its frame as x,y,z,q1,q2,q3,q4, and correct modules of "
+                    f"{option}='{used}', or its frame as x,y,z,q1,q2,q3,q4, and correct modules of "
                     "several tools one by one"
                 )
 

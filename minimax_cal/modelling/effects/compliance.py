@@ -150,10 +150,11 @@ CROSS_COMPLIANCE = Effect(
 )  # fmt: skip
 
 
-def lean(scene: Scene) -> Array:
-    """(m,) angle of the second link from the vertical about its joint's axis [rad]."""
-    up = np.broadcast_to(scene.robot.up[:, None], scene.links.z[1].shape)
-    axis, along = scene.links.z[1], scene.links.after[1] - scene.links.before[1]
+def lean(scene: Scene, joint: int) -> Array:
+    """(m,) angle of a joint's link from the vertical about the joint's axis [rad]."""
+    links = scene.links
+    up = np.broadcast_to(scene.robot.up[:, None], links.z[joint].shape)
+    axis, along = links.z[joint], links.after[joint] - links.before[joint]
     side = np.cross(up, along, axis=0)
     return np.asarray(np.arctan2((side * axis).sum(axis=0), (up * along).sum(axis=0)))
 
@@ -161,12 +162,12 @@ def lean(scene: Scene) -> Array:
 def spring(scene: Scene, place: str, choice: Choice) -> Columns:
     """dq_j = k sin(b) (1 - s0 / s), s^2 = a^2 + L^2 - 2 a L cos b.
 
-    b: of joint 2 the lean of the upper arm, of another its own angle, less the spring's zero, where
-    its eye is nearest to its anchor.  The eye sits at `eye` and the free length is `rest`, both in
-    units of the distance L from the joint to its anchor.
+    b: the lean of the joint's link less the spring's zero, where its eye is nearest to its anchor.
+    The eye sits at `eye` and the free length is `rest`, both in units of the distance L from the
+    joint to its anchor.
     """
     joint = joint_of(place)
-    angle = (lean(scene) if joint == 1 else scene.q[joint]) - choice["zero"]
+    angle = lean(scene, joint) - choice["zero"]
     a, rest = choice["eye"], choice["rest"]
     length = np.sqrt(1.0 + a * a - 2.0 * a * np.cos(angle))
     pull = np.sin(angle) * (1.0 - rest / length)
@@ -187,28 +188,29 @@ def finer_spring(scene: Scene, choice: Choice) -> Sequence[Choice]:
 
 
 def spring_places(scene: Scene) -> tuple[str, ...]:
-    """Joints 2 and 3, where they swing in a vertical plane."""
-    if scene.joints < 3:
-        return ()
-    level = np.abs((scene.links.z[1:3] * scene.robot.up[:, None]).sum(axis=1)).max(axis=1) < 0.5
-    swing = np.ptp(lean(scene)) > 0.1, np.ptp(scene.q[2]) > SWING
-    turns = ~scene.robot.prismatic[1:3]
-    return tuple(f"J{i + 2}" for i in range(2) if turns[i] and level[i] and swing[i])
+    """The shoulder: the first joint that turns about a level axis, where it swings upright.
+
+    Springs at other joints have no direction of their own: with any zero they imitate two orders of
+    a gear.
+    """
+    level = np.abs((scene.links.z * scene.robot.up[:, None]).sum(axis=1)).max(axis=1) < 0.5
+    joints = np.flatnonzero(level & ~scene.robot.prismatic)
+    swings = len(joints) > 0 and np.ptp(lean(scene, int(joints[0]))) > SWING
+    return (f"J{joints[0] + 1}",) if swings else ()
 
 
-# Where a spring is shortest: the arm upright, or hanging (its anchor on the other side); of another
-# joint than the second, which tells no direction by itself, all round.
-ZEROS = {True: (-0.25, 0.0, 0.25, np.pi), False: (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)}
-SWING = 0.5  # least range of a joint other than the second [rad]
+# Where a spring is shortest: the arm upright, or hanging (its anchor on the other side).
+ZEROS = (-0.25, 0.0, 0.25, np.pi)
+SWING = 0.1  # least range of the lean [rad]
 
 
 GRAVITY_COMPENSATOR = Effect(
     "gravity_compensator",
-    "the spring that balances the upper arm, or the forearm",
+    "the spring that balances the upper arm",
     "dq_j = k a L sin(q_j - phi) (1 - s_0/s)",
     spring_places,
     spring,
-    choices=lambda scene, place: springs(ZEROS[place == "J2"], (0.4, 0.55), (0.45, 0.65)),
+    choices=lambda scene, place: springs(ZEROS, (0.4, 0.55), (0.45, 0.65)),
     finer=finer_spring,
     typical=1e-2,
     follows="angle",
