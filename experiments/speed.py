@@ -38,12 +38,12 @@ from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distanc
 from minimax_cal.fitting.options import solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.tables import Table
-from minimax_cal.kernels import choice, plain
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots.kernels import choice, plain
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers import least_squares, minimax
 

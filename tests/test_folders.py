@@ -8,7 +8,6 @@ import pytest
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
-    "kernels",
     "solvers",
     "robots",
     "measuring",

@@ -23,8 +23,8 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
-from minimax_cal.kernels.choice import work
 from minimax_cal.reporting.plots.figures import save_errors
+from minimax_cal.robots.kernels.choice import work
 
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 

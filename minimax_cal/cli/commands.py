@@ -158,7 +158,7 @@ def paced(command: Callable[..., Any] | None, *, brief: bool) -> Callable[..., A
 
     @wraps(command)  # type: ignore[arg-type]
     def at_pace(*given: Any, **named: Any) -> Any:
-        from minimax_cal.kernels.choice import work  # NumPy comes with it
+        from minimax_cal.robots.kernels.choice import work  # NumPy comes with it
 
         with work(brief=brief):
             return command(*given, **named)  # type: ignore[misc]

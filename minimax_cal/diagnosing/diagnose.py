@@ -139,13 +139,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     study = replace(study, moments=clean.moments)
     causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
-    progress("gap ladder")
-    spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
-    ladder = climbed(study, [finding.terms for finding in spoken.effects])
-    if "joint_error_map" not in options.exclude:
-        progress("error maps of joints")
-        spoken, ladder = with_maps(spoken, ladder)
-        causes = spoken if spoken.maps.terms else causes
+    causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
     steps = steps_of(asked, study, judges, spoken, ladder)
     for step in steps:
         progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
@@ -195,6 +189,20 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         nominal=study.nominal,
         remainder=rest,
     )
+
+
+def in_rungs(
+    study: Study, causes: Causes, exclude: Sequence[str], progress: Progress
+) -> tuple[Causes, Causes, Ladder]:
+    """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
+    progress("gap ladder")
+    spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
+    ladder = climbed(study, [finding.terms for finding in spoken.effects])
+    if "joint_error_map" in exclude:
+        return causes, spoken, ladder
+    progress("error maps of joints")
+    spoken, ladder = with_maps(spoken, ladder)
+    return spoken if spoken.maps.terms else causes, spoken, ladder
 
 
 def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels.choice import kernels, ready
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kernels.choice import kernels, ready
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 

@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels.choice import kernels, ready
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import Names, State, links_of
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kernels.choice import kernels, ready
 from minimax_cal.robots.kinematics import Chain, hat
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal

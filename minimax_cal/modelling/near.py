@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.kernels.choice import kernels
 from minimax_cal.modelling.model import Model, SumOfSquares, arrays_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import AUTO, NEAR, LeastSquares, method_of
 from minimax_cal.solvers.status import Status

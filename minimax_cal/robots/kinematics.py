@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels import plain
-from minimax_cal.kernels.choice import kernels, ready
-from minimax_cal.kernels.plain import ALPHA as ALPHA
-from minimax_cal.kernels.plain import BETA as BETA
-from minimax_cal.kernels.plain import THETA as THETA
-from minimax_cal.kernels.plain import A as A
-from minimax_cal.kernels.plain import D as D
-from minimax_cal.kernels.plain import cross as cross
+from minimax_cal.robots.kernels import plain
+from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.kernels.plain import ALPHA as ALPHA
+from minimax_cal.robots.kernels.plain import BETA as BETA
+from minimax_cal.robots.kernels.plain import THETA as THETA
+from minimax_cal.robots.kernels.plain import A as A
+from minimax_cal.robots.kernels.plain import D as D
+from minimax_cal.robots.kernels.plain import cross as cross
 
 MDH_NAMES = ("a", "d", "theta", "alpha", "beta")
 

@@ -29,7 +29,6 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     rows = found.last
     state = rows.state.step(rows.step)
     names, data = watched.names, watched.data
-    n = fit.robot.joints
     sure = spread_of(fit, watched, found)
     known = sure.active
     cell = Cell.of(
@@ -40,7 +39,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     parameters = Parameters(told_parameters(fit, cell, nominal, sure, known), fit.known.dof)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
-    links = [names.all[i] for i in range(5 * n) if not rows.active[i]]
+    links = [names.all[i] for i in range(5 * fit.robot.joints) if not rows.active[i]]
     settings = {
         **fit.options.settings(), "objective": "sum", "holdout": 0.0, "holdout_by": None,
         "fix": links, "free": (), "priors": {}, "loss": "square", "trim": 0.0,

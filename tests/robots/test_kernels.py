@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
-from minimax_cal.kernels import choice, plain
 from minimax_cal.modelling.model import Model, arrays_of, model_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kernels import choice, plain
 
 Arrays = tuple[np.ndarray, ...]
 ALIKE = 1e-12  # relative to the largest entry
@@ -21,7 +21,7 @@ POSES = 150  # more than a block of the compiled kernels
 @pytest.fixture
 def fast() -> ModuleType:
     pytest.importorskip("numba", reason="numba is not installed: pip install 'minimax-cal[fast]'")
-    from minimax_cal.kernels import fast
+    from minimax_cal.robots.kernels import fast
 
     return fast
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels import plain
+from minimax_cal.robots.kernels import plain
 
 SWITCH = "MINIMAX_CAL_KERNELS"  # plain or fast, in the environment; unset takes what is there
 NOTICE = "compiling kernels for this machine, once: about half a minute"
@@ -43,7 +43,7 @@ def best() -> Any:
     told = os.environ.get(SWITCH, "")
     if told == "plain" or (told != "fast" and util.find_spec("numba") is None):
         return plain
-    fast = import_module("minimax_cal.kernels.fast")
+    fast = import_module("minimax_cal.robots.kernels.fast")
     if not any(Path(fast.cost.stats.cache_path).glob("fast.*.nbi")):
         logging.getLogger("minimax_cal").warning(NOTICE)
     return fast

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.kernels.plain import FIRST, PIVOT, RISE, ROUNDS, STILL, STUCK, TRUST
+from minimax_cal.robots.kernels.plain import FIRST, PIVOT, RISE, ROUNDS, STILL, STUCK, TRUST
 
 BLOCK = 128  # poses: the Jacobian of one target then fits the second-level cache
 
