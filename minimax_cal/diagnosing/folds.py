@@ -9,6 +9,7 @@ import numpy as np
 from minimax_cal.diagnosing.causes import Causes, effects_of
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.limits import MOST
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.beyond import Beyond, Errors, without
 from minimax_cal.fitting.options import Progress
@@ -25,7 +26,7 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     used.  state: the geometry that was fitted to them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
-    choice = select(causes.library.only(rows), ripple=causes.ripple)
+    choice = select(causes.library.only(rows), ripple=causes.ripple, seldom=MOST)
     return climbed(small, causes.maps.beside(effects_of(choice)))
 
 

@@ -69,12 +69,20 @@ class Choice:
         return remaining(rows, weight, self.known)
 
 
-def select(lib: Library, most: int = MOST, *, ripple: bool = True, level: float = LEVEL) -> Choice:
+def select(
+    lib: Library,
+    most: int = MOST,
+    *,
+    ripple: bool = True,
+    level: float = LEVEL,
+    seldom: int = SELDOM,
+) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
     at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
-    of a false name on data without an effect.
+    of a false name on data without an effect.  seldom: of more than REFINED effects each is compared
+    anew after so many, and at the end.
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
@@ -95,7 +103,7 @@ def select(lib: Library, most: int = MOST, *, ripple: bool = True, level: float 
             lib, fits = refined(lib, fits, level) if len(fits) > REFINED else (lib, fits)
             break
         fits = [*fits, *best]
-        if len(fits) <= REFINED or len(fits) % SELDOM == 0:
+        if len(fits) <= REFINED or len(fits) % seldom == 0:
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
     noise = noise_beside(lib, fits)
