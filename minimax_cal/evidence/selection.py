@@ -81,8 +81,8 @@ def select(
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
     at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
-    of a false name on data without an effect.  seldom: of more than REFINED effects each is compared
-    anew after so many, and at the end.
+    of a false name on data without an effect.  seldom: of more than REFINED effects each is
+    compared anew after so many, and at the end.
     """
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
