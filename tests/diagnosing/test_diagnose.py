@@ -232,6 +232,7 @@ def test_fanuc_gravity_is_named() -> None:
     assert found.ladder[-1].holdout.rms_mm < 0.7 * found.ladder[1].holdout.rms_mm
 
 
+@pytest.mark.slow
 def test_meca_has_no_gravity() -> None:
     robot, file = shared("meca500_r")
     found = mc.diagnose(robot, mc.read_measurements(file).in_visit_order(), quick=True)
@@ -259,7 +260,8 @@ def irb120(every: int, *, read_back: bool = False) -> mc.Diagnosis:
     return mc.diagnose(mc.load_robot(robot), data.take(rows), quick=True)
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [3, 1])
 def test_irb120_gives_way_at_its_joints(every: int) -> None:
     found = irb120(every)
     assert found.findings[0].term.effect == "joint_compliance"

@@ -759,6 +759,7 @@ def test_paths_are_checked_first(results: Path, tmp_path: Path) -> None:
             command(results / "fit.json", *options)
 
 
+@pytest.mark.slow
 def test_real_arm_in_three_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = SHARED / "irb120"
     if not folder.is_dir():
