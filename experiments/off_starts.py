@@ -8,12 +8,14 @@ at their identity and origin, everything else nominal.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from experiments import pseudo_inverse
+from experiments.pseudo_inverse import ROUNDING
 from experiments.speed import identified
 from minimax_cal.fitting.start import search
 from minimax_cal.ground.arrays import Array
@@ -76,7 +78,8 @@ def measured(setting: Setting) -> tuple[Robot, Measurements]:
 class Job:
     """Some starts of one method: deviations of theta_2 and alpha_3.
 
-    parameters: identifiable, by the library, or one of UNITS, by the paper's own way.
+    parameters: identifiable, by the library, or one of UNITS, by the paper's own way.  moved:
+    whether each value of a start is moved by a unit of rounding, at random.
     """
 
     setting: Setting
@@ -85,6 +88,7 @@ class Job:
     theta: tuple[float, ...]
     alpha: tuple[float, ...]
     cap: int = CAP
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,12 +108,14 @@ def grid(every: int) -> tuple[Array, Array]:
     return theta.ravel(), alpha.ravel()
 
 
-def jobs_of(setting: Setting, method: str, parameters: str, every: int, cap: int) -> list[Job]:
+def jobs_of(
+    setting: Setting, method: str, parameters: str, every: int, cap: int, moved: bool = False
+) -> list[Job]:
     """The grid cut into jobs."""
     theta, alpha = grid(every)
     return [
         Job(setting, method, parameters, tuple(theta[i : i + CHUNK].tolist()),
-            tuple(alpha[i : i + CHUNK].tolist()), cap)
+            tuple(alpha[i : i + CHUNK].tolist()), cap, moved)
         for i in range(0, len(theta), CHUNK)
     ]  # fmt: skip
 
@@ -167,6 +173,9 @@ def to_the_letter(job: Job, robot: Robot, model: Model) -> Outcome:
     """The paper's own way, one start after the other."""
     iterations, costs, converged = [], [], []
     begins = [flat(robot, t, a) for t, a in zip(job.theta, job.alpha, strict=True)]
+    if job.moved:
+        rng = np.random.default_rng(0)
+        begins = [x * (1.0 + ROUNDING * rng.integers(-1, 2, x.size)) for x in begins]
     letter(job.method, job.parameters, model, begins[0], 1)  # compiling does not count
     began = time.perf_counter()
     for begin in begins:
@@ -189,6 +198,15 @@ def flat(robot: Robot, theta: float = 0.0, alpha: float = 0.0) -> Array:
     return np.concatenate([links_of(mdh), np.zeros(9)])
 
 
+def twin() -> Callable[..., tuple[int, float, int]] | None:
+    """`pseudo_inverse.iterate` of all parameters together, compiled, where numba is installed."""
+    try:
+        from experiments.pseudo_inverse_fast import iterate
+    except ImportError:
+        return None
+    return iterate
+
+
 def letter(
     method: str, parameters: str, model: Model, begin: Array, cap: int, course: int = 0
 ) -> tuple[int, float, int, Array]:
@@ -201,9 +219,13 @@ def letter(
     damping = DAMPING if METHODS[method].damped else 0.0
     costs = np.full(course, np.nan)
     y = unit * model.y[0].ravel()
+    at, q, rule = begin * scale, np.ascontiguousarray(model.q), (damping, BY, SMALL, cap)
+    separable = METHODS[method].separable
+    fast = None if separable else twin()
     with np.errstate(all="ignore"):
-        count, cost, ended = pseudo_inverse.iterate(
-            begin * scale, np.ascontiguousarray(model.q), y,
-            METHODS[method].separable, damping, BY, SMALL, cap, costs,
-        )  # fmt: skip
+        count, cost, ended = (
+            fast(at, q, y, *rule, costs)
+            if fast
+            else pseudo_inverse.iterate(at, q, y, separable, *rule, costs)
+        )
     return int(count), float(cost) / unit**2, int(ended), costs / unit**2
