@@ -32,6 +32,7 @@ from minimax_cal.solvers.status import Status
 PAPER = ("nlgn", "nllm", "snlgn", "snllm")
 UNITS = {"all, mm": 1e3, "all, m": 1.0}  # the paper's parameters: units a metre
 CAP = 10_000
+MANY = 5_000  # iterations allowed from which half a minute of compiling pays
 STEP = 1e-9  # motion of a point at which the library's iteration has ended [m]
 SMALL = 1e-6  # length of a step, in the units chosen, at which the paper's has ended
 DAMPING, BY = 1e-2, 10.0  # Marquardt's first damping and factor, as MATLAB's lsqnonlin has them
@@ -176,7 +177,8 @@ def to_the_letter(job: Job, robot: Robot, model: Model) -> Outcome:
     if job.moved:
         rng = np.random.default_rng(0)
         begins = [x * (1.0 + ROUNDING * rng.integers(-1, 2, x.size)) for x in begins]
-    letter(job.method, job.parameters, model, begins[0], 1)  # compiling does not count
+    # compiling does not count
+    letter(job.method, job.parameters, model, begins[0], 1, meant=job.cap)
     began = time.perf_counter()
     for begin in begins:
         count, cost, ended, _ = letter(job.method, job.parameters, model, begin, job.cap)
@@ -199,7 +201,7 @@ def flat(robot: Robot, theta: float = 0.0, alpha: float = 0.0) -> Array:
 
 
 def twin() -> Callable[..., tuple[int, float, int]] | None:
-    """`pseudo_inverse.iterate` of all parameters together, compiled, where numba is installed."""
+    """`pseudo_inverse.iterate` of all parameters together, where numba is there to compile it."""
     try:
         from experiments.pseudo_inverse_fast import iterate
     except ImportError:
@@ -208,11 +210,13 @@ def twin() -> Callable[..., tuple[int, float, int]] | None:
 
 
 def letter(
-    method: str, parameters: str, model: Model, begin: Array, cap: int, course: int = 0
-) -> tuple[int, float, int, Array]:
+    method: str, parameters: str, model: Model, begin: Array, cap: int, course: int = 0,
+    meant: int = 0,
+) -> tuple[int, float, int, Array]:  # fmt: skip
     """Iterations, cost [m^2], how it ended, and the costs of the first iterates (course,) [m^2].
 
-    One of PAPER on one of UNITS, on the first target of a model.
+    One of PAPER on one of UNITS, on the first target of a model.  meant: the cap that decides
+    whether the compiled twin runs, if it is not this one.
     """
     unit = UNITS[parameters]
     scale = np.where(model.names.linear, unit, 1.0)
@@ -221,7 +225,7 @@ def letter(
     y = unit * model.y[0].ravel()
     at, q, rule = begin * scale, np.ascontiguousarray(model.q), (damping, BY, SMALL, cap)
     separable = METHODS[method].separable
-    fast = None if separable else twin()
+    fast = twin() if not separable and max(cap, meant) >= MANY else None
     with np.errstate(all="ignore"):
         count, cost, ended = (
             fast(at, q, y, *rule, costs)
