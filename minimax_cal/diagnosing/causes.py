@@ -80,10 +80,10 @@ def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
 def named_in(choice: Choice) -> list[Named]:
     """The effects selected with their motions: of few parameters each its own, else together."""
     out = []
-    for one in choice.fits:
-        motion = choice.library.columns[:, one.candidate.main].T
-        motion = motion if len(motion) <= FEW else (one.value @ motion)[None]
-        out.append(Named(one.candidate.term, motion))
+    for candidate, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
+        motion = choice.library.columns[:, candidate.main].T
+        motion = motion if len(motion) <= FEW else (value @ motion)[None]
+        out.append(Named(candidate.term, motion))
     return out
 
 
@@ -122,7 +122,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
 def by_weight(choice: Choice) -> list[int]:
     """The effects in the order in which each takes most of what is left, points weighing alike."""
     lib = choice.library
-    fields = [lib.products.clear(one.candidate.main) for one in choice.fits]
+    fields = [lib.products.clear(candidate.main) for candidate in choice.chosen]
     sizes = [len(field) for field in fields]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     columns = np.concatenate([np.zeros((0, len(lib.rows.error))), *fields])
@@ -146,7 +146,7 @@ def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     """The terms of each effect selected, the weightiest first, all lines of a joint together."""
     out: dict[tuple[str, str], list[Term]] = {}
     for number in by_weight(choice):
-        term = choice.fits[number].candidate.term
+        term = choice.chosen[number].term
         out.setdefault((term.effect, term.place), []).append(term)
     return [tuple(terms) for terms in out.values()]
 

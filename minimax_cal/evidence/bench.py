@@ -12,12 +12,11 @@ from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Library
 from minimax_cal.evidence.noise import Noise, inflation
-from minimax_cal.evidence.products import within
+from minimax_cal.evidence.products import triangles, within
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import EFFECTS
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
-SAME = 1e-12  # added to products of unit columns where some are the same
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
 
 
@@ -253,21 +252,24 @@ class Fixed:
 
     def white(self, columns: Array, at: int) -> tuple[Array, Array]:
         """Columns (d, N) and the error (N,), projected, their rows of the same variance."""
-        both = np.concatenate([columns, self.error[None]]) * self.weights[at]
-        part = solve_triangular(self.factors[at], self.rows @ both.T, lower=True)
-        back = solve_triangular(self.factors[at], self.rows, lower=True)
-        left = (both / np.maximum(self.weights[at], 1e-300) - part.T @ back) * np.sqrt(
-            self.weights[at]
-        )
+        both = np.concatenate([columns, self.error[None]])
+        root = np.sqrt(self.weights[at])
+        factor = self.factors[at]
+        part = solve_triangular(factor, self.rows @ (both * self.weights[at]).T, lower=True)
+        value = solve_triangular(factor, part, lower=True, trans="T")
+        left = (both - value.T @ self.rows) * root
         return left[:-1], left[-1]
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
+        s, d = len(self.weights), len(columns)
+        weighed = (columns[None] * self.weights[:, None]).reshape(s * d, self.weights.shape[1])
+        shared = (self.rows @ weighed.T).reshape(-1, s, d)
         part = np.stack([
-            solve_triangular(factor, (self.rows * weight) @ columns.T, lower=True).T
-            for factor, weight in zip(self.factors, self.weights, strict=True)
+            solve_triangular(factor, shared[:, i], lower=True, check_finite=False).T
+            for i, factor in enumerate(self.factors)
         ])  # fmt: skip
-        pull = (self.weights * self.error) @ columns.T
+        pull = (weighed @ self.error).reshape(s, d)
         return part, pull - (part @ self.before[..., None])[..., 0]
 
 
@@ -291,53 +293,72 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
 
     fits: values of the chosen, where their doubts matter.
     """
-    products = lib.products
+    products, rows = lib.products, lib.rows
     main, loose, ridge = columns_of(chosen, fits)
     noise, dof = products.noise(main), products.dof(main)
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
-    p, fit = products.columns.fixed - 1, products.span.shape[1]
-    fixed, error, whole = products.across(ratios, index)
-    gram = np.concatenate(
-        [products.told_apart(fixed[:, :, :p], axis=2), fixed[:, :, p + 1 + index]], axis=2
-    )
-    r = fit + len(main)
-    gram[:, range(r, r + len(loose)), range(r, r + len(loose))] += ridge * noise.variance  # a prior
-    factors = triangles(gram)
+    at = products.at(ratios, index)
+    q = len(main)
+    gram = at.lines[:, :, index].copy()
+    gram[:, range(q, len(index)), range(q, len(index))] += ridge * noise.variance  # a prior
+    factor = triangles(gram)
+    both = np.concatenate([at.pull[..., None], at.lines], axis=2)
     part = np.stack([
-        solve_triangular(factor, lines[:, p:], lower=True, check_finite=False).T
-        for factor, lines in zip(factors, fixed, strict=True)
-    ])  # fmt: skip
+        solve_triangular(lower, lines, lower=True, check_finite=False).T
+        for lower, lines in zip(factor, both, strict=True)
+    ]) if len(index) else np.zeros((len(ratios), both.shape[2], 0))  # fmt: skip
     before, part = part[:, 0], part[:, 1:]
-    square = error[:, p]
-    total = np.maximum(square - (before**2).sum(axis=1), ROUNDING * square + 1e-300)
-    size = np.einsum("sff->sf", factors)[:, :r]
-    spread = np.log1p(ratios[:, None] * lib.rows.variance_ratio[products.kept]).sum(axis=1)
+    total = np.maximum(at.error[:, 0] - (before**2).sum(axis=1), ROUNDING * at.square + 1e-300)
+    size = np.einsum("sff->sf", factor)[:, :q]
+    spread = np.log1p(ratios[:, None] * rows.variance_ratio[products.kept]).sum(axis=1)
     settings = Settings(
         ratios=ratios,
         part=part,
         before=before,
-        pull=error[:, p + 1 :] - (part @ before[..., None])[..., 0],
+        pull=at.error[:, 1:] - (part @ before[..., None])[..., 0],
         total=total,
-        whole=whole,
-        logs=spread + 2.0 * np.log(size).sum(axis=1),
+        whole=at.whole,
+        logs=spread + at.logs + 2.0 * np.log(size).sum(axis=1),
         own=lambda index: products.among(ratios, index),
     )
-    geometry = products.told_apart(products.columns.clear[:p], axis=0)
-    rows = np.concatenate([geometry, products.clear(index)])
-    weights = products.kept / (1.0 + np.outer(ratios, lib.rows.variance_ratio))
-    held = Fixed(rows, factors, weights, before, lib.rows.error)
+    held = Fixed(
+        np.concatenate([products.geometry(), products.clear(index)]),
+        stacked(at.factor, at.part[:, :, 1:], factor),
+        products.kept / (1.0 + np.outer(ratios, rows.variance_ratio)),
+        np.concatenate([at.part[:, :, 0], before], axis=1),
+        rows.error,
+    )
     return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.count))
 
 
-def triangles(gram: Array) -> Array:
-    """(s, f, f) lower triangles whose squares are matrices (s, f, f)."""
-    scale = np.sqrt(np.einsum("sff->sf", gram))[..., None]
-    unit = gram / scale / np.swapaxes(scale, 1, 2)
-    try:
-        return np.asarray(scale * np.linalg.cholesky(unit))
-    except np.linalg.LinAlgError:  # two of the chosen are the same on these poses
-        return np.asarray(scale * np.linalg.cholesky(unit + SAME * np.eye(gram.shape[-1])))
+def stacked(first: Array, part: Array, second: Array) -> Array:
+    """Lower triangles of two sets of columns, (s, r, r) and (s, q, q), and (s, r, q) between."""
+    r = first.shape[1]
+    whole = np.zeros((len(first), r + second.shape[1], r + second.shape[1]))
+    whole[:, :r, :r], whole[:, r:, r:] = first, second
+    whole[:, r:, :r] = np.swapaxes(part, 1, 2)
+    return whole
+
+
+def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
+    """Values and sigmas (d,) of the parameters of effects, estimated together.
+
+    fits: the effects; their values are the sizes of their doubts.
+    """
+    main, loose, ridge = columns_of([one.candidate for one in fits], fits)
+    index = np.concatenate([main, loose])
+    if not len(index):
+        return ()
+    at = lib.products.at(np.array([noise.ratio]), index)
+    gram = at.lines[0][:, index].copy()
+    gram[range(len(main), len(index)), range(len(main), len(index))] += ridge * noise.variance
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(scale, scale), 1e-12, hermitian=True)
+    value = inverse @ (at.pull[0] / scale) / scale
+    sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
+    cuts = np.cumsum([len(one.candidate.main) for one in fits])
+    return tuple(zip(np.split(value, cuts)[:-1], np.split(sigma, cuts)[:-1], strict=True))
 
 
 def columns_of(

@@ -139,9 +139,8 @@ class Library:
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""
         products, count = self.products, self.products.columns.count
-        across, _, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
-        own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
-        left = own - (across[0, :, products.columns.fixed :] ** 2).sum(axis=0)
+        whole = products.at(np.zeros(1), np.zeros(0, dtype=int)).whole
+        left = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
         every = (products.columns.raw**2).sum(axis=0)  # what a part shows less of is rounding
         clear = (left > FAINT * whole[0]) & (whole[0] > GONE * every)
         shown = tuple(c for c in self.candidates if clear[c.main].all())

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
+from minimax_cal.evidence.bench import Added, Bench, bench, columns_of, together
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
@@ -39,19 +40,35 @@ NOTHING: Array = np.zeros(0, dtype=int)
 class Choice:
     """The effects selected.
 
-    library: with all columns that were tried.  fits: of each, the others given.
-    benches: of each, for its rivals.  noise: with all of them.
+    library: with all columns that were tried.  found: the effects, as each was when it was chosen.
+    noise: with all of them.
     """
 
     library: Library
-    fits: tuple[Added, ...]
-    benches: tuple[Bench, ...]
+    found: tuple[Added, ...]
     noise: Noise
 
     @property
     def chosen(self) -> tuple[Candidate, ...]:
         """The candidates."""
-        return tuple(one.candidate for one in self.fits)
+        return tuple(one.candidate for one in self.found)
+
+    @cached_property
+    def benches(self) -> tuple[Bench, ...]:
+        """Of each effect, for its rivals: beside the others."""
+        every = range(len(self.found))
+        return tuple(bench(self.library, *without(self.found, number)) for number in every)
+
+    @cached_property
+    def fits(self) -> tuple[Added, ...]:
+        """Each effect beside the others."""
+        pairs = zip(self.benches, self.chosen, strict=True)
+        return tuple(table.added(candidate) for table, candidate in pairs)
+
+    @cached_property
+    def estimates(self) -> tuple[tuple[Array, Array], ...]:
+        """Values and sigmas (d,) of the parameters of each effect, all estimated together."""
+        return together(self.library, self.found, self.noise)
 
     @property
     def known(self) -> Array:
@@ -87,8 +104,7 @@ def select(
     fits: list[Added] = []
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
-        return Choice(lib, (), (), noise)
-    tables: dict[tuple[int, ...], Bench] = {}
+        return Choice(lib, (), noise)
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
@@ -97,25 +113,17 @@ def select(
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
             break
-        tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table, level)
         if not best:
-            lib, fits = refined(lib, fits, level) if len(fits) > REFINED else (lib, fits)
             break
         fits = [*fits, *best]
         if len(fits) <= REFINED or len(fits) % seldom == 0:
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
-    noise = noise_beside(lib, fits)
-    benches = []
-    for i, one in enumerate(fits):
-        chosen, others = without(fits, i)
-        table = tables.get(tuple(map(id, chosen))) or bench(lib, chosen, others)
-        if not table.knows(one.candidate):  # tuned since
-            table = bench(lib, chosen, others)
-        benches.append(table)
-    final = tuple(b.added(one.candidate) for b, one in zip(benches, fits, strict=True))
-    return Choice(lib, final, tuple(benches), noise)
+    if len(fits) > REFINED:
+        lib, fits = refined(lib, fits, level)
+        noise = noise_beside(lib, fits)
+    return Choice(lib, tuple(fits), noise)
 
 
 def plain(lib: Library) -> tuple[Candidate, ...]:
@@ -173,6 +181,8 @@ def tuned(table: Bench, best: Added) -> Added:
     for _ in range(TUNINGS):
         term = best.candidate.term
         near = EFFECTS[term.effect].finer(table.library.scene, term.choice)
+        if not near:
+            break
         aside = table.library.aside([(replace(term, choice=choice), 1.0) for choice in near])
         ranked = table.beside(aside).ranked(aside.candidates)
         if not ranked or ranked[0].evidence <= best.evidence:
@@ -196,9 +206,8 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
         return lib, fits
     for _ in range(3):
         changed = False
-        for number in range(
-            min(len(fits) - 1, REFINED)
-        ):  # the last one was just chosen beside the others
+        others_than_last = range(min(len(fits) - 1, REFINED))  # it was just chosen beside them
+        for number in others_than_last:
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
