@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import AGAIN, DIFFER, FOLDS, SAME
+from minimax_cal.evidence.limits import AGAIN, DIFFER, FOLDS, MOST, SAME
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -28,7 +28,7 @@ def judged_again(
     part = folds(data, FOLDS)
     times = [0] * len(findings)
     for number in range(FOLDS):
-        choice = select(library.only(part != number), ripple=ripple, level=AGAIN)
+        choice = select(library.only(part != number), ripple=ripple, level=AGAIN, seldom=MOST)
         times = [n + is_found(one, choice, whole) for n, one in zip(times, findings, strict=True)]
     pairs = zip(findings, times, strict=True)
     return [replace(one, again=n / FOLDS) for one, n in pairs]

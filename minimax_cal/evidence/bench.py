@@ -10,11 +10,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
-from minimax_cal.evidence.library import Aside, Candidate, Library
+from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.noise import Noise, inflation
 from minimax_cal.evidence.products import triangles, within
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.table import EFFECTS
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
@@ -84,13 +83,12 @@ class Settings:
         value = value[..., 0]
         return value, (basis**2 @ kept[..., None])[..., 0], (value * pull).sum(axis=-1)
 
-    def added_all(self, same: Sequence[Candidate], dof: int) -> tuple[Array, Array, Array, Array]:
+    def added_all(self, kind: Kind, dof: int) -> tuple[Array, Array, Array, Array]:
         """Decrease of the square by each candidate; values, their variances; Occam's factor.
 
-        Doubts have the prior that the values found imply.  same: of equal numbers of columns.
+        Doubts have the prior that the values found imply.
         """
-        main = np.array([c.main for c in same])
-        both = np.concatenate([main, np.array([c.doubt for c in same])], axis=1)
+        main, both = kind.main, kind.both
         d = main.shape[1]
         block = self.blocks(both)
         none = np.zeros((len(self.ratios), *main.shape))
@@ -98,7 +96,7 @@ class Settings:
         if both.shape[1] == d:
             return gain, value, inverse, np.zeros(gain.shape)
         variance = np.maximum(self.total[:, None] - gain, 1e-300)[..., None] / dof
-        owner = np.broadcast_to([c.owner for c in same], (*gain.shape, both.shape[1] - d))
+        owner = np.broadcast_to(kind.owner, (*gain.shape, both.shape[1] - d))
         size = np.maximum(np.abs(np.take_along_axis(value, owner, axis=-1)), 1e-30)
         ridge = np.concatenate([none, variance / size**2], axis=-1)
         value, inverse, gain = self.solve(both, block, ridge)
@@ -130,7 +128,7 @@ class Bench:
 
     @cached_property
     def everyone(self) -> list[Added]:
-        """Every candidate of the library, the best first."""
+        """Candidates that are worth it, the best first, and the best of each kind."""
         found = self.ranked(self.library.candidates)
         if self.library.lines is not None:
             found += self.lines.ranked(self.library.lines.candidates)
@@ -154,33 +152,39 @@ class Bench:
         """A candidate beside what was chosen, at its best ratio."""
         line = self.line(c)
         if line is None:
-            return self.compared([c])[0]
-        return replace(self.lines.compared([line])[0], candidate=c)
+            return self.compared(Kind.of([c]))[0]
+        return replace(self.lines.compared(Kind.of([line]))[0], candidate=c)
 
     def ranked(self, among: Sequence[Candidate]) -> list[Added]:
-        """Candidates by evidence."""
-        kinds: dict[tuple[int, int], list[Candidate]] = {}
-        for c in among:
-            kinds.setdefault((len(c.main), len(c.doubt)), []).append(c)
-        found = [one for same in kinds.values() for one in self.compared(same)]
+        """Candidates that are worth it by evidence, and the best of each kind."""
+        found = [one for kind in kinds(tuple(among)) for one in self.compared(kind)]
         return sorted(found, key=lambda one: -one.evidence)
 
-    def compared(self, same: list[Candidate]) -> list[Added]:
-        """Candidates with the same numbers of columns and doubts, all at once."""
-        s = self.settings
-        gain, value, inverse, volume = s.added_all(same, self.dof)
+    def compared(self, kind: Kind) -> list[Added]:
+        """Candidates of a kind that are worth it, and the best."""
+        s, each = self.settings, np.arange(len(kind.candidates))
+        gain, value, inverse, volume = s.added_all(kind, self.dof)
         rest = np.maximum(s.total[:, None] - gain, 1e-300)
         cost = self.dof * np.log(rest) + s.logs[:, None]
-        out = []
-        for i, (c, at) in enumerate(zip(same, np.argmin(cost, axis=0), strict=True)):
-            variance = float(rest[at, i] / self.dof)
-            up = max(self.base - float(cost[at, i]), 0.0)
-            sigma = np.sqrt(np.maximum(inverse[at, i] * variance, 0.0))
-            worth = up - float(volume[at, i]) - occam(c, up)
-            worth -= prior_penalty(c, value[at, i], sigma)
-            ratio = float(s.ratios[at])
-            out.append(Added(c, up, worth, ratio, variance, value[at, i], sigma))
-        return out
+        at = np.argmin(cost, axis=0)
+        variance = rest[at, each] / self.dof
+        up = np.maximum(self.base - cost[at, each], 0.0)
+        value = value[at, each]
+        sigma = np.sqrt(np.maximum(inverse[at, each] * variance[:, None], 0.0))
+        worth = up - volume[at, each] - occam(kind, up) - prior_penalty(kind, value, sigma)
+        shown = np.union1d(np.flatnonzero(worth > 0.0), [np.argmax(worth)])
+        return [
+            Added(
+                kind.candidates[i],
+                float(up[i]),
+                float(worth[i]),
+                float(s.ratios[at[i]]),
+                float(variance[i]),
+                value[i],
+                sigma[i],
+            )
+            for i in shown.tolist()
+        ]
 
     def p_value(self, one: Added, wide: float = 1.0) -> float:
         """Probability that a candidate without effect gains so much, the best of all tries.
@@ -273,19 +277,17 @@ class Fixed:
         return part, pull - (part @ self.before[..., None])[..., 0]
 
 
-def occam(c: Candidate, gain: float) -> float:
-    """What d free parameters must gain to be worth it: d (1 + log of the gain of each)."""
-    d = len(c.main) + c.shapes
-    return d * (1.0 + float(np.log(max(gain / d, 1.0)))) + 2.0 * float(np.log(c.tries))
+def occam(kind: Kind, gain: Array) -> Array:
+    """What d free parameters must gain to be worth it (c,): d (1 + log of the gain of each)."""
+    d = kind.free
+    return np.asarray(d * (1.0 + np.log(np.maximum(gain / d, 1.0))) + 2.0 * np.log(kind.tries))
 
 
-def prior_penalty(c: Candidate, value: Array, sigma: Array) -> float:
-    """What values far beyond the usual cost, and signs that no body has."""
-    effect = EFFECTS[c.term.effect]
-    cost = float(((value / effect.typical) ** 2).sum())
-    if effect.positive and len(value) == 1 and value[0] < 0.0:
-        cost += float((value[0] / max(sigma[0], 1e-300)) ** 2)
-    return cost
+def prior_penalty(kind: Kind, value: Array, sigma: Array) -> Array:
+    """What values far beyond the usual cost (c,), and signs that no body has."""
+    cost = ((value / kind.typical[:, None]) ** 2).sum(axis=1)
+    wrong = kind.positive & (value[:, 0] < 0.0)
+    return np.asarray(cost + wrong * (value[:, 0] / np.maximum(sigma[:, 0], 1e-300)) ** 2)
 
 
 def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ()) -> Bench:
@@ -320,7 +322,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         total=total,
         whole=at.whole,
         logs=spread + at.logs + 2.0 * np.log(size).sum(axis=1),
-        own=lambda index: products.among(ratios, index),
+        own=at.among,
     )
     held = Fixed(
         np.concatenate([products.geometry(), products.clear(index)]),

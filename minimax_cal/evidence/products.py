@@ -7,9 +7,9 @@ every node; what is left is as smooth.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -208,6 +208,7 @@ class Beside:
         index = np.arange(p)
         gram = span.T @ np.moveaxis(sums.products(index, 0, p), 0, 1) @ span
         self.factor = triangles(gram)
+        self.inverse = np.linalg.inv(self.factor)
         self.logs = 2.0 * np.log(np.einsum("grr->gr", self.factor)).sum(axis=1)
         self.error = sums.products(np.array([p]), p, p + 1)[0, :, 0]
         self.lines = Lines(self.left, depth)
@@ -228,15 +229,15 @@ class Beside:
             self.held = grown(self.held, width, axis=2)
             raw = self.sums.products(np.arange(len(self.span)), known, width)
             turned = self.span.T @ np.moveaxis(raw, 0, 1)
-            self.held[:, :, known:width] = np.linalg.solve(self.factor, turned)
+            self.held[:, :, known:width] = self.inverse @ turned
             self.known = width
-        return self.held[:, :, :width]
+        return np.asarray(self.held[:, :, :width])
 
     def left(self, index: Array, start: int, stop: int) -> Array:
         """(f, g, d) products of columns with those from a first to before a last."""
         part = self.part
         shared = np.swapaxes(part[:, :, index], 1, 2) @ part[:, :, start:stop]
-        return self.sums.products(index, start, stop) - np.moveaxis(shared, 0, 1)
+        return np.asarray(self.sums.products(index, start, stop) - np.moveaxis(shared, 0, 1))
 
     def across(self, index: Array) -> Array:
         """(f, g, p + 1 + D) products of columns with all."""
@@ -257,14 +258,18 @@ class Beside:
         return self.sets[mark]
 
 
-class At(NamedTuple):
+View = tuple[Array, Beside, Array]  # which ratios (s,), of which products, how (s, g) combined
+
+
+@dataclass(frozen=True, eq=False)
+class At:
     """Products at ratios (s,), geometry projected out, of q columns and the error with all.
 
     lines: (s, q, D) with the candidates'.  error: (s, 1 + D) of the error with itself and those.
     square: (s,) of the error, unprojected.  whole: (s, D) squares of the candidates' as they are.
     factor: (s, r, r) lower triangles of the geometry's products; part: (s, r, 1 + q) coordinates
     of the error and of the q columns in its span; logs: (s,) log determinants.
-    pull: (s, q) of the q columns with the error.
+    pull: (s, q) of the q columns with the error.  views: where the ratios come from.
     """
 
     lines: Array
@@ -275,6 +280,15 @@ class At(NamedTuple):
     part: Array
     logs: Array
     pull: Array
+    views: Sequence[View]
+
+    def among(self, index: Array) -> Array:
+        """(s, c, d, d) products within sets of candidates' columns (c, d)."""
+        out = np.empty((len(self.logs), *index.shape, index.shape[1]))
+        for here, beside, between in self.views:
+            own = beside.among(index + beside.sums.columns.fixed)
+            out[here] = np.moveaxis(own @ between.T, -1, 0)
+        return out
 
 
 class Products:
@@ -315,13 +329,13 @@ class Products:
             self.formed[number] = Beside(self.sums(number), self.span)
         return self.formed[number]
 
-    def parts(self, ratios: Array) -> list[tuple[Array, Beside, Array]]:
+    def views(self, ratios: Array) -> list[View]:
         """Which ratios (s,), of which products, and how (s, g) combined."""
         if ratios is RATIOS:
             return [(np.arange(len(RATIOS)), self.beside(None), np.eye(len(RATIOS)))]
         logs = np.log10(np.maximum(ratios, 1e-300))
         numbers = np.floor(logs).astype(int)
-        out = []
+        out: list[View] = []
         for number in map(int, np.unique(numbers)):
             here = np.flatnonzero(numbers == number)
             if ratios[here[0]] == 0.0:
@@ -370,7 +384,7 @@ class Products:
         def cost(ratios: Array) -> tuple[Array, Array]:
             gram = np.empty((len(ratios), len(chosen), len(chosen)))
             logs = np.empty(len(ratios))
-            for here, beside, between in self.parts(ratios):
+            for here, beside, between in self.views(ratios):
                 gram[here] = np.tensordot(between, beside.square(chosen), 1)
                 logs[here] = between @ beside.logs
             value, squares = costs(gram, ratios, varied, dof)
@@ -391,21 +405,15 @@ class Products:
         square, logs = np.empty(s), np.empty(s)
         whole = np.empty((s, self.columns.count))
         factor, part = np.empty((s, r, r)), np.empty((s, r, 1 + q))
-        for here, beside, between in self.parts(ratios):
+        views = self.views(ratios)
+        for here, beside, between in views:
             lines[here] = np.moveaxis(between @ beside.across(fixed)[:, :, p:], 1, 0)
             whole[here] = between @ beside.sums.squares().T
             square[here], logs[here] = between @ beside.error, between @ beside.logs
             factor[here] = np.tensordot(between, beside.factor, 1)
             part[here] = np.tensordot(between, beside.part[:, :, fixed], 1)
-        return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, lines[:, 1:, 0])
-
-    def among(self, ratios: Array, index: Array) -> Array:
-        """(s, c, d, d) products within sets of candidates' columns (c, d), geometry projected."""
-        out = np.empty((len(ratios), *index.shape, index.shape[1]))
-        for here, beside, between in self.parts(ratios):
-            own = beside.among(index + self.columns.fixed)
-            out[here] = np.moveaxis(own @ between.T, -1, 0)
-        return out
+        pull = lines[:, 1:, 0]
+        return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, pull, views)
 
 
 SAME = 1e-12  # added to products of unit columns where some are the same

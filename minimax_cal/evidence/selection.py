@@ -211,7 +211,8 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
-            top = next(o for o in table.everyone if not repeated(o.candidate, chosen))
+            others_best = (o for o in table.everyone if not repeated(o.candidate, chosen))
+            top = next(others_best, own)
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True

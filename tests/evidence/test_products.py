@@ -22,7 +22,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term
 
 RATIOS = np.array([0.0, 0.013, 0.4, 3.7, 1.0e4])
-ROUNDING = 1e-12  # of products, relative to the largest of their columns
+ROUNDING = 1e-9  # of products, relative to the largest of their columns
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
 
     between = interpolation(np.log10(ratios) - decade, NODES)
     found = between @ weights(nodes(decade))
-    assert_allclose(found, weights(ratios), rtol=1e-12)
+    assert_allclose(found, weights(ratios), rtol=1e-9)
 
 
 @pytest.mark.parametrize("some", [False, True])
@@ -73,7 +73,8 @@ def test_products_are_the_sums_over_rows_that_count(
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     clear, raw = products.columns.clear, products.columns.raw
     p = products.columns.fixed - 1
-    found, within = products.at(RATIOS, index), products.among(RATIOS, sets)
+    found = products.at(RATIOS, index)
+    within = found.among(sets)
     for i, ratio in enumerate(RATIOS):
         weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
         geometry, root = products.geometry() * np.sqrt(weight), np.sqrt(weight)
@@ -88,13 +89,13 @@ def test_products_are_the_sums_over_rows_that_count(
         for c, pair in enumerate(1 + sets):
             off = np.abs(within[i, c] - gram[np.ix_(pair, pair)])
             assert np.all(off <= atol[np.ix_(pair, pair)])
-        assert_allclose(found.whole[i], weight @ raw**2, rtol=1e-11)
-        assert_allclose(found.square[i], every[0] @ every[0], rtol=1e-11)
-        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-9)
+        assert_allclose(found.whole[i], weight @ raw**2, rtol=ROUNDING)
+        assert_allclose(found.square[i], every[0] @ every[0], rtol=ROUNDING)
+        assert_allclose(found.logs[i], np.linalg.slogdet(geometry @ geometry.T)[1], atol=1e-8)
         lower = found.factor[i]
-        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=1e-10, atol=1e-12)
+        assert_allclose(lower @ lower.T, geometry @ geometry.T, rtol=ROUNDING, atol=1e-9)
         shared = geometry @ every[np.concatenate([[0], 1 + index])].T
-        assert_allclose(lower @ found.part[i], shared, rtol=1e-9, atol=1e-12 * size.max())
+        assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
 
 
 def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
