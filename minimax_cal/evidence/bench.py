@@ -11,8 +11,8 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
-from minimax_cal.evidence.noise import Noise, inflation
-from minimax_cal.evidence.products import triangles, within
+from minimax_cal.evidence.noise import Noise, inflation, triangles
+from minimax_cal.evidence.products import LEAST, within
 from minimax_cal.ground.arrays import Array
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
@@ -301,8 +301,9 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
     at = products.at(ratios, index)
-    q = len(main)
+    q, each = len(main), range(len(index))
     gram = at.lines[:, :, index].copy()
+    gram[:, each, each] += LEAST * at.whole[:, index]
     gram[:, range(q, len(index)), range(q, len(index))] += ridge * noise.variance  # a prior
     factor = triangles(gram)
     both = np.concatenate([at.pull[..., None], at.lines], axis=2)

@@ -230,11 +230,11 @@ class Stack:
         fields = columns.displacement(self.scene)
         if not np.any(fields):
             return None
-        doubts, owners = [np.zeros((0, *fields.shape[1:]))], []
+        every, owners = [fields], []
         for number, doubt in columns.doubts(self.scene):
-            doubts.append(doubt)
+            every.append(doubt)
             owners += [number] * len(doubt)
-        main, doubt = self.place(fields), self.place(np.concatenate(doubts))
+        main, doubt = np.split(self.place(np.concatenate(every)), [len(fields)])
         return Candidate(term, main, doubt, np.array(owners, dtype=int), tries)
 
 

@@ -19,6 +19,7 @@ from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
+SAME = 1e-12  # added to products of unit columns where some are the same
 FREE = 3  # degrees of freedom below which no noise is told from another
 
 
@@ -187,10 +188,19 @@ def costs(gram: Array, ratios: Array, varied: Array, dof: int) -> tuple[Array, A
     """
     gram = gram + 0.0
     gram[:, -1, -1] += 1e-300
-    scale = np.sqrt(np.einsum("rpp->rp", gram))
-    eye = 1e-13 * np.eye(gram.shape[-1])
-    factor = np.linalg.cholesky(gram / (scale[:, :, None] * scale[:, None, :]) + eye)
-    logs = np.log(np.einsum("rpp->rp", factor)) + np.log(scale)
+    logs = np.log(np.einsum("rpp->rp", triangles(gram)))
     squares = np.exp(2.0 * logs[:, -1])
     spread = np.log1p(ratios[:, None] * varied).sum(axis=1)
     return dof * np.log(squares) + spread + 2.0 * logs[:, :-1].sum(axis=1), squares
+
+
+def triangles(gram: Array) -> Array:
+    """(s, f, f) lower triangles whose squares are matrices (s, f, f), as near as those allow."""
+    scale = np.sqrt(np.maximum(np.einsum("sff->sf", gram), 1e-300))[..., None]
+    unit = gram / scale / np.swapaxes(scale, 1, 2)
+    try:
+        return np.asarray(scale * np.linalg.cholesky(unit))
+    except np.linalg.LinAlgError:  # two columns are the same, or the geometry imitates one
+        lift = SAME + 2.0 * np.maximum(-np.linalg.eigvalsh(unit)[:, 0], 0.0)
+        eye = np.eye(gram.shape[-1])
+        return np.asarray(scale * np.linalg.cholesky(unit + lift[:, None, None] * eye))

@@ -13,10 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import FREE, Noise, Rows, costs, noise_of, told_apart
+from minimax_cal.evidence.noise import FREE, Noise, Rows, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
 from minimax_cal.ground.arrays import Array
 
+LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
 BLOCK = 4_000_000  # weighed numbers that are held at once
 
 
@@ -383,10 +384,12 @@ class Products:
 
         def cost(ratios: Array) -> tuple[Array, Array]:
             gram = np.empty((len(ratios), len(chosen), len(chosen)))
-            logs = np.empty(len(ratios))
+            logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
             for here, beside, between in self.views(ratios):
                 gram[here] = np.tensordot(between, beside.square(chosen), 1)
+                least[here] = LEAST * (between @ beside.sums.squares()[index].T)
                 logs[here] = between @ beside.logs
+            gram[:, range(len(index)), range(len(index))] += least
             value, squares = costs(gram, ratios, varied, dof)
             return value + logs, squares
 
@@ -414,16 +417,3 @@ class Products:
             part[here] = np.tensordot(between, beside.part[:, :, fixed], 1)
         pull = lines[:, 1:, 0]
         return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, pull, views)
-
-
-SAME = 1e-12  # added to products of unit columns where some are the same
-
-
-def triangles(gram: Array) -> Array:
-    """(s, f, f) lower triangles whose squares are matrices (s, f, f)."""
-    scale = np.sqrt(np.einsum("sff->sf", gram))[..., None]
-    unit = gram / scale / np.swapaxes(scale, 1, 2)
-    try:
-        return np.asarray(scale * np.linalg.cholesky(unit))
-    except np.linalg.LinAlgError:  # two of the chosen are the same on these poses
-        return np.asarray(scale * np.linalg.cholesky(unit + SAME * np.eye(gram.shape[-1])))

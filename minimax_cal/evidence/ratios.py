@@ -2,7 +2,7 @@
 
 A row with the variance ratio v weighs 1/(1 + ratio v).  Along the logarithm of the ratio that is a
 smooth step whose nearest poles lie pi beside the real line, so that a polynomial through so many
-Chebyshev points in every decade gives all weights to 1e-10, and with them all products, what
+Chebyshev points in every decade gives all weights to rounding, and with them all products, what
 is left of these when columns are projected out, and likelihoods.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 
 RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 9)])  # among which the likeliest is sought
-NODES = 14  # points in a decade of ratios: products to 1e-10
+NODES = 18  # points in a decade of ratios: products to rounding
 FEW = 14  # points in two decades where a likelihood is least: to 1e-7 of it
 FINE = 401  # points between which a polynomial's least value is sought
 

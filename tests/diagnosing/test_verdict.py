@@ -14,8 +14,7 @@ from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.verdict import heard, patched
 from minimax_cal.evidence import limits
-from minimax_cal.evidence.bench import Added
-from minimax_cal.evidence.library import Candidate
+from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import Term
 
 
@@ -24,19 +23,17 @@ def finding(effect: str, place: str, size: float = 100.0, again: float = 1.0) ->
     return Finding((Term(effect, place),), ("a",), ("rad",), none, none, size, 1e-9, again=again)
 
 
-def added(effect: str, place: str, value: float, sigma: float) -> Added:
-    none = np.zeros(0, dtype=int)
-    c = Candidate(Term(effect, place), np.zeros(1, dtype=int), none, none)
-    return Added(c, 1.0, 1.0, 0.0, 1.0, np.array([value]), np.array([sigma]))
+def told(value: float, sigma: float) -> tuple[Array, Array]:
+    return np.array([value]), np.array([sigma])
 
 
 def test_parameters_agree_within_the_sigmas_of_both() -> None:
-    whole = added("gear_error", "J1", 1.0, 0.1)
+    whole = told(1.0, 0.1)
     for value, agree in ((1.1, True), (1.4, True), (2.0, False), (0.0, False), (-1.0, False)):
-        assert established.agree(added("gear_error", "J1", value, 0.1), whole) == agree
-    sure = added("gear_error", "J1", 1.0, 1e-6)
-    assert established.agree(added("gear_error", "J1", 1.1, 1e-6), sure)  # a tenth is no other law
-    assert not established.agree(added("gear_error", "J1", 1.5, 1e-6), sure)
+        assert established.agree(told(value, 0.1), whole) == agree
+    sure = told(1.0, 1e-6)
+    assert established.agree(told(1.1, 1e-6), sure)  # a tenth is no other law
+    assert not established.agree(told(1.5, 1e-6), sure)
 
 
 def test_structure_must_be_improbable_and_of_account() -> None:

@@ -114,9 +114,12 @@ class Term:
 
     def columns(self, scene: Scene) -> Columns:
         """How points move per unit of its parameters."""
-        if self.text not in scene.laws:
-            scene.laws[self.text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
-        return scene.laws[self.text]
+        text = self.text
+        if text not in scene.laws:
+            if len(scene.laws) >= LAWS:  # a search looks at thousands, each a few times in a row
+                del scene.laws[next(iter(scene.laws))]
+            scene.laws[text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
+        return scene.laws[text]
 
 
 def of_sessions(frames: Frames) -> tuple[Term, ...]:
@@ -188,6 +191,7 @@ def terms(
     return tuple(out)
 
 
+LAWS = 300  # whose columns a scene keeps
 CONSTANTS = frozenset({"constant", "fast", "slow"})  # of time, above 0; infinite is straight
 FREE = frozenset({  # any number will do
     "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest",
