@@ -39,6 +39,7 @@ from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
+from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
@@ -176,6 +177,32 @@ class Parameters(Sequence[Parameter]):
                 "reason": [p.reason for p in self.every],
             }
         )  # fmt: skip
+
+
+def link_by_link(
+    names: Names,
+    units: Sequence[str],
+    before: Array,
+    after: Array,
+    sigma: Array,
+    known: Identification,
+) -> tuple[Parameter, ...]:
+    """Every parameter in the order in which people read them.
+
+    units: of each, SI.  before, after, sigma: (p,) as drawn, as found and how sure [SI].
+    """
+    return tuple(
+        Parameter(
+            name=names.all[i],
+            value=float(after[i]),
+            nominal=float(before[i]),
+            sigma=float(sigma[i]),
+            unit=units[i],
+            identifiable=bool(known.active[i]),
+            reason=known.reasons.get(names.all[i], ""),
+        )
+        for i in names.link_by_link
+    )
 
 
 def parameter_table(parameters: Iterable[Parameter]) -> Table:

@@ -39,7 +39,7 @@ from minimax_cal.modelling.model import (
     with_poses,
 )
 from minimax_cal.modelling.near import nearby
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares, minimax
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
@@ -283,8 +283,7 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     names = model.names
     allowed = ~names.match(options.fix, "fix")
     if options.only == OFFSETS:
-        n, zeros = robot.joints, np.zeros(names.count, dtype=bool)
-        zeros[np.arange(n) + np.where(robot.prismatic, n, 2 * n)] = True
+        zeros = np.isin(np.arange(names.count), zero_positions(robot.prismatic))
         allowed &= zeros | ~names.links
     order = identify.drop_order(robot, names)
     kept = names.match(options.free, "free")

@@ -190,6 +190,6 @@ def sized(watched: Watched, rows: Rows, found: list[Moved]) -> tuple[Moved, ...]
     out = []
     for each in found:
         i = names.index(each.parameter)
-        unit = "m" if names.linear[i] else "rad"
-        out.append(replace(each, by=float(change[i]), sigma=float(sigma[i]), unit=unit))
+        by, size = float(change[i]), float(sigma[i])
+        out.append(replace(each, by=by, sigma=size, unit=names.units[i]))
     return tuple(out)

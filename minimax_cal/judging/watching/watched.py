@@ -21,7 +21,7 @@ from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.solvers import least_squares
 
 PLENTY = 500  # poses that tell what more would
@@ -76,8 +76,7 @@ class Watched:
     @property
     def zeros(self) -> Array:
         """(n,) the parameters that say where each joint's zero is."""
-        n = self.cell.robot.joints
-        return np.arange(n) + np.where(self.cell.robot.prismatic, n, 2 * n)
+        return zero_positions(self.cell.robot.prismatic)
 
     @cached_property
     def start(self) -> tuple[Model, State]:
