@@ -41,8 +41,8 @@ from minimax_cal.modelling.model import (
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots.robot import Robot
-from minimax_cal.solvers import least_squares, minimax
-from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 
@@ -390,9 +390,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
 
     The turn that fits the errors best vanishes for half a turn too: start near the answer.
     """
-    points, method = float(model.counts.sum()), method_of(task.options.method)
-    problem = SumOfSquares(model)
-    return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
+    return nearby(model, stage.state, task.options.method)
 
 
 def worst_case(

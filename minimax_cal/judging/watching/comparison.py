@@ -20,8 +20,8 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.judging.watching.compared import Changed, Comparison, Difference
-from minimax_cal.judging.watching.moved import CLEARER, LEVEL, LIKEWISE, MOST, ZEROS
+from minimax_cal.judging.watching.compared import Comparison, Difference
+from minimax_cal.judging.watching.moved import MOST, Moved, levels, picked
 from minimax_cal.judging.watching.opening import watched_of
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.modelling.model import model_of
@@ -141,7 +141,7 @@ def differences(
 
 def explained(
     fit: Fit, change: Array, covariance: Array, free: Array
-) -> tuple[tuple[Changed, ...], float]:
+) -> tuple[tuple[Moved, ...], float]:
     """Which parameters' changes explain all differences, the clearest first; chance of none.
 
     free: (c,) those that can be compared.  A parameter counts by what it explains of the whole
@@ -155,9 +155,6 @@ def explained(
         covariance[np.ix_(free, free)] / np.outer(sigma, sigma), rcond=SMALLEST, hermitian=True
     )
     off, is_zero = change[free] / sigma, np.isin(free, zero_positions(fit.robot.prismatic))
-    shares = np.where(
-        is_zero, ZEROS / max(is_zero.sum(), 1), (1 - ZEROS) / max((~is_zero).sum(), 1)
-    )
     total = float(off @ inverse @ off)
     same = float(stats.chi2.sf(total, np.linalg.matrix_rank(inverse)))
     chosen: list[int] = []
@@ -168,25 +165,19 @@ def explained(
         rest = inverse - columns @ solve_normal(gram, columns.T)
         score, size = rest @ off, np.diag(rest)
         open_ = (size > SMALLEST * np.diag(inverse)) & ~np.isin(np.arange(len(free)), chosen)
-        square = np.where(open_, score**2 / np.where(open_, size, 1.0), 0.0)
+        square = np.where(open_, score**2 / np.where(open_, size, 1.0), -np.inf)
         p_value = np.asarray(stats.chi2.sf(square, 1))
-        passed = p_value <= LEVEL * shares
+        passed = p_value <= levels(is_zero)
         if not passed.any():
             break
-        zero, link = (
-            int(np.argmax(np.where(passed & k, square, -1.0))) for k in (is_zero, ~is_zero)
-        )
-        better = passed[link] and square[link] > square[zero] + CLEARER
-        pick = link if better or not passed[zero] else zero
-        lost = square[pick] - square
-        near = [i for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick and open_[i]]
+        pick, near = picked(square, passed, is_zero)
         chosen.append(pick)
         told.append((float(p_value[pick]), tuple(names.all[free[i]] for i in near)))
     spread = np.linalg.inv(inverse[np.ix_(chosen, chosen)]) if chosen else np.zeros((0, 0))
     by = (spread @ (inverse[chosen] @ off)) * sigma[chosen]
     sure = np.sqrt(np.diag(spread)) * sigma[chosen]
     return tuple(
-        Changed(
+        Moved(
             names.all[free[i]],
             float(by[row]),
             float(sure[row]),

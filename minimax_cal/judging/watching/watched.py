@@ -20,9 +20,9 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import Model, SumOfSquares, model_of
+from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
-from minimax_cal.solvers import least_squares
 
 PLENTY = 500  # poses that tell what more would
 PLACINGS = 3  # passes that place an arm with effects
@@ -98,13 +98,8 @@ class Watched:
             if terms:
                 model, state = extended(plain, robot, self.data, state, terms)
             model = model.only(active)
-            points = float(model.counts.sum())
             if active.any():
-                found = least_squares.solve(
-                    SumOfSquares(model), state.batch(), 1, points,
-                    least_squares.METHODS["snllm"], least_squares.NEAR, trace=False,
-                )  # fmt: skip
-                state = found.x.take(np.array(0))
+                state = nearby(model, state).x.take(np.array(0))
         return model, state
 
     def rows(self, active: Array, state: State) -> Rows:
