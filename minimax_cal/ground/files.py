@@ -83,6 +83,15 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
 
 
+def made_folder(path: Path) -> Path:
+    """The folder, made where it is not there.  Raises CalibrationError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be made ({error.strerror})") from error
+    return path
+
+
 def json_text(content: object) -> str:
     """JSON as this project writes it; NaN, which JSON does not know, raises ValueError."""
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
