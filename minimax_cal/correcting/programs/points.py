@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -108,14 +109,7 @@ def of_quaternion(q: Array, where: str) -> Array:
     size = float(np.linalg.norm(q))
     if abs(size - 1.0) > 1e-3:
         raise DataError(f"{where}: the quaternion has length {size:.4g}; it must be 1")
-    w, x, y, z = q / size
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat(np.roll(q, -1)).as_matrix())  # it wants w last
 
 
 def posed(place: Array, turn: Array) -> Array:
