@@ -100,7 +100,7 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
     sure = {
         term.text
         for finding in told.findings
-        if getattr(finding, "established", True)
+        if finding.established
         for term in finding.terms
         if term.effect in EFFECTS
     }
