@@ -14,7 +14,7 @@ from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import MASS_PER_METRE, torques
+from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot, load_robot
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
@@ -141,11 +141,5 @@ def random_poses(robot: Robot, count: int, rng: np.random.Generator, span: float
 def gravity(robot: Robot, q: Array) -> Array:
     """Gravity torques (m, n), in the controller's sense [N m]; assumed masses where unknown."""
     links = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic)
-    known = np.isfinite(robot.mass) & np.isfinite(robot.com).all(axis=1)
-    length = np.hypot(robot.mdh[:, 0], robot.mdh[:, 1])
-    halfway = np.zeros((robot.joints, 3))
-    halfway[:, 0] = -0.5 * robot.mdh[:, 0]
-    mass = np.where(known, robot.mass, MASS_PER_METRE * length)
-    com = np.where(known[:, None], robot.com, halfway)
-    bend = torques(links, mass, com, robot.up).T * robot.sign
+    bend = torques(links, *masses_of(robot), robot.up).T * robot.sign
     return np.where(robot.prismatic, 0.0, bend)

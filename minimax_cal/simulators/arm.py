@@ -22,7 +22,7 @@ from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import random_poses
-from minimax_cal.robots.gravity import LEAST_MASS
+from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.springs import Springs, springs_of
 
@@ -79,7 +79,7 @@ class Arm:
 
 def assumed(robot: Robot) -> bool:
     """Whether masses have to be assumed: the robot does not tell all of them."""
-    return not bool(np.isfinite(robot.mass).all() and np.isfinite(robot.com).all())
+    return not bool(weighed(robot).all())
 
 
 def stiff(robot: Robot, masses: tuple[Array, Array]) -> Arm:
@@ -111,9 +111,8 @@ def arm_of(
     q = sample(robot) if q is None or not len(q) else q
     poses = still(q, cell.target_names, robot) if measured is None else measured
     scene = cell.scene(poses)
-    mass, com = scene.masses
-    own = (np.maximum(mass, LEAST_MASS), com)
-    parts = Parts(replace(stiff(robot, masses or own), spots=cell.target_positions))
+    begun = stiff(robot, masses or masses_of(robot, LEAST_MASS))
+    parts = Parts(replace(begun, spots=cell.target_positions))
     for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
         ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
     change = np.zeros(sum(len(values) for _, values in parts.firm))

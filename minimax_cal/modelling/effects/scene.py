@@ -13,7 +13,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import stood
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import G, centres, torques, tubes
+from minimax_cal.robots.gravity import G, centres, masses_of, torques, weighed
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
@@ -124,20 +124,12 @@ class Scene:
     @cached_property
     def known_masses(self) -> bool:
         """Whether the robot file tells the masses and centres of gravity of the moving links."""
-        mass, com = self.robot.mass, self.robot.com
-        return bool(np.isfinite(mass[1:]).all() and np.isfinite(com[1:]).all())
+        return bool(weighed(self.robot)[1:].all())
 
     @cached_property
     def masses(self) -> tuple[Array, Array]:
-        """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m].
-
-        Where the file does not tell them: a uniform tube along each link.
-        """
-        tube, halfway = tubes(self.robot.mdh)
-        mass, com = self.robot.mass, self.robot.com
-        known = np.isfinite(mass) & np.isfinite(com).all(axis=1)
-        mass = np.where(known, mass, tube)
-        return mass, np.where(known[:, None], com, halfway)
+        """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m]: `masses_of`."""
+        return masses_of(self.robot)
 
     def torque(self, mass: Array, com: Array) -> Array:
         """(n, m) gravity's torque about each joint, 0 at slides [N m]."""
