@@ -51,6 +51,7 @@ from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.robots.robot import Robot, load_robot
 
@@ -198,7 +199,7 @@ def in_rungs(
     progress("gap ladder")
     spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
-    if "joint_error_map" in exclude:
+    if JOINT_ERROR_MAP.name in exclude:
         return causes, spoken, ladder
     progress("error maps of joints")
     spoken, ladder = with_maps(spoken, ladder)

@@ -58,6 +58,7 @@ from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
@@ -65,7 +66,7 @@ from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
-JUMP = ("session_jump", "session_jump:frame")  # without its moment
+JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 NAMED = 5  # implausible changes that are told one by one
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
@@ -241,7 +242,7 @@ def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) 
     if not len(rows):
         return options
     since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
-    found = Term("session_jump", "frame", {"since": since})
+    found = Term(SESSION_JUMP.name, "frame", {"since": since})
     return replace(options, effects=[found if e in JUMP else e for e in options.effects])
 
 

@@ -275,7 +275,7 @@ def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
             f"{data.source}: {named}: taken to be measured from where session "
             f"{next(iter(frames))} was (the fit knows {', '.join(frames)})"
         )
-    timed = [t.label for t in cell.effects.terms if {"constant", "fast", "since"} & t.choice.keys()]
+    timed = [t.label for t in cell.effects.terms if t.by_clock]
     if timed and "clock" not in data.columns:
         column = clock.column if clock else "visit order"
         place = clock.on(data).columns.get("clock") if clock else None

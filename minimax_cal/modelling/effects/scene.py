@@ -214,6 +214,11 @@ class Columns:
     fixed: Mapping[str, float] = field(default_factory=dict)
     ridge: Array = field(default_factory=lambda: np.zeros(0))
 
+    @property
+    def only_turns(self) -> bool:
+        """Whether joints turn, and targets do not move besides."""
+        return not self.shift.size
+
     def displacement(self, scene: Scene) -> Array:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
         out = np.zeros((len(self.names), *scene.points.shape))
@@ -311,6 +316,16 @@ class Effect:
     def of_angle(self) -> bool:
         """Whether it is a function of its joint's own angle."""
         return self.follows in ("angle", "wave")
+
+    @property
+    def of_move(self) -> bool:
+        """Whether it comes from the way to a pose."""
+        return self.follows in ("approach", "move")
+
+    @property
+    def of_session(self) -> bool:
+        """Whether it ends with the session in which it was measured."""
+        return self.follows == "time" and not self.of_flange
 
 
 def joint_of(place: str) -> int:
