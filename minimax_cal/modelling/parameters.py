@@ -19,6 +19,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.transforms import transform
 
 BASE_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
 
@@ -55,9 +56,7 @@ class State:
     @property
     def base(self) -> Array:
         """(4, 4) pose of the base in the measurement frame, of a single state."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.rotation, self.origin
-        return pose
+        return transform(self.rotation, self.origin)
 
     def along(self, axes: Array) -> Array:
         """(p,) all parameters of a single state as people are told them, in the order of `Names`.

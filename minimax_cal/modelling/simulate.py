@@ -16,6 +16,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.transforms import transform
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
 
@@ -100,10 +101,9 @@ def simulate(
     n = robot.joints
     errors = rng.normal(size=(n, 5)) * ([truth.length] * 2 + [truth.angle] * 3)
     real = robot.with_mdh(robot.mdh + errors)
-    base = np.eye(4)
-    base[:3, :3] = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
+    turn = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
     aside = rng.normal(size=3)
-    base[:3, 3] = truth.distance * aside / np.linalg.norm(aside)
+    base = transform(turn, truth.distance * aside / np.linalg.norm(aside))
     angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets
     spots = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0.0 * angle], axis=1) * truth.circle
     cell = Cell(real, base, tuple(f"smr{i + 1}" for i in range(targets)), spots)

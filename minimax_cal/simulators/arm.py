@@ -25,6 +25,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.springs import Springs, springs_of
 
 SAMPLES = 120  # poses at which laws and springs are compared
@@ -152,9 +153,7 @@ def with_springs(arm: Arm, found: Springs, state: State) -> Arm:
     state: geometry, base and targets of the fit.
     """
     after = state.step(found.change)
-    mount = np.eye(4)
-    mount[:3, :3] = state.rotation.T @ after.rotation
-    mount[:3, 3] = state.rotation.T @ (after.origin - state.origin)
+    mount = inverse(state.base) @ after.base
     arm = with_tool(arm, found.sag, found.drawn)
     return replace(
         arm,

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.robots.transforms import transform
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 LONGEST = 40  # letters of a number
@@ -114,6 +115,4 @@ def of_quaternion(q: Array, where: str) -> Array:
 
 def posed(place: Array, turn: Array) -> Array:
     """(4, 4) of a place (3,) [mm] and a rotation."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, 1e-3 * place
-    return pose
+    return transform(turn, 1e-3 * place)
