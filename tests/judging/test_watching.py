@@ -291,7 +291,8 @@ def test_the_pick_explains_most_and_zero_positions_go_first() -> None:
     first = np.array([True, False, False])
     square = np.array([30.0, 38.0, 20.0])
     assert moved.picked(square, every, first)[0] == 0  # a link that is not clearly better
-    assert moved.picked(square + [0.0, moved.CLEARER, 0.0], every, first)[0] == 1
+    clearer = np.array([30.0, 38.0 + moved.CLEARER, 20.0])
+    assert moved.picked(clearer, every, first)[0] == 1
     assert moved.picked(square, ~first, first)[0] == 1  # the zero position may be chance
     assert moved.picked(square, every, none)[0] == 1  # no zero position at all: the largest
     rivals = moved.picked(np.array([30.0, 30.0 - 0.9 * moved.LIKEWISE, -np.inf]), every, none)
