@@ -37,7 +37,8 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.simulate import Truth, gravity, random_poses, simulate
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
+from minimax_cal.robots.sampling import random_poses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -41,8 +41,9 @@ from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.simulate import gravity, random_poses
+from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import nearest_rotation
 
 if TYPE_CHECKING:

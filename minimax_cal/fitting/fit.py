@@ -30,6 +30,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
@@ -53,7 +54,6 @@ ACCURACIES = (  # where accuracy is told: title, key
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 NOT_IDENTIFIED = "not identified because"
-MILLI = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}  # how people read a parameter
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class Parameter:
     @property
     def scale(self) -> tuple[float, str]:
         """Factor and unit in which people read it: millimetres, milliradians."""
-        return MILLI.get(self.unit, (1.0, self.unit))
+        return for_people(self.unit)
 
     @property
     def written(self) -> tuple[float, str]:
         """Factor and unit in files: only lengths are scaled, to millimetres."""
-        return (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        return in_files(self.unit)
 
     @property
     def why_not(self) -> str:

@@ -20,6 +20,7 @@ from scipy.special import gammaincinv, stdtrit
 from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
+from minimax_cal.ground.units import in_files
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
@@ -239,7 +240,7 @@ class Uncertainty:
         names = self.names.all
         return {
             "names": [names[i] for i in known],
-            "units": ["mm" if self.units[i] == "m" else self.units[i] for i in known],
+            "units": [in_files(self.units[i])[1] for i in known],
             "rows": rows.tolist(),
             "source": self.source,
             "degrees_of_freedom": self.dof,
@@ -256,7 +257,7 @@ def quantile(level: float, dof: float) -> float:
 
 def scales(units: tuple[str, ...]) -> Array:
     """(p,) what a parameter is multiplied by in JSON: 1e3 for lengths."""
-    return np.array([1e3 if unit == "m" else 1.0 for unit in units])
+    return np.array([in_files(unit)[0] for unit in units])
 
 
 def noise_of(poses: Poses) -> tuple[Noise, float]:

@@ -16,6 +16,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import transform
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
@@ -121,21 +122,6 @@ def simulate(
         source=f"simulated {robot.name}",
     )
     return Simulation(data, cell)
-
-
-def random_poses(robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi) -> Array:
-    """Joint values (count, n) within the limits and one turn, the flange above the floor."""
-    most = np.where(robot.prismatic, 0.5, span)
-    lower, upper = np.maximum(robot.lower, -most), np.minimum(robot.upper, most)
-    chosen = np.empty((0, robot.joints))
-    for _ in range(100):
-        q = rng.uniform(lower, upper, (4 * count, robot.joints))
-        high = robot.pose(q)[:, :3, 3] @ robot.up > 0.1 * robot.reach()
-        chosen = np.concatenate([chosen, q[high]])[:count]
-        if len(chosen) == count:
-            return chosen
-    # an arm that hangs below its base: every pose is as good as another
-    return rng.uniform(lower, upper, (count, robot.joints))
 
 
 def gravity(robot: Robot, q: Array) -> Array:

@@ -22,9 +22,9 @@ from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.springs import Springs, springs_of
 

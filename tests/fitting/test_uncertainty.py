@@ -33,7 +33,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import Prior, pose_weights
 from minimax_cal.modelling.parameters import State, links_of
-from minimax_cal.modelling.simulate import Simulation, Truth, random_poses, simulate
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.sampling import random_poses
 
 NOISE = Noise(0.5, (20e-6) ** 2, 15e-6)
 H = 1e-6  # step of the central differences [m, rad]: errors of 1e-9 relative

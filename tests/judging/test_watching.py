@@ -16,7 +16,8 @@ from minimax_cal.judging.watching import moved
 from minimax_cal.judging.watching.moved import search
 from minimax_cal.judging.watching.opening import watched_of
 from minimax_cal.modelling.effects import EFFECTS
-from minimax_cal.modelling.simulate import Simulation, Truth, random_poses, simulate
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.sampling import random_poses
 
 TRUTH = Truth(compliance=0.0)
 SIGMAS = 4.0  # that an estimate may be off: one of 16 000 is

@@ -15,10 +15,11 @@ from minimax_cal.modelling.effects import EFFECTS, Scene, Term
 from minimax_cal.modelling.effects.scene import Columns
 from minimax_cal.modelling.effects.table import Fitted, fitted_from_list, terms
 from minimax_cal.modelling.effects.time import ROOM
-from minimax_cal.modelling.simulate import gravity, random_poses
+from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import MASS_PER_METRE, G
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_poses
 
 DOCS = ROOT / "docs" / "effects.md"
 EXACT = 1e-12  # relative: the same arithmetic by another way

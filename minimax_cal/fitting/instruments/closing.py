@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.fitting.identify import random_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.inverse import missing, nearest
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
 
 LONGEST = 0.5  # step of a joint [rad, m]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from minimax_cal.fitting.fit import MILLI
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 
@@ -39,11 +39,11 @@ class Difference:
     @property
     def scale(self) -> tuple[float, str]:
         """As people read it."""
-        return MILLI[self.unit]
+        return for_people(self.unit)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
-        scale, unit = (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        scale, unit = in_files(self.unit)
         told = {"parameter": self.parameter, "unit": unit, "a": scale * self.a, "b": scale * self.b}
         told |= {"by": scale * self.by, "sigma": scale * self.sigma, "sigmas": self.sigmas}
         return told | ({"reason": self.reason} if self.reason else {})
@@ -77,7 +77,7 @@ class Comparison:
         if not self.changed:
             return f"{self.robot}: no joint differs between {a} and {b} by more than chance allows."
         told = ", ".join(
-            f"{c.parameter} by {1e3 * c.by:+.3f} {MILLI[c.unit][1]}" for c in self.changed
+            f"{c.parameter} by {1e3 * c.by:+.3f} {for_people(c.unit)[1]}" for c in self.changed
         )
         return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
 

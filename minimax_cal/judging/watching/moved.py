@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from minimax_cal.fitting.fit import MILLI
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.watching.watched import Rows, Watched
 from minimax_cal.modelling.parameters import links_of
 from minimax_cal.solvers.least_squares import solve_normal
@@ -51,7 +51,7 @@ class Moved:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
-        scale, unit = (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        scale, unit = in_files(self.unit)
         return {
             "parameter": self.parameter, "joint": self.joint, "by": scale * self.by,
             "sigma": scale * self.sigma, "unit": unit, "p_value": self.p_value,
@@ -65,7 +65,7 @@ def moved_table(title: str, moved: Sequence[Moved]) -> Table:
         title,
         ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
         tuple(
-            (m.parameter, m.joint, MILLI[m.unit][1], 1e3 * m.by, 1e3 * m.sigma, m.p_value,
+            (m.parameter, m.joint, for_people(m.unit)[1], 1e3 * m.by, 1e3 * m.sigma, m.p_value,
              ", ".join(m.others))
             for m in moved
         ),
