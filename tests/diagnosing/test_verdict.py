@@ -15,6 +15,8 @@ from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.verdict import heard, patched
 from minimax_cal.evidence import limits
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.cell import Cell, still
+from minimax_cal.modelling.effects.scene import mask_of
 from minimax_cal.modelling.effects.table import Term
 
 
@@ -45,13 +47,25 @@ def test_structure_must_be_improbable_and_of_account() -> None:
 
 
 def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
-    assert not patched([])
-    assert not patched([finding("gear_error", "J2")])
-    assert patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J2")])
-    assert patched([finding("gear_error", "all", 300.0), finding("encoder_gain", "J2")])
-    assert not patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J3")])
-    heavy = [finding("joint_compliance", "J2", 900.0), finding("gear_error", "J2", 100.0)]
-    assert not patched([*heavy, finding("encoder_gain", "J2", 50.0)])  # beside the main cause
+    robot = mc.load_robot("irb2600")
+    cell = Cell(robot, np.eye(4), ("smr1",), np.full((1, 3), 0.1))
+    scene = cell.scene(still(np.linspace(-1.0, 1.0, 60).reshape(10, 6), ("smr1",), robot))
+    whole = {"turns": 1.0, "joints": mask_of(range(6))}
+
+    def unknown(*told: tuple[str, str, float]) -> bool:
+        found = [finding(effect, place, size) for effect, place, size in told]
+        terms = [replace(f, terms=(replace(f.term, choice=whole),)) for f in found]
+        return patched(terms, scene)
+
+    gain = ("encoder_gain", "J2", 100.0)
+    assert not unknown()
+    assert not unknown(("gear_error", "J2", 100.0))
+    assert unknown(("gear_error", "J2", 300.0), gain)
+    assert unknown(("gear_error", "all", 300.0), gain)
+    assert not unknown(("gear_error", "J2", 300.0), ("encoder_gain", "J3", 100.0))
+    assert not unknown(("gear_error", "J2", 300.0), ("axis_wobble", "J2", 100.0))  # no turn
+    assert not unknown(("gear_ripple", "J2", 300.0), gain)  # a fine wave is another thing
+    assert not unknown(("link_bending", "L2", 900.0), ("gear_error", "J2", 100.0), gain)
 
 
 @pytest.fixture(scope="module")

@@ -27,9 +27,10 @@ from minimax_cal.judging.maps import (
 )
 from minimax_cal.judging.saved import Saved
 from minimax_cal.modelling.parameters import Names, State
-from minimax_cal.modelling.simulate import Simulation, random_poses
+from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.reporting.plots.map import REACHED, outline, save_map
 from minimax_cal.robots.kinematics import forward
+from minimax_cal.robots.sampling import random_poses
 
 SMALL = Grid(samples=3000, bins=16)
 

@@ -108,6 +108,12 @@ class Term:
         return "sessions" in self.choice
 
     @property
+    def by_clock(self) -> bool:
+        """Whether it follows the time, and not the temperature or the sessions."""
+        told = "temperature" in self.choice or self.frees_frames
+        return EFFECTS[self.effect].follows == "time" and not told
+
+    @property
     def text(self) -> str:
         """As gear_error:J2:turns=2.0, with the whole choice."""
         return ":".join([self.label, *(f"{k}={float(v)!r}" for k, v in self.choice.items())])
@@ -126,7 +132,7 @@ def of_sessions(frames: Frames) -> tuple[Term, ...]:
     """What frees the frames of all sessions but the first, where there are several."""
     if len(frames) < 2:
         return ()
-    return (Term("session_jump", "frame", {"sessions": float(len(frames))}),)
+    return (Term(SESSION_JUMP.name, "frame", {"sessions": float(len(frames))}),)
 
 
 def parse(text: str) -> tuple[str, str, dict[str, float]]:
@@ -174,10 +180,6 @@ def terms(
             here = ", ".join(places) or "none with these data"
             raise OptionError(f"effect {name}: no place {place!r}; choose {here}")
         choices = variants(text, effect.choices(scene, place), given)
-        if name == "gear_ripple" and "turns" not in choices[0]:
-            raise OptionError(
-                f"effect {text!r}: the robot file gives no ratio; write {name}:{place}:turns=17"
-            )
         several = [Term(name, place, choice) for choice in choices]
         try:
             term = pick(out, several) if len(several) > 1 else several[0]

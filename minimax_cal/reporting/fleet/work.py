@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -151,13 +150,3 @@ def on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Row]:
     with client:
         for future in distributed.as_completed(client.map(done, jobs, pure=False)):
             yield future.result()
-
-
-def checked_folder(path: Path | None) -> Path | None:
-    """The folder of results, made where it is not there.  Raises CalibrationError."""
-    if path is not None:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CalibrationError(f"{path}: cannot be made ({error.strerror})") from error
-    return path
