@@ -18,8 +18,16 @@ SHARED = ROOT.parent / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The site is built first: no other test takes as long, and one process waits for none."""
-    items.sort(key=lambda item: item.path.name != "test_docs.py")
+    """Site, README and the like come first: they take longest, and no process waits for them."""
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Tests beside each other stay in one process, which then makes their fixtures once."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 @pytest.fixture
