@@ -8,6 +8,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
+from browsing import browsing  # stands beside this
 
 import minimax_cal as mc
 from minimax_cal.cli import main
@@ -58,6 +59,19 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     from served import serving  # stands beside those tests
 
     with serving(tmp_path_factory.mktemp("sessions")) as found:
+        yield found
+
+
+@pytest.fixture(scope="session")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the browser keeps what it is given."""
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="session")
+def driver(downloads: Path) -> Iterator[Any]:
+    """The browser of all tests that look at pages."""
+    with browsing(downloads) as found:
         yield found
 
 
