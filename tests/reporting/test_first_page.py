@@ -9,6 +9,7 @@ from test_report import WORDING, Seen, results
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.judging.tolerance import limits_of
+from minimax_cal.reporting import report
 from minimax_cal.reporting.html import compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
@@ -143,7 +144,14 @@ def browser() -> None:
 
 
 @pytest.mark.usefixtures("browser")
-def test_paper_and_picture_by_the_ending(results: Path, tmp_path: Path) -> None:
-    for name, start in (("page.pdf", b"%PDF"), ("page.png", b"\x89PNG")):
-        assert run("report", results / "fit.json", "-o", tmp_path / name) == 0
-        assert (tmp_path / name).read_bytes().startswith(start)
+def test_paper_and_picture_by_the_ending(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run("report", results / "fit.json", "-o", tmp_path / "page.png") == 0
+    assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+    printed: list[tuple[str, Path]] = []  # by a browser in `test_pdf_holds_the_whole_report`
+    monkeypatch.setattr(report, "print_pdf", lambda page, path, _: printed.append((page, path)))
+    assert run("report", results / "fit.json", "-o", tmp_path / "page.pdf") == 0
+    ((text, path),) = printed
+    assert path == tmp_path / "page.pdf"
+    assert "accuracy" in Seen(text).text
