@@ -7,8 +7,9 @@ time: an effect that is left out looks like noise of the joints, and would hide 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+DRIVEN = {"time": "time", "move": "move", "approach": "move"}  # effects that follow one thing
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -76,15 +78,16 @@ def select(
     ripple: bool = True,
     level: float = LEVEL,
     seldom: int = SELDOM,
+    first: Sequence[Candidate] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
     at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
     of a false name on data without an effect.  seldom: of more than REFINED effects each is
-    compared anew after so many, and at the end.
+    compared anew after so many, and at the end.  first: what was chosen with other weights.
     """
-    fits: list[Added] = []
+    lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), (), noise)
@@ -106,7 +109,19 @@ def select(
         if len(fits) <= REFINED or len(fits) % seldom == 0:
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
-    noise = noise_beside(lib, fits)
+    lib, fits = one_course(lib, fits)
+    while True:
+        choice = beside_each_other(lib, fits, tables)
+        needless = [t.p_value(one) for t, one in zip(choice.benches, choice.fits, strict=True)]
+        if max(needless, default=0.0) <= level:
+            return choice
+        fits = [one for one in fits if one is not fits[int(np.argmax(needless))]]
+
+
+def beside_each_other(
+    lib: Library, fits: Sequence[Added], tables: Mapping[tuple[int, ...], Bench]
+) -> Choice:
+    """What was chosen, each with its values beside all others.  tables: benches that are there."""
     benches = []
     for i, one in enumerate(fits):
         chosen, others = without(fits, i)
@@ -115,12 +130,26 @@ def select(
             table = bench(lib, chosen, others)
         benches.append(table)
     final = tuple(b.added(one.candidate) for b, one in zip(benches, fits, strict=True))
-    return Choice(lib, final, tuple(benches), noise)
+    return Choice(lib, final, tuple(benches), noise_beside(lib, fits))
+
+
+def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
+    """The library and the effects that were chosen of another, in their order."""
+    fits: list[Added] = []
+    known = {c.term.text: c for c in lib.candidates}
+    for c in first:
+        mine = known.get(c.term.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
+        if mine is None:
+            continue
+        if c.term.text not in known:
+            lib = replace(lib, candidates=(*lib.candidates, mine))
+        fits.append(bench(lib, [one.candidate for one in fits], fits).added(mine))
+    return lib, fits
 
 
 def plain(lib: Library) -> tuple[Candidate, ...]:
     """The candidates without lines that were found: those of an earlier round."""
-    return tuple(c for c in lib.candidates if c.tries == 1.0)
+    return tuple(c for c in lib.candidates if not c.is_line)
 
 
 def noise_beside(lib: Library, fits: Sequence[Added]) -> Noise:
@@ -212,6 +241,31 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
                 fits[number] = own
         if not changed:
             break
+    return lib, fits
+
+
+def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
+    """Two names of one driver give way to one whose course is tuned, where that explains as much.
+
+    A law of time or moves with a course that is not quite its own calls for a second one.
+    """
+    for pair in combinations(fits, 2):
+        drivers = {DRIVEN.get(EFFECTS[one.candidate.term.effect].follows) for one in pair}
+        keys = {one.candidate.key for one in pair}
+        free = [c for c in lib.candidates if c.key in keys and c.shapes]
+        if len(drivers) > 1 or None in drivers or not free:
+            continue
+        others = [one for one in fits if one not in pair]
+        chosen = [one.candidate for one in others]
+        table = bench(lib, chosen, others)
+        first = table.added(pair[0].candidate)
+        beside = bench(lib, [*chosen, first.candidate], [*others, first])
+        both = first.evidence + beside.added(pair[1].candidate).evidence
+        near = table.ranked(free)[0]
+        best = tuned(table, near)
+        if best.evidence > both - TIE:
+            lib, best = adopted(lib, best, near.candidate)
+            return one_course(lib, [*others, best])
     return lib, fits
 
 

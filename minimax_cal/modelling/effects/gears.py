@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from minimax_cal.modelling.effects.scene import (
     unmasked,
 )
 
+WITHIN = (0.25, 0.5, 2.0)  # least, usual and largest move after which a lag grows no more [rad]
 LEAST_SWEEP = 0.5  # a joint must turn so far to show a gain or a slow wave [rad]
 
 
@@ -186,20 +188,35 @@ BACKLASH = Effect(
 
 
 def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = e (q_n - q_(n-1))."""
-    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
+    """dq_j = e (q_n - q_(n-1)), or a course of it that ends where moves are long."""
+    move, within = scene.each("move"), choice.get("within", np.inf)
+    course = within * np.tanh(move / within) if np.isfinite(within) else move
+    columns = turns_by(scene, joints_at(place, choice), course, "e", "1")
+    return replace(columns, fixed={"within": within} if np.isfinite(within) else {})
+
+
+def settlings(scene: Scene, place: str) -> Sequence[Choice]:
+    """In proportion to the move, and with an end."""
+    return [at_all(place, moved(scene, "move"), choice) for choice in ({}, {"within": WITHIN[1]})]
+
+
+def other_ends(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Ends near one that was chosen; shorter ones are play."""
+    ends = choice["within"] * np.array([0.6, 0.8, 1.25, 1.6]) if "within" in choice else []
+    return [{**choice, "within": float(end)} for end in ends if WITHIN[0] <= end <= WITHIN[2]]
 
 
 SETTLING = Effect(
     "settling",
     "the joint had not settled, or was read back before it had",
-    "dq_j = e (q_n - q_(n-1))",
+    "dq_j = e m, m = q_n - q_(n-1), or e s tanh(m / s)",
     lambda scene: moved_places(scene, "move"),
     unsettled,
+    finer=other_ends,
     needs=lambda scene: (
         "" if moved(scene, "move") else "the visit order (column order)" + scene.untold
     ),
-    choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
+    choices=settlings,
     typical=1e-2,
     follows="move",
 )
