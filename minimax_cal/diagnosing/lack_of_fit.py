@@ -226,7 +226,10 @@ def structure(
 
 
 def share(features: Array, rest: Rest) -> tuple[float, float]:
-    """F test that the rest has no more than its share in the span of features (N, D)."""
+    """F test that the rest has no more than its share in the span of features (N, D).
+
+    With the pose that tells most and without it: one that is off is no structure.
+    """
     before = np.linalg.norm(features, axis=0)
     features = features[:, before > 0.0] / before[before > 0.0]
     features = features - rest.basis @ (rest.basis.T @ features)
@@ -238,12 +241,23 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     unit = vectors[:, kept] / np.sqrt(values[kept])
     pull = unit.T @ (features.T @ rest.rows)
     d = len(kept)
-    wide = inflation(features @ (unit @ pull), rest.rows, rest.group, rest.dof)
+    told = features @ unit
+    field = told @ pull
+    wide = inflation(field, rest.rows, rest.group, rest.dof)
     inside = float(pull @ pull) / wide
     outside = max(rest.total - inside, 1e-300)
     if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0
-    p = stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d)
+    most = int(np.argmax(np.bincount(rest.group, field * rest.rows)))
+    own = rest.group == most
+    taken, size = float((told[own] ** 2).sum()), float((rest.rows[own] ** 2).sum())
+    gain = float(field[own] @ rest.rows[own]) / wide
+    fewer, free = max(d - taken, 1.0), rest.dof - d
+    left = max(outside - max(size - gain, 0.0), 1e-300), max(free - own.sum() + taken, 1.0)
+    p = max(
+        stats.f.sf((inside / d) / (outside / free), d, free),
+        stats.f.sf(((inside - gain) / fewer) / (left[0] / left[1]), fewer, left[1]),
+    )
     return float(p), inside - d
 
 
