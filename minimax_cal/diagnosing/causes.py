@@ -9,7 +9,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, explained, heard, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -58,15 +58,17 @@ def causes_of(
     """
     progress("effects")
     lib, choice = chosen(study, exclude)
-    plain, study = study, weighed_anew(study, choice.known)
+    traces = left_by(study, choice)
+    loud = heard(traces, explained(study.rows, choice), study.rows.count)
+    plain, study = study, weighed_anew(study, choice.known, each=loud is None)
     if study is not plain:
-        progress("effects beside joints that scatter unlike each other")
+        progress("effects beside noises that differ")
         lib, choice = chosen(study, exclude, choice.chosen)
+        traces = left_by(study, choice)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         lib, choice = chosen(study, (*exclude, "backlash"))
-    progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
+        traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
@@ -74,6 +76,11 @@ def causes_of(
     effects = judged_again(effects, choice, study.data, lib, ripple)
     every = (*faults, *read_back)
     return study, Causes(every, lib, ripple, choice, tuple(effects), traces, lib.untestable)
+
+
+def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
+    """Traces of what the effects leave."""
+    return structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
 
 
 def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
@@ -202,7 +209,8 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
     out: dict[tuple[str, str], Finding] = {}
     keys = [(found.term.effect, found.term.place) for found in findings]
     for key, found in zip(keys, findings, strict=True):
-        if found.term.effect == "gear_ripple" or keys.count(key) > 1:
+        several = found.term.effect == "gear_ripple" or keys.count(key) > 1
+        if several and "waves_per_turn" in found.fixed:
             turns = found.fixed["waves_per_turn"]
             names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})

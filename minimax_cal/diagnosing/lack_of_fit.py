@@ -15,7 +15,9 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
+from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
+from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.effects.scene import Scene, turning
@@ -223,6 +225,23 @@ def structure(
     found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
     found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
     return tuple(found)
+
+
+def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None:
+    """The least probable structure that matters, beside what was explained and beside the noise.
+
+    explained: weighed square that the effects explain.  count: of rows.
+    """
+    least = max(MATTERS * explained, WORTH * count)
+    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
+    return min(loud, key=lambda trace: trace.p, default=None)
+
+
+def explained(rows: Rows, choice: Choice) -> float:
+    """Weighed square that the effects explain."""
+    none = np.zeros((len(rows.error), 0))
+    without, left = (rest_of(rows, choice.noise, known).total for known in (none, choice.known))
+    return without - left
 
 
 def share(features: Array, rest: Rest) -> tuple[float, float]:

@@ -26,10 +26,11 @@ STEADY = 0.05  # least part of the instrument's variance that all directions hav
 ROOM = 9.0  # of a logarithm of a variance, on both sides of where it starts
 
 
-def weighed_anew(study: Study, known: Array) -> Study:
+def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     """The study, its rows weighed by the noises that the data tell, or itself if those are alike.
 
-    known: (N, q) columns of effects.
+    known: (N, q) columns of effects.  each: whether every joint may scatter by itself: not where
+    structure is left, which would pass for scatter of its joint.
     """
     whole = (study.rows.weight > 0.0).all(axis=1)
     dof = int(whole.sum()) * study.rows.weight.shape[1] - study.rows.basis.shape[1] - known.shape[1]
@@ -39,13 +40,14 @@ def weighed_anew(study: Study, known: Array) -> Study:
     joints, sight = motions(study)
     rest = Rest.of(study, known, whole)
     turned, (along, across) = rest.products(joints), rest.products(sight)
-    size = (noise.jitter**2, noise.variance)
-    least, _ = rest.likeliest([turned.sum(axis=0), along + across], np.array(size))
-    start = np.repeat(size, (len(turned), 2))
-    most, found = rest.likeliest([*turned, along, across], start)
-    if chi2.sf(least - most, len(turned)) > UNLIKE:
+    size, alike = (noise.jitter**2, noise.variance), turned.sum(axis=0)
+    least, _ = rest.likeliest([alike, along + across], np.array(size))
+    parts = [*(turned if each else alike[None]), along, across]
+    most, found = rest.likeliest(parts, np.repeat(size, (len(parts) - 2, 2)))
+    if chi2.sf(least - most, len(parts) - 2) > UNLIKE:
         return study
-    return weighed(study, np.sqrt(found[:-2]), found[-2], found[-1])
+    scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
+    return weighed(study, scatter, found[-2], found[-1])
 
 
 def motions(study: Study) -> tuple[list[Array], list[Array]]:

@@ -53,15 +53,18 @@ def wave(scene: Scene, joint: int, turns: float) -> Array:
 
 
 def waves(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = a cos(k q_j) + b sin(k q_j), k = turns."""
-    turns = choice["turns"]
+    """dq_j = a cos(k q_j) + b sin(k q_j), k = turns; or the sum of that for k = 1 ... orders."""
+    each = [choice["turns"]] if "turns" in choice else range(1, int(choice["orders"]) + 1)
     joints = joints_at(place, choice)
-    parts = [one_joint(scene, j, wave(scene, j, turns)) for j in joints]
-    several = len(joints) > 1
-    names = tuple(f"{part}{j + 1 if several else ''}" for j in joints for part in ("cos", "sin"))
-    return Columns(
-        names, ("rad",) * len(names), np.concatenate(parts), fixed={"waves_per_turn": turns}
-    )
+    parts = [one_joint(scene, j, wave(scene, j, k)) for j in joints for k in each]
+    marks = [
+        f"{j + 1 if len(joints) > 1 else ''}{f' {k}/turn' if len(each) > 1 else ''}"
+        for j in joints
+        for k in each
+    ]
+    names = tuple(f"{part}{mark}" for mark in marks for part in ("cos", "sin"))
+    fixed = {"waves_per_turn": each[0]} if len(each) == 1 else {}
+    return Columns(names, ("rad",) * len(names), np.concatenate(parts), fixed=fixed)
 
 
 GEAR_ERROR = Effect(
@@ -71,7 +74,8 @@ GEAR_ERROR = Effect(
     swept_places,
     waves,
     choices=lambda scene, place: [
-        at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)
+        *(at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)),
+        *([] if place == "all" else [{"orders": 2.0}]),  # a joint may show none of them alone
     ],
     lines=True,
     typical=5e-4,
@@ -202,8 +206,10 @@ def settlings(scene: Scene, place: str) -> Sequence[Choice]:
 
 def other_ends(scene: Scene, choice: Choice) -> Sequence[Choice]:
     """Ends near one that was chosen; shorter ones are play."""
-    ends = choice["within"] * np.array([0.6, 0.8, 1.25, 1.6]) if "within" in choice else []
-    return [{**choice, "within": float(end)} for end in ends if WITHIN[0] <= end <= WITHIN[2]]
+    if "within" not in choice:
+        return ()
+    ends = [part * choice["within"] for part in (0.6, 0.8, 1.25, 1.6)]
+    return [{**choice, "within": end} for end in ends if WITHIN[0] <= end <= WITHIN[2]]
 
 
 SETTLING = Effect(
