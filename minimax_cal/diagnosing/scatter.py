@@ -32,7 +32,7 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     known: (N, q) columns of effects.  each: whether every joint may scatter by itself: not where
     structure is left, which would pass for scatter of its joint.
     """
-    whole = (study.rows.weight > 0.0).all(axis=1)
+    whole = np.asarray((study.rows.weight > 0.0).all(axis=1))
     dof = int(whole.sum()) * study.rows.weight.shape[1] - study.rows.basis.shape[1] - known.shape[1]
     noise = restricted(study.rows, known)
     if dof < LEAST_DOF or noise.variance < EXACT**2:
