@@ -247,7 +247,7 @@ def explained(rows: Rows, choice: Choice) -> float:
 def share(features: Array, rest: Rest) -> tuple[float, float]:
     """F test that the rest has no more than its share in the span of features (N, D).
 
-    With the pose that tells most and without it: one that is off is no structure.
+    If the pose that tells most is off by itself, without it: one outlier is no structure.
     """
     before = np.linalg.norm(features, axis=0)
     features = features[:, before > 0.0] / before[before > 0.0]
@@ -267,17 +267,15 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     outside = max(rest.total - inside, 1e-300)
     if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0
-    most = int(np.argmax(np.bincount(rest.group, field * rest.rows)))
-    own = rest.group == most
-    taken, size = float((told[own] ** 2).sum()), float((rest.rows[own] ** 2).sum())
-    gain = float(field[own] @ rest.rows[own]) / wide
-    fewer, free = max(d - taken, 1.0), rest.dof - d
-    left = max(outside - max(size - gain, 0.0), 1e-300), max(free - own.sum() + taken, 1.0)
-    p = max(
-        stats.f.sf((inside / d) / (outside / free), d, free),
-        stats.f.sf(((inside - gain) / fewer) / (left[0] / left[1]), fewer, left[1]),
-    )
-    return float(p), inside - d
+    p = float(stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d))
+    own = rest.group == int(np.argmax(np.bincount(rest.group, field * rest.rows)))
+    size = float(rest.rows[own] @ rest.rows[own])
+    if stats.chi2.sf(size, own.sum()) * (rest.group.max() + 1) < STRUCTURE:
+        gain, taken = float(field[own] @ rest.rows[own]) / wide, float((told[own] ** 2).sum())
+        fewer, free = max(d - taken, 1.0), max(rest.dof - d - own.sum() + taken, 1.0)
+        ratio = ((inside - gain) / fewer) / (max(outside - size + gain, 1e-300) / free)
+        p = max(p, float(stats.f.sf(ratio, fewer, free)))
+    return p, inside - d
 
 
 def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
