@@ -63,7 +63,7 @@ def test_what_was_fitted_is_not_found_again() -> None:
 
 
 def test_one_pose_that_is_off_is_no_structure() -> None:
-    """Many functions of few poses: a pose has a part of them for itself, and one row 9 sigmas off."""
+    """Of many functions few poses have each a part of its own, and one row is 9 sigmas off."""
     made = study(6e-6, 1.0, 0, poses=50)
     rng, noise = np.random.default_rng(1), Noise(0.5, 1e-10, 0.0)
     spread = np.sqrt(1e-10 * (1.0 + 0.5 * made.rows.variance_ratio))
