@@ -123,7 +123,7 @@ def table_2(found: Table2) -> list[Verdict]:
                 SEVERAL),
         Verdict("S Table 2: time, NLLM over SNLLM", "convergence", f"{cost_printed:.1f}",
                 f"{cost:.1f}", told(cost > 3.0), "a start's mean time, as a ratio: no two machines "
-                "are alike"),
+                "are alike, and NLLM's loop is the better compiled one"),
         Verdict("S Table 2: converged %", "convergence", theirs(3), column(4),
                 told(alike[0], max(at(4, "nlgn"), at(4, "nllm")) < 100.0 and separable), where),
         Verdict("S Table 2: to the minimum %", "convergence", theirs(4), column(5),

