@@ -14,6 +14,7 @@ from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
 
+ORDERS = 2  # waves a turn that one gear shows at once
 OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
 
 Structure = tuple[str, float]
@@ -50,9 +51,12 @@ def patched(findings: Sequence[Finding]) -> bool:
     """Whether the weightiest effect needs another law of its joint's angle: likely one unknown."""
     if not findings:
         return False
-    first = max(findings, key=lambda found: found.size).term
+    largest = max(findings, key=lambda found: found.size)
+    first = largest.term
     if first.effect not in OF_ANGLE:
         return False
+    if first.effect == "gear_error" and first.place != "all" and len(largest.names) > 2 * ORDERS:
+        return True  # a series, as good for any curve
     others = [f.term for f in findings if f.term.effect in OF_ANGLE and f.term is not first]
     return any("all" in (first.place, t.place) or t.place == first.place for t in others)
 

@@ -53,6 +53,9 @@ def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
     assert patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J2")])
     assert patched([finding("gear_error", "all", 300.0), finding("encoder_gain", "J2")])
     assert not patched([finding("gear_error", "J2", 300.0), finding("encoder_gain", "J3")])
+    orders = finding("gear_error", "J2")
+    assert not patched([replace(orders, names=("a",) * 4)])
+    assert patched([replace(orders, names=("a",) * 6)])  # three orders are a series for any curve
     heavy = [finding("joint_compliance", "J2", 900.0), finding("gear_error", "J2", 100.0)]
     assert not patched([*heavy, finding("encoder_gain", "J2", 50.0)])  # beside the main cause
 
