@@ -13,9 +13,10 @@ from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 
 ORDERS = 2  # waves a turn that one gear shows at once
-OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
 
 Structure = tuple[str, float]
 
@@ -34,7 +35,7 @@ def judged(
     loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
     if loud:
         return "unknown", (loud.name, structure[1])
-    if patched([found for found in sure if np.isfinite(found.size)]):
+    if patched([found for found in sure if np.isfinite(found.size)], study.scene):
         return "unknown", ("two laws for one joint may stand for one that is not known",
                            structure[1])  # fmt: skip
     loose = sum(f.size for f in causes.effects if not f.established and f.p_value < CERTAIN)
@@ -47,18 +48,26 @@ def judged(
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
 
 
-def patched(findings: Sequence[Finding]) -> bool:
+def patched(findings: Sequence[Finding], scene: Scene) -> bool:
     """Whether the weightiest effect needs another law of its joint's angle: likely one unknown."""
     if not findings:
         return False
     largest = max(findings, key=lambda found: found.size)
     first = largest.term
-    if first.effect not in OF_ANGLE:
+    if not turns_by_angle(first, scene):
         return False
-    if first.effect == "gear_error" and first.place != "all" and len(largest.names) > 2 * ORDERS:
+    several = EFFECTS[first.effect].lines and first.place != "all"
+    if several and len(largest.names) > 2 * ORDERS:
         return True  # a series, as good for any curve
-    others = [f.term for f in findings if f.term.effect in OF_ANGLE and f.term is not first]
+    others = [f.term for f in findings if f.term is not first and turns_by_angle(f.term, scene)]
     return any("all" in (first.place, t.place) or t.place == first.place for t in others)
+
+
+def turns_by_angle(term: Term, scene: Scene) -> bool:
+    """Whether it turns a joint by a formula of that joint's angle, other than a fine wave."""
+    effect = EFFECTS[term.effect]
+    by_formula = effect.follows == "angle" and not effect.is_map
+    return by_formula and term.columns(scene).only_turns
 
 
 def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> bool:

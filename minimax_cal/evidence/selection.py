@@ -7,13 +7,14 @@ time: an effect that is left out looks like noise of the joints, and would hide 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
-from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
+from minimax_cal.evidence.bench import Added, Bench, bench, columns_of, together
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
@@ -41,19 +42,35 @@ NOTHING: Array = np.zeros(0, dtype=int)
 class Choice:
     """The effects selected.
 
-    library: with all columns that were tried.  fits: of each, the others given.
-    benches: of each, for its rivals.  noise: with all of them.
+    library: with all columns that were tried.  found: the effects, as each was when it was chosen.
+    noise: with all of them.
     """
 
     library: Library
-    fits: tuple[Added, ...]
-    benches: tuple[Bench, ...]
+    found: tuple[Added, ...]
     noise: Noise
 
     @property
     def chosen(self) -> tuple[Candidate, ...]:
         """The candidates."""
-        return tuple(one.candidate for one in self.fits)
+        return tuple(one.candidate for one in self.found)
+
+    @cached_property
+    def benches(self) -> tuple[Bench, ...]:
+        """Of each effect, for its rivals: beside the others."""
+        every = range(len(self.found))
+        return tuple(bench(self.library, *without(self.found, number)) for number in every)
+
+    @cached_property
+    def fits(self) -> tuple[Added, ...]:
+        """Each effect beside the others."""
+        pairs = zip(self.benches, self.chosen, strict=True)
+        return tuple(table.added(candidate) for table, candidate in pairs)
+
+    @cached_property
+    def estimates(self) -> tuple[tuple[Array, Array], ...]:
+        """Values and sigmas (d,) of the parameters of each effect, all estimated together."""
+        return together(self.library, self.found, self.noise)
 
     @property
     def known(self) -> Array:
@@ -90,8 +107,7 @@ def select(
     lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
-        return Choice(lib, (), (), noise)
-    tables: dict[tuple[int, ...], Bench] = {}
+        return Choice(lib, (), noise)
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
@@ -100,37 +116,36 @@ def select(
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
             break
-        tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table, level)
         if not best:
-            lib, fits = refined(lib, fits, level) if len(fits) > REFINED else (lib, fits)
             break
         fits = [*fits, *best]
         if len(fits) <= REFINED or len(fits) % seldom == 0:
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
+    if len(fits) > REFINED:
+        lib, fits = refined(lib, fits, level)
     lib, fits = one_course(lib, fits)
-    while True:
-        choice = beside_each_other(lib, fits, tables)
-        needless = [t.p_value(one) for t, one in zip(choice.benches, choice.fits, strict=True)]
-        if max(needless, default=0.0) <= level:
-            return choice
-        fits = [one for one in fits if one is not fits[int(np.argmax(needless))]]
+    fits = needed(lib, fits, level)
+    return Choice(lib, tuple(fits), noise_beside(lib, fits))
 
 
-def beside_each_other(
-    lib: Library, fits: Sequence[Added], tables: Mapping[tuple[int, ...], Bench]
-) -> Choice:
-    """What was chosen, each with its values beside all others.  tables: benches that are there."""
-    benches = []
-    for i, one in enumerate(fits):
-        chosen, others = without(fits, i)
-        table = tables.get(tuple(map(id, chosen))) or bench(lib, chosen, others)
-        if not table.knows(one.candidate):  # tuned since
-            table = bench(lib, chosen, others)
-        benches.append(table)
-    final = tuple(b.added(one.candidate) for b, one in zip(benches, fits, strict=True))
-    return Choice(lib, final, tuple(benches), noise_beside(lib, fits))
+def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
+    """The effects without those that the others made needless, the weakest first."""
+    while fits:
+        noise = noise_beside(lib, fits)
+        values = together(lib, fits, noise)
+        signals = [
+            float(((value / np.maximum(sigma, 1e-300)) ** 2).sum()) / len(value)
+            for value, sigma in values
+        ]
+        weakest = int(np.argmin(signals))
+        chosen, others = without(fits, weakest)
+        table = bench(lib, chosen, others)
+        if table.p_value(table.added(fits[weakest].candidate)) <= level:
+            break
+        fits = others
+    return fits
 
 
 def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
@@ -202,6 +217,8 @@ def tuned(table: Bench, best: Added) -> Added:
     for _ in range(TUNINGS):
         term = best.candidate.term
         near = EFFECTS[term.effect].finer(table.library.scene, term.choice)
+        if not near:
+            break
         aside = table.library.aside([(replace(term, choice=choice), 1.0) for choice in near])
         ranked = table.beside(aside).ranked(aside.candidates)
         if not ranked or ranked[0].evidence <= best.evidence:
@@ -225,13 +242,13 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
         return lib, fits
     for _ in range(3):
         changed = False
-        for number in range(
-            min(len(fits) - 1, REFINED)
-        ):  # the last one was just chosen beside the others
+        others_than_last = range(min(len(fits) - 1, REFINED))  # it was just chosen beside them
+        for number in others_than_last:
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
-            top = next(o for o in table.everyone if not repeated(o.candidate, chosen))
+            others_best = (o for o in table.everyone if not repeated(o.candidate, chosen))
+            top = next(others_best, own)
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True

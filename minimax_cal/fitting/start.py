@@ -16,6 +16,7 @@ from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.transforms import nearest_rotation
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
@@ -70,7 +71,9 @@ def fit_base(model: Model, mdh: Array, near: Array = EVERYWHERE) -> BaseFit:
         starts, signs = near.T[None], np.ones(1)
     else:
         guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
-        starts = np.concatenate([project(g) for g in (guess[None], -guess[None])] + 2 * [CUBE])
+        starts = np.concatenate(
+            [nearest_rotation(g) for g in (guess[None], -guess[None])] + 2 * [CUBE]
+        )
         signs = np.repeat([1.0, -1.0, 1.0, -1.0], [1, 1, len(CUBE), len(CUBE)])
     found, cost = kernels().polish(matrix, right, *ready(starts), signs)
     points = np.count_nonzero(model.seen)
@@ -103,14 +106,6 @@ def linear_rows(model: Model, mdh: Array, centre: Array) -> Array:
     root = np.sqrt(model.weight)[..., None, None]
     rows = root * np.concatenate([plain, turned, known], axis=-1)
     return np.asarray(rows[model.seen].reshape(-1, rows.shape[-1]))
-
-
-def project(matrix: Array) -> Array:
-    """The nearest rotations, by SVD.  matrix: (..., 3, 3)."""
-    u, _, vt = np.linalg.svd(matrix)
-    flip = np.ones((*matrix.shape[:-2], 3))
-    flip[..., 2] = np.linalg.det(u @ vt)
-    return np.asarray((u * flip[..., None, :]) @ vt)
 
 
 def search(

@@ -20,12 +20,13 @@ from scipy.special import gammaincinv, stdtrit
 from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
+from minimax_cal.ground.units import in_files
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
 
@@ -109,7 +110,7 @@ class Poses:
     @staticmethod
     def of(estimator: Estimator, state: State) -> Poses:
         """All poses of an estimator at its solution."""
-        model, (m, n) = estimator.model, estimator.model.q.shape
+        model, m = estimator.model, len(estimator.model.q)
         block = Block(slice(0, m), kinematics.chain(state.mdh, model.q, model.prismatic))
         error, turned = model.weighted_rows(state, block, np.ones(model.names.count, dtype=bool))
         k, p = turned.shape[:2]
@@ -121,13 +122,12 @@ class Poses:
             weighted = estimator.mix @ jacobian
         else:
             weighted = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * jacobian
-        joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
         off = (model.prior.mean - model.values(state))[model.active]
         geometric = model.names.geometric
         return Poses(
             error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
             jacobian=jacobian,
-            arm=every[..., joints],
+            arm=every[..., zero_positions(model.prismatic)],
             weighted=weighted,
             off=off,
             prior=model.prior.weight[model.active],
@@ -240,7 +240,7 @@ class Uncertainty:
         names = self.names.all
         return {
             "names": [names[i] for i in known],
-            "units": ["mm" if self.units[i] == "m" else self.units[i] for i in known],
+            "units": [in_files(self.units[i])[1] for i in known],
             "rows": rows.tolist(),
             "source": self.source,
             "degrees_of_freedom": self.dof,
@@ -257,7 +257,7 @@ def quantile(level: float, dof: float) -> float:
 
 def scales(units: tuple[str, ...]) -> Array:
     """(p,) what a parameter is multiplied by in JSON: 1e3 for lengths."""
-    return np.array([1e3 if unit == "m" else 1.0 for unit in units])
+    return np.array([in_files(unit)[0] for unit in units])
 
 
 def noise_of(poses: Poses) -> tuple[Noise, float]:
@@ -343,7 +343,7 @@ def uncertainty_of(
     names, active = few.model.names, few.model.active
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[np.ix_(active, active)] = 0.5 * (found + found.T) * len(rows) / len(group)
-    own = tuple("m" if length else "rad" for length in names.linear[: names.geometric])
+    own = names.units[: names.geometric]
     return Uncertainty(names, (*own, *units), covariance, noise, dof, source)
 
 
@@ -396,7 +396,7 @@ def position_factor(
     factor = jacobian @ root
     if not jitter:
         return np.asarray(factor)
-    joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
+    joints = zero_positions(model.prismatic)
     return np.concatenate([factor, known.noise.jitter * jacobian[..., joints]], axis=-1)
 
 
@@ -425,7 +425,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)
     names = Names(cell.robot.joints, cell.target_names, effects)
-    units = (*("m" if x else "rad" for x in names.linear[: names.geometric]), *own)
+    units = (*names.units[: names.geometric], *own)
     try:
         part = content["covariance"]
         place = np.array([names.index(str(name)) for name in part["names"]], dtype=int)

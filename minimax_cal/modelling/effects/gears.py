@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.effects.scene import (
     PLAIN,
     Choice,
@@ -91,12 +92,22 @@ def ratios(scene: Scene, place: str) -> Sequence[Choice]:
     return ({"turns": abs(ratio)}, {"turns": 2.0 * abs(ratio)}) if np.isfinite(ratio) else ()
 
 
+def ripple(scene: Scene, place: str, choice: Choice) -> Columns:
+    """`waves`, of as many a turn as a choice says."""
+    if "turns" not in choice:
+        raise OptionError(
+            f"effect gear_ripple:{place}: the robot file gives no ratio; write "
+            f"gear_ripple:{place}:turns=17"
+        )
+    return waves(scene, place, choice)
+
+
 GEAR_RIPPLE = Effect(
     "gear_ripple",
     "ripple of the gear's teeth or wave generator, many times a turn",
     "dq_j = a cos(k q_j) + b sin(k q_j), k = gear ratio, twice that, or found by a periodogram",
     lambda scene: tuple(f"J{j + 1}" for j in sweeping(scene)),
-    waves,
+    ripple,
     choices=ratios,
     lines=True,
     typical=5e-4,
