@@ -9,13 +9,14 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, explained, heard, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
+from minimax_cal.diagnosing.scatter import weighed_anew
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.library import Candidate, Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
@@ -52,24 +53,37 @@ class Causes:
 
 def causes_of(
     study: Study, faults: Sequence[Fault], exclude: Sequence[str], progress: Progress
-) -> Causes:
-    """The effects that explain a study's errors, beside faults that are known."""
+) -> tuple[Study, Causes]:
+    """The effects that explain a study's errors, beside faults that are known.
+
+    And the study, its rows weighed by the noises that were found beside the effects.
+    """
     progress("effects")
     lib, choice = chosen(study, exclude)
+    traces = left_by(study, choice)
+    loud = heard(traces, explained(study.rows, choice), study.rows.count)
+    plain, study = study, weighed_anew(study, choice.known, each=loud is None)
+    if study is not plain:
+        progress("effects beside noises that differ")
+        lib, choice = chosen(study, exclude, choice.chosen)
+        traces = left_by(study, choice)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
         lib, choice = chosen(study, (*exclude, *play))
-    progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
+        traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = GEAR_RIPPLE.name not in exclude
     effects = judged_again(effects, choice, study.data, lib, ripple)
-    return Causes(
-        (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
-    )
+    every = (*faults, *read_back)
+    return study, Causes(every, lib, ripple, choice, tuple(effects), traces, lib.untestable)
+
+
+def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
+    """Traces of what the effects leave."""
+    return structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
 
 
 def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
@@ -90,12 +104,14 @@ def named_in(choice: Choice) -> list[Named]:
     return out
 
 
-def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
-    """The library and what it explains."""
+def chosen(
+    study: Study, exclude: Sequence[str], first: Sequence[Candidate] = ()
+) -> tuple[Library, Choice]:
+    """The library and what it explains.  first: what was chosen with other weights."""
     lib = library(study.scene, study.rows, exclude)
     if SESSION_JUMP.name not in exclude:
         lib = with_jumps(lib, study)
-    return lib, selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude)
+    return lib, selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
 
 
 def with_jumps(lib: Library, study: Study) -> Library:

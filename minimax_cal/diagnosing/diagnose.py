@@ -139,7 +139,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
-    causes = causes_of(study, clean.faults, options.exclude, progress)
+    study, causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
     steps = steps_of(asked, study, judges, spoken, ladder)
@@ -152,6 +152,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     progress("remainder")
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes, study, ladder, rest)
+    noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
     if verdict == "none" and shaky(floor, noise, steps[-1]):
         verdict = "not_repeatable"
     beyond = NOT_ASKED

@@ -8,11 +8,11 @@ import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes
 from minimax_cal.diagnosing.gap import Ladder
-from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of
+from minimax_cal.diagnosing.lack_of_fit import explained, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import CERTAIN, HALF, MATTERS, STRUCTURE, WORTH
+from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
@@ -30,7 +30,7 @@ def judged(
     worst = min(traces, key=lambda trace: trace.p)
     structure = (worst.name, min(1.0, worst.p * len(traces)))
     sure = [found for found in findings if found.established]
-    loud = heard(traces, explained(study, causes), study.rows.count)
+    loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
     if loud:
         return "unknown", (loud.name, structure[1])
     if patched([found for found in sure if np.isfinite(found.size)], study.scene):
@@ -44,26 +44,6 @@ def judged(
     if not sure:
         return "none", structure
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
-
-
-def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None:
-    """The least probable structure that matters, beside what was explained and beside the noise.
-
-    explained: weighed square that the effects explain.  count: of rows.
-    """
-    least = max(MATTERS * explained, WORTH * count)
-    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
-    return min(loud, key=lambda trace: trace.p, default=None)
-
-
-def explained(study: Study, causes: Causes) -> float:
-    """Weighed square that the effects explain."""
-    none = np.zeros((len(study.rows.error), 0))
-    without, left = (
-        rest_of(study.rows, causes.choice.noise, known).total
-        for known in (none, causes.choice.known)
-    )
-    return without - left
 
 
 def patched(findings: Sequence[Finding], scene: Scene) -> bool:

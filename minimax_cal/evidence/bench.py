@@ -11,6 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
+from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
 from minimax_cal.evidence.products import LEAST, within
 from minimax_cal.ground.arrays import Array
@@ -109,7 +110,7 @@ class Settings:
 class Bench:
     """Where candidates are compared: beside what was chosen, over several ratios of the noises.
 
-    tries: candidates that are compared, for the chance of a false name.  dof: degrees of freedom.
+    tries: laws that are compared, for the chance of a false name.  dof: degrees of freedom.
     fixed: what is projected out, in rows.
     """
 
@@ -194,7 +195,11 @@ class Bench:
         d = len(one.candidate.main) + one.candidate.shapes
         free = max(self.dof - d, 1)
         ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d / wide
-        return float(min(1.0, fdtrc(d, free, ratio) * self.tries * one.candidate.tries))
+        return float(min(1.0, fdtrc(d, free, ratio) * self.looked_at(one.candidate)))
+
+    def looked_at(self, c: Candidate) -> float:
+        """Candidates of its kind, over the share of the level that the kind has."""
+        return c.tries / LINES if c.is_line else self.tries / (1.0 - 2.0 * LINES)
 
     def improbable(self, one: Added, level: float) -> bool:
         """Whether a gain is less probable than a level, by all rows and by groups of them."""
@@ -332,7 +337,8 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         np.concatenate([at.part[:, :, 0], before], axis=1),
         rows.error,
     )
-    return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.count))
+    tries = float(sum(not c.is_line for c in lib.candidates))
+    return Bench(lib, tuple(chosen), noise, settings, held, dof, tries)
 
 
 def stacked(first: Array, part: Array, second: Array) -> Array:

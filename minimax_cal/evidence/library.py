@@ -24,7 +24,7 @@ class Candidate:
     """A term with its columns in the matrix of all candidates.
 
     main: (d,) columns.  doubt: (r,) further columns, one sigma each per unit of main[owner].
-    tries: how many variants like this one were looked at to find it.
+    tries: of a line, how many frequencies were looked at, at all joints, to find it and its like.
     """
 
     term: Term
@@ -45,6 +45,11 @@ class Candidate:
     def key(self) -> tuple[str, str]:
         """Effect and place."""
         return self.term.effect, self.term.place
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it was found by a search over frequencies."""
+        return self.tries > 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +177,6 @@ class Library:
         if self.lines is not None and self.lines.holds(c):
             return np.asarray(self.lines.clear[index])
         return self.products.clear(index)
-
-    @property
-    def count(self) -> int:
-        """How many candidates there are."""
-        return len(self.candidates) + (len(self.lines.candidates) if self.lines else 0)
 
     def only(self, poses: Array) -> Library:
         """The library for some of the poses, of which the others' columns are taken away.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+DRIVEN = {"time": "time", "move": "move", "approach": "move"}  # effects that follow one thing
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -93,15 +95,16 @@ def select(
     ripple: bool = True,
     level: float = LEVEL,
     seldom: int = SELDOM,
+    first: Sequence[Candidate] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
     at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
     of a false name on data without an effect.  seldom: of more than REFINED effects each is
-    compared anew after so many, and at the end.
+    compared anew after so many, and at the end.  first: what was chosen with other weights.
     """
-    fits: list[Added] = []
+    lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), noise)
@@ -122,13 +125,46 @@ def select(
         noise = noise_beside(lib, fits)
     if len(fits) > REFINED:
         lib, fits = refined(lib, fits, level)
+    lib, fits = one_course(lib, fits)
+    fits = needed(lib, fits, level)
+    return Choice(lib, tuple(fits), noise_beside(lib, fits))
+
+
+def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
+    """The effects without those that the others made needless, the weakest first."""
+    while fits:
         noise = noise_beside(lib, fits)
-    return Choice(lib, tuple(fits), noise)
+        values = together(lib, fits, noise)
+        signals = [
+            float(((value / np.maximum(sigma, 1e-300)) ** 2).sum()) / len(value)
+            for value, sigma in values
+        ]
+        weakest = int(np.argmin(signals))
+        chosen, others = without(fits, weakest)
+        table = bench(lib, chosen, others)
+        if table.p_value(table.added(fits[weakest].candidate)) <= level:
+            break
+        fits = others
+    return fits
+
+
+def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
+    """The library and the effects that were chosen of another, in their order."""
+    fits: list[Added] = []
+    known = {c.term.text: c for c in lib.candidates}
+    for c in first:
+        mine = known.get(c.term.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
+        if mine is None:
+            continue
+        if c.term.text not in known:
+            lib = replace(lib, candidates=(*lib.candidates, mine))
+        fits.append(bench(lib, [one.candidate for one in fits], fits).added(mine))
+    return lib, fits
 
 
 def plain(lib: Library) -> tuple[Candidate, ...]:
     """The candidates without lines that were found: those of an earlier round."""
-    return tuple(c for c in lib.candidates if c.tries == 1.0)
+    return tuple(c for c in lib.candidates if not c.is_line)
 
 
 def noise_beside(lib: Library, fits: Sequence[Added]) -> Noise:
@@ -222,6 +258,31 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
                 fits[number] = own
         if not changed:
             break
+    return lib, fits
+
+
+def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
+    """Two names of one driver give way to one whose course is tuned, where that explains as much.
+
+    A law of time or moves with a course that is not quite its own calls for a second one.
+    """
+    for pair in combinations(fits, 2):
+        drivers = {DRIVEN.get(EFFECTS[one.candidate.term.effect].follows) for one in pair}
+        keys = {one.candidate.key for one in pair}
+        free = [c for c in lib.candidates if c.key in keys and c.shapes]
+        if len(drivers) > 1 or None in drivers or not free:
+            continue
+        others = [one for one in fits if one not in pair]
+        chosen = [one.candidate for one in others]
+        table = bench(lib, chosen, others)
+        first = table.added(pair[0].candidate)
+        beside = bench(lib, [*chosen, first.candidate], [*others, first])
+        both = first.evidence + beside.added(pair[1].candidate).evidence
+        near = table.ranked(free)[0]
+        best = tuned(table, near)
+        if best.evidence > both - TIE:
+            lib, best = adopted(lib, best, near.candidate)
+            return one_course(lib, [*others, best])
     return lib, fits
 
 

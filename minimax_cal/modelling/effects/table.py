@@ -194,9 +194,9 @@ def terms(
 
 
 LAWS = 300  # whose columns a scene keeps
-CONSTANTS = frozenset({"constant", "fast", "slow"})  # of time, above 0; infinite is straight
+CONSTANTS = frozenset({"constant", "fast", "slow", "within"})  # above 0; infinite is straight
 FREE = frozenset({  # any number will do
-    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest",
+    "turns", "constant", "fast", "slow", "within", "since", "zero", "eye", "rest",
     "low", "high", "length", "size",
 })  # fmt: skip
 
