@@ -22,7 +22,7 @@ from minimax_cal.fitting.claims import (
     is_crossed,
     unseen_suspects,
 )
-from minimax_cal.fitting.crossed import few_poses
+from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
@@ -246,6 +246,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    cross = is_crossed(options, poses.held)
     wrong = contradiction(robot, data, after, held, suspects)
     notices = (
         *poses.notices,
@@ -290,7 +291,7 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
         claim=partial(beyond_of, robot, options, data, held, solved, suspects),
-        error_crossed=crossed_of(robot, options, data, held, solved),
+        error_crossed=crossed_of(robot, options, data, held, solved) if cross else NOT_CROSSED,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -527,7 +528,7 @@ def uncertainty_of(
     return replace(
         known,
         covariance=exactly(known.covariance, arrays.get("covariance")),
-        noise=replace(noise, variance=float(variance[0])),
+        listen=partial(replace, noise, variance=float(variance[0])),
     )
 
 

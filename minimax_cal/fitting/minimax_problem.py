@@ -8,7 +8,7 @@ numbers near one, whatever the robot's size and the instrument's noise.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -192,21 +192,13 @@ def point_values(model: Model, x: State) -> Array:
 
 def point_sensitivity(model: Model, x: State) -> Sensitivity:
     """Squared distances and their derivatives."""
-    blocks = model.blocks(x)
-    rows = [model.weighted_rows(x, block, model.active) for block in blocks]
-    f = np.concatenate([(error**2).sum(axis=-2) for error, _ in rows], axis=-1)
-    jacobians = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
-    jacobian = np.concatenate(jacobians, axis=1)
+    f, jacobian = model.squares(x)
 
     def curvature(weights: Array) -> Array:
-        spread = np.zeros(model.seen.shape)
-        spread[model.seen] = np.sqrt(weights)
-        total = np.zeros((jacobian.shape[-1],) * 2)
-        for block, (_, turned) in zip(blocks, rows, strict=True):
-            part = turned * spread[:, None, None, block.rows]
-            flat = np.moveaxis(part, 1, 0).reshape(len(total), -1)
-            total += flat @ flat.T
-        return 2.0 * total
+        share = np.zeros(model.seen.shape)
+        share[model.seen] = weights
+        some = replace(model, weight=model.weight * share)
+        return np.asarray(2.0 * some.normal(x, model.active).gram.sum(axis=0))
 
     return Sensitivity(f[model.seen], jacobian[model.seen], curvature)
 

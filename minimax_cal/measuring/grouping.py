@@ -7,9 +7,10 @@ whole part is left out)?  Poses that repeat each other, or stand in one cluster,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from weakref import WeakKeyDictionary
+from functools import wraps
+from weakref import finalize
 
 import numpy as np
 import scipy
@@ -24,6 +25,7 @@ from minimax_cal.measuring.measurements import Measurements
 REPEAT = 5e-4
 APART = 3.0  # the distance between clusters over those inside them
 FEWEST_CLUSTERS = 8  # fewer are regions of the workspace: `parts` leaves each out in its turn
+LABELS = ("pose", "group")  # columns that tell which poses belong together
 SORTED = 2000  # poses among which pairs are found by sorting, without a tree
 MOST = 3000  # poses among which clusters are looked for
 MOVES = 0.01  # a joint with less range does not move [rad, m]
@@ -34,19 +36,32 @@ MOST_OF = 0.5  # share of the poses that a part may have
 FEWEST = 3  # poses of a part
 
 
+def remembered(find: Callable[[Measurements], Array]) -> Callable[[Measurements], Array]:
+    """The function, whose answers are kept as long as the joint values of the poses.
+
+    One calibration asks a dozen times, and arrays of measurements are never changed in place.  The
+    answer must rest on joints and labels alone.
+    """
+    known: dict[int, tuple[Mapping[str, Array], Array]] = {}
+
+    @wraps(find)
+    def asked(data: Measurements) -> Array:
+        labels = {name: data.columns[name] for name in LABELS if name in data.columns}
+        here = known.get(id(data.q))
+        if here is None:
+            finalize(data.q, known.pop, id(data.q), None)
+        if here is None or labels.keys() != here[0].keys() or any(
+            here[0][name] is not label for name, label in labels.items()
+        ):  # fmt: skip
+            here = known[id(data.q)] = labels, find(data)
+        return here[1].copy()
+
+    return asked
+
+
+@remembered
 def groups(data: Measurements) -> Array:
     """(m,) a number for each pose: rows at the same joints, or of the same `pose`, share it."""
-    if data not in FOUND:
-        FOUND[data] = repeats(data)
-    return FOUND[data].copy()
-
-
-# one calibration asks a dozen times; measurements are never changed in place
-FOUND: WeakKeyDictionary[Measurements, Array] = WeakKeyDictionary()
-
-
-def repeats(data: Measurements) -> Array:
-    """`groups`, looked for."""
     near = close_pairs(data.q, REPEAT)
     group = joined(near, data.poses) if len(near) else np.arange(data.poses)
     for label in np.unique(group[near[:, 0]]) if len(near) else ():
@@ -124,6 +139,7 @@ def leaders(q: Array) -> Array:
     return lead
 
 
+@remembered
 def clusters(data: Measurements) -> Array:
     """(m,) a number for each pose; poses of a cluster share it, repeats always do.
 

@@ -214,16 +214,8 @@ def normal(
     total, pull, both = np.zeros((B, k)), np.zeros((B, k, h)), np.zeros((B, k, h, h))
     side, own = np.zeros((B, k, h, 3)), np.zeros((B, k, 3))
     for rows in blocks(len(q), B * k):
-        arm, shift = unwound(mdh, q[rows], prismatic), shifted(effects, fields, moved, rows)
-        error, swung = sighted(*arm[:2], rotation, origin, targets, y[..., rows], shift)
-        J = sensed(arm, targets, swung, which[:s])
-        if end < p:
-            field = np.swapaxes(fields[which[end:] - last][..., rows], 0, 1)
-            more = inside(arm[0], np.broadcast_to(field, (B, *field.shape)))
-            J = np.concatenate([J, more], axis=2)
-        root = np.sqrt(weight[:, rows])
-        J *= root[:, None, None]
-        error *= root[:, None]
+        error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
+                                fields, moved, which, rows)  # fmt: skip
         flat = J.reshape(B, k, h, -1)
         total += np.einsum("bkic,bkic->bk", error, error)
         pull += (flat @ error.reshape(B, k, -1, 1))[..., 0]
@@ -245,6 +237,71 @@ def normal(
             gram[:, t, to, lo:hi] = part = side[:, t, at][..., axis]
             gram[:, t, lo:hi, to] = np.swapaxes(part, -1, -2)
     return total, gradient, gram
+
+
+def shared(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
+    poses: slice,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Weighted errors (B, k, 3, c), columns that all targets share (B, k, h, 3, c), roots (k, c).
+
+    The roots are those of the weights.  Of some poses, in the axes of the flange; as `normal`.
+    """
+    n, k = mdh.shape[1], len(y)
+    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
+    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
+    arm, shift = unwound(mdh, q[poses], prismatic), shifted(effects, fields, moved, poses)
+    error, swung = sighted(*arm[:2], rotation, origin, targets, y[..., poses], shift)
+    J = sensed(arm, targets, swung, which[:s])
+    if end < len(which):
+        field = np.swapaxes(fields[which[end:] - last][..., poses], 0, 1)
+        more = inside(arm[0], np.broadcast_to(field, (len(mdh), *field.shape)))
+        J = np.concatenate([J, more], axis=2)
+    root = np.sqrt(weight[:, poses])
+    J *= root[:, None, None]
+    error *= root[:, None]
+    return error, J, root
+
+
+def rows(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array, lo: int,
+    hi: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Weighted errors (k, 3, c) of the poses lo to hi, and their Jacobian J (k, p, 3, c).
+
+    In the axes of the flange, of a batch of one; the errors' derivative is -J.  As `normal`.
+    """
+    n, k, p = mdh.shape[1], len(y), len(which)
+    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
+    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
+    error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
+                            fields, moved, which, slice(lo, hi))  # fmt: skip
+    out = np.zeros((k, p, *error.shape[2:]))
+    out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
+    for row in range(s, end):
+        t, axis = divmod(int(which[row]) - first, 3)
+        out[t, row, axis] = root[t]
+    return error[0], out
+
+
+def squares(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Weighted squared distance of every point (k, m) [m^2] and its derivative (k, m, p).
+
+    Of a batch of one, as `normal`.
+    """
+    k, m = weight.shape
+    f, slope = np.zeros((k, m)), np.zeros((k, m, len(which)))
+    for part in blocks(m, k):
+        error, J = rows(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
+                        moved, which, part.start, part.stop)  # fmt: skip
+        f[:, part] = np.einsum("kic,kic->kc", error, error)
+        slope[:, part] = -2.0 * np.einsum("kpic,kic->kcp", J, error)
+    return f, slope
 
 
 def sensed(
