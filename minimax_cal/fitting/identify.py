@@ -163,16 +163,18 @@ def gram_of(model: Model, state: State) -> Array:
 
 def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) -> int:
     """How many of the allowed parameters plenty of poses would determine, for targets anywhere."""
-    known = GENERIC.setdefault(robot, {})
-    if reference.names not in known:
+    known = COUNTED.setdefault(robot, {})
+    asked = len(reference.y), order.tobytes(), allowed.tobytes()
+    if asked not in known:
         spots = np.random.default_rng(0).normal(size=(len(reference.y), 3))
         state = State(robot.mdh, np.eye(3), np.zeros(3), 0.1 * robot.reach() * spots)
-        known[reference.names] = gram_of(reference, state)
-    return int(allowed.sum()) - len(redundant(known[reference.names], allowed, order, RANK))
+        gone = redundant(gram_of(reference, state), allowed, order, RANK)
+        known[asked] = int(allowed.sum()) - len(gone)
+    return known[asked]
 
 
-# the Gram matrices of `generic_count`, which every fit of a robot asks for
-GENERIC: WeakKeyDictionary[Robot, dict[Names, Array]] = WeakKeyDictionary()
+# the answers of `generic_count`, for which every fit of a robot asks
+COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
 
 
 def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:

@@ -8,7 +8,7 @@ numbers near one, whatever the robot's size and the instrument's noise.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -70,6 +70,7 @@ class MinimaxProblem:
 
     per: "target" for f_i = F_i / m_i, "point" for the squared distance of every measured point.
     start, first: where the scaling was found, and the derivatives there.
+    mean: (free, free) mean of the curvatures there.
     scale: (free,) divides a step's entries.  size: divides the f_i [m^2].
     form: "two-sided" |e| <= tol, or the paper's "squared" e^2 <= tol^2, whose gradient vanishes
     at e = 0, or "off".
@@ -80,6 +81,7 @@ class MinimaxProblem:
     distances: Distances
     start: State
     first: Sensitivity
+    mean: Array
     scale: Array
     size: float
     form: str
@@ -103,6 +105,8 @@ class MinimaxProblem:
     def deviation(self, x: State) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
         pairs, names = self.distances.pairs, self.model.names
+        if not len(pairs):
+            return np.zeros(0), np.zeros((0, len(self.scale)))
         between = x.target_positions[pairs[:, 0]] - x.target_positions[pairs[:, 1]]
         length = np.maximum(np.linalg.norm(between, axis=-1), 1e-12)
         c = (length - self.distances.mean) / self.distances.tolerance
@@ -133,7 +137,11 @@ class MinimaxProblem:
         c, normal = self.deviation(x)
 
         def curvature(weights: Array) -> Array:
-            both = at.curvature(weights)
+            if self.per == "point":  # few have more than the least; of that any place will do
+                least = float(weights.min())
+                both = at.curvature(weights - least) + least * len(weights) * self.mean
+            else:
+                both = at.curvature(weights)
             if known:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
             return np.asarray(both / self.squared_scale)
@@ -197,8 +205,7 @@ def point_sensitivity(model: Model, x: State) -> Sensitivity:
     def curvature(weights: Array) -> Array:
         share = np.zeros(model.seen.shape)
         share[model.seen] = weights
-        some = replace(model, weight=model.weight * share)
-        return np.asarray(2.0 * some.normal(x, model.active).gram.sum(axis=0))
+        return 2.0 * model.gram(x, model.weight * share)
 
     return Sensitivity(f[model.seen], jacobian[model.seen], curvature)
 
@@ -221,7 +228,7 @@ def minimax_problem(
     first = PER[per][1](model, start)
     size = float(first.f.max())
     size = size if size > 0.0 else 1e-18
-    mean = 0.5 * np.diag(first.curvature(np.full(len(first.f), 1.0 / len(first.f))))
-    mean = mean + model.prior.weight[model.active] / model.counts.sum()
-    scale = np.sqrt(np.maximum(2.0 * mean / size, 1e-30))
-    return MinimaxProblem(per, model, distances, start, first, scale, size, form)
+    mean = first.curvature(np.full(len(first.f), 1.0 / len(first.f)))
+    known = model.prior.weight[model.active] / model.counts.sum()
+    scale = np.sqrt(np.maximum((np.diag(mean) + 2.0 * known) / size, 1e-30))
+    return MinimaxProblem(per, model, distances, start, first, mean, scale, size, form)
