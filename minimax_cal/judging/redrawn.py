@@ -63,7 +63,7 @@ class Rows:
         slack = (mu * (self.f.max(axis=1, keepdims=True) - self.f)).sum(axis=1)
         slack += np.abs(lam * room).sum(axis=1)
         violation = np.maximum(np.abs(self.c) - 1.0, 0.0).max(axis=1, initial=0.0)
-        return np.maximum(np.maximum(stationarity, slack), violation)
+        return np.asarray(np.maximum(np.maximum(stationarity, slack), violation))
 
     def step(self, z: Array, floor: float) -> tuple[Array, Array, Array]:
         """Steps (B, p) and multipliers (B, k + l) of the QPs, and (B,) which were solved.
@@ -189,7 +189,7 @@ class Redrawn:
 
 
 def solved_at_once(
-    model: Model, fit: State, draw: Draw, mu: Array, settings: Sqp = Sqp()
+    model: Model, fit: State, draw: Draw, mu: Array, settings: Sqp
 ) -> tuple[State, Array]:
     """The minimax of every draw, a batch of B states, and (B,) True where it was reached.
 
