@@ -30,6 +30,7 @@ SORTED = 2000  # poses among which pairs are found by sorting, without a tree
 MOST = 3000  # poses among which clusters are looked for
 MOVES = 0.01  # a joint with less range does not move [rad, m]
 REGIONS = 5  # clusters of joint values that are left out in their turn
+LLOYD = 10  # rounds that find them
 QUARTER = 0.25  # of the poses at each end of a joint
 LATE = 0.2  # share of a session that its last part is
 MOST_OF = 0.5  # share of the poses that a part may have
@@ -319,10 +320,30 @@ def candidates(data: Measurements, by: str | None) -> Iterator[Region]:
 def regions(data: Measurements) -> Array:
     """(m,) number of the cluster of joint values that a pose is in, out of about `REGIONS`."""
     count = min(REGIONS, len(np.unique(groups(data))))
-    seeded = np.random.default_rng(0)
-    return np.asarray(
-        scipy.cluster.vq.kmeans2(data.q, count, minit="++", seed=seeded, missing="warn")[1]
-    )
+    return nearest_means(data.q, count, np.random.default_rng(0))
+
+
+def nearest_means(q: Array, count: int, rng: np.random.Generator) -> Array:
+    """(m,) the nearest of some means of q (m, n) [Lloyd 1982; Arthur and Vassilvitskii 2007].
+
+    Ten rounds from a start that is drawn apart, as `scipy.cluster.vq.kmeans2` takes them, which is
+    slow to import.
+    """
+
+    def squares() -> Array:
+        return np.stack([((q - mean) ** 2).sum(axis=1) for mean in means])
+
+    means = q[[rng.integers(len(q))]]
+    while len(means) < count:
+        square = squares().min(axis=0)
+        chosen = np.searchsorted((square / square.sum()).cumsum(), rng.uniform())
+        means = np.concatenate([means, q[[chosen]]])
+    for _ in range(LLOYD):
+        label = squares().argmin(axis=0)
+        size = np.bincount(label, minlength=count)
+        total = np.stack([np.bincount(label, column, count) for column in q.T], axis=1)
+        means = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], means)
+    return label
 
 
 def region_name(data: Measurements, rows: Array) -> str:
