@@ -19,8 +19,9 @@ import click
 
 from experiments.index import Outcome, write_index
 from experiments.record import environment, save_json
-from experiments.sweep import Study, look_for, needed, study_options
+from experiments.sweep import Study, needed, study_options
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.parallel import look_for
 
 STUDIES = {  # name: (module with the command `main`, what it tells)
     "papers": (

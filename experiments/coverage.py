@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from experiments import sweep
@@ -38,8 +37,8 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.judging.bootstrap import bootstrap
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.parameters import State, links_of
-from minimax_cal.modelling.simulate import Truth, gravity, random_poses, simulate
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
+from minimax_cal.robots.sampling import random_poses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -176,14 +175,6 @@ def reference(arm: Cell, case: Case) -> Solved:
     return fit_cell(mc.load_robot(case.robot), data, Options(objective="sum"), silent)
 
 
-def along(axes: Array, x: State) -> Array:
-    """(p,) parameters, the base's along given axes, as `calibrate.parameter_table` tells them."""
-    turn = Rotation.from_matrix(axes.T @ x.rotation).as_rotvec()
-    return np.concatenate(
-        [links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1)]
-    )
-
-
 def known_by_noise(fit: Solved) -> Uncertainty:
     """The uncertainty of a fit by its noises alone."""
     active = fit.estimator.model.active
@@ -220,7 +211,7 @@ def run(batch: Batch) -> Runs:
         if not np.array_equal(fit.identification.active, active):
             continue
         axes = fit.nominal.rotation
-        error = along(axes, fit.state)[active] - along(axes, true.state)[active]
+        error = (fit.state.along(axes) - true.state.along(axes))[active]
         told = (fit.uncertainty, known_by_noise(fit))
         cell = Cell.of(robot, fit.state, arm.target_names)
         inside = [positions(cell, known, ideal, case, rng) for known in told]
@@ -323,7 +314,7 @@ def resampled(batch: Batch) -> tuple[Array, Array]:
         if not np.array_equal(found.place, place):
             continue
         low, high = found.interval(LEVEL).T
-        truth = along(fit.before.base[:3, :3], true.state)[place]
+        truth = true.state.along(fit.before.base[:3, :3])[place]
         held.append((low <= truth) & (truth <= high))
         q = random_poses(robot, WORKSPACE, rng)
         low, high = found.position_interval(q, LEVEL)

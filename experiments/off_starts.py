@@ -8,12 +8,14 @@ at their identity and origin, everything else nominal.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from experiments import pseudo_inverse
+from experiments.pseudo_inverse import ROUNDING
 from experiments.speed import identified
 from minimax_cal.fitting.start import search
 from minimax_cal.ground.arrays import Array
@@ -30,6 +32,7 @@ from minimax_cal.solvers.status import Status
 PAPER = ("nlgn", "nllm", "snlgn", "snllm")
 UNITS = {"all, mm": 1e3, "all, m": 1.0}  # the paper's parameters: units a metre
 CAP = 10_000
+MANY = 5_000  # iterations allowed from which half a minute of compiling pays
 STEP = 1e-9  # motion of a point at which the library's iteration has ended [m]
 SMALL = 1e-6  # length of a step, in the units chosen, at which the paper's has ended
 DAMPING, BY = 1e-2, 10.0  # Marquardt's first damping and factor, as MATLAB's lsqnonlin has them
@@ -76,7 +79,8 @@ def measured(setting: Setting) -> tuple[Robot, Measurements]:
 class Job:
     """Some starts of one method: deviations of theta_2 and alpha_3.
 
-    parameters: identifiable, by the library, or one of UNITS, by the paper's own way.
+    parameters: identifiable, by the library, or one of UNITS, by the paper's own way.  moved:
+    whether each value of a start is moved by a unit of rounding, at random.
     """
 
     setting: Setting
@@ -85,6 +89,7 @@ class Job:
     theta: tuple[float, ...]
     alpha: tuple[float, ...]
     cap: int = CAP
+    moved: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,12 +109,14 @@ def grid(every: int) -> tuple[Array, Array]:
     return theta.ravel(), alpha.ravel()
 
 
-def jobs_of(setting: Setting, method: str, parameters: str, every: int, cap: int) -> list[Job]:
+def jobs_of(
+    setting: Setting, method: str, parameters: str, every: int, cap: int, moved: bool = False
+) -> list[Job]:
     """The grid cut into jobs."""
     theta, alpha = grid(every)
     return [
         Job(setting, method, parameters, tuple(theta[i : i + CHUNK].tolist()),
-            tuple(alpha[i : i + CHUNK].tolist()), cap)
+            tuple(alpha[i : i + CHUNK].tolist()), cap, moved)
         for i in range(0, len(theta), CHUNK)
     ]  # fmt: skip
 
@@ -167,7 +174,11 @@ def to_the_letter(job: Job, robot: Robot, model: Model) -> Outcome:
     """The paper's own way, one start after the other."""
     iterations, costs, converged = [], [], []
     begins = [flat(robot, t, a) for t, a in zip(job.theta, job.alpha, strict=True)]
-    letter(job.method, job.parameters, model, begins[0], 1)  # compiling does not count
+    if job.moved:
+        rng = np.random.default_rng(0)
+        begins = [x * (1.0 + ROUNDING * rng.integers(-1, 2, x.size)) for x in begins]
+    # compiling does not count
+    letter(job.method, job.parameters, model, begins[0], 1, meant=job.cap)
     began = time.perf_counter()
     for begin in begins:
         count, cost, ended, _ = letter(job.method, job.parameters, model, begin, job.cap)
@@ -189,21 +200,36 @@ def flat(robot: Robot, theta: float = 0.0, alpha: float = 0.0) -> Array:
     return np.concatenate([links_of(mdh), np.zeros(9)])
 
 
+def twin() -> Callable[..., tuple[int, float, int]] | None:
+    """`pseudo_inverse.iterate` of all parameters together, where numba is there to compile it."""
+    try:
+        from experiments.pseudo_inverse_fast import iterate
+    except ImportError:
+        return None
+    return iterate
+
+
 def letter(
-    method: str, parameters: str, model: Model, begin: Array, cap: int, course: int = 0
-) -> tuple[int, float, int, Array]:
+    method: str, parameters: str, model: Model, begin: Array, cap: int, course: int = 0,
+    meant: int = 0,
+) -> tuple[int, float, int, Array]:  # fmt: skip
     """Iterations, cost [m^2], how it ended, and the costs of the first iterates (course,) [m^2].
 
-    One of PAPER on one of UNITS, on the first target of a model.
+    One of PAPER on one of UNITS, on the first target of a model.  meant: the cap that decides
+    whether the compiled twin runs, if it is not this one.
     """
     unit = UNITS[parameters]
     scale = np.where(model.names.linear, unit, 1.0)
     damping = DAMPING if METHODS[method].damped else 0.0
     costs = np.full(course, np.nan)
     y = unit * model.y[0].ravel()
+    at, q, rule = begin * scale, np.ascontiguousarray(model.q), (damping, BY, SMALL, cap)
+    separable = METHODS[method].separable
+    fast = twin() if not separable and max(cap, meant) >= MANY else None
     with np.errstate(all="ignore"):
-        count, cost, ended = pseudo_inverse.iterate(
-            begin * scale, np.ascontiguousarray(model.q), y,
-            METHODS[method].separable, damping, BY, SMALL, cap, costs,
-        )  # fmt: skip
+        count, cost, ended = (
+            fast(at, q, y, *rule, costs)
+            if fast
+            else pseudo_inverse.iterate(at, q, y, separable, *rule, costs)
+        )
     return int(count), float(cost) / unit**2, int(ended), costs / unit**2

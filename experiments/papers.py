@@ -60,13 +60,6 @@ def made_by(
     return make
 
 
-def from_convergence(study: Study) -> list[Verdict]:
-    """Paper S, Table 2 and Fig. 3."""
-    rows, setting = convergence.study_of(study)
-    convergence.save(study, rows, setting)
-    return verdicts_s.table_2(rows)
-
-
 def from_conditions(study: Study) -> list[Verdict]:
     """Paper M, Table 3 and Fig. 2-6."""
     found = conditions.study_of(study)
@@ -104,7 +97,7 @@ def from_errata(study: Study) -> list[Verdict]:
 
 
 STUDIES: dict[str, Callable[[Study], list[Verdict]]] = {
-    "convergence": from_convergence,
+    "convergence": made_by(convergence, verdicts_s.table_2),
     "courses": made_by(courses, verdicts_s.courses),
     "any_base": made_by(any_base, verdicts_s.anywhere),
     "conditions": from_conditions,

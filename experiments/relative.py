@@ -36,14 +36,15 @@ from minimax_cal.fitting.instruments import (
 from minimax_cal.fitting.instruments.closing import CLOSED, reach
 from minimax_cal.fitting.instruments.data import wire_names
 from minimax_cal.fitting.instruments.identify import position_sigma
-from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.simulate import gravity, random_poses
+from minimax_cal.modelling.simulate import gravity
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import nearest_rotation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -218,7 +219,7 @@ def position_errors(arm: Arm, robot: Robot, spot: Array, q: Array, *, scaled: bo
 def apart(true: Array, predicted: Array, *, scaled: bool) -> Array:
     """Distance (m,) of points from points (m, 3) after the best rigid motion, or similarity [m]."""
     off, moved = true - true.mean(axis=0), predicted - predicted.mean(axis=0)
-    moved = moved @ project(off.T @ moved).T
+    moved = moved @ nearest_rotation(off.T @ moved).T
     scale = (off * moved).sum() / (moved**2).sum() if scaled else 1.0
     return np.asarray(np.linalg.norm(off - scale * moved, axis=1))
 

@@ -29,10 +29,10 @@ from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Fitted, terms
-from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.reporting.plots.simulator import simulator_figure
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.simulators.result import SimulatorGap
 
 PUBLISHED = (5000.0, 5000.0, 5000.0, 1000.0, 1000.0, 1000.0, 1000.0)  # gains of the size in use

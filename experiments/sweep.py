@@ -3,7 +3,7 @@
     results = sweep(function, jobs, name="any_base")                          # all cores
     results = sweep(function, jobs, name="any_base", cluster="tcp://host:8786")
 
-joblib does the scheduling.  Each result is kept on disk as it arrives, under a key of all that it
+Each result is kept on disk as it arrives, under a key of all that it
 depends on, so that the same call goes on from there.  Workers of a cluster must run the same code,
 one job at a time: start them in the project's folder with
 ``python -m dask worker tcp://host:8786 --nworkers N --nthreads 1``.
@@ -14,7 +14,6 @@ A study takes its options from `study_options` and ends with ``start(__file__)``
 from __future__ import annotations
 
 import ast
-import asyncio
 import dataclasses
 import functools
 import hashlib
@@ -23,11 +22,8 @@ import io
 import itertools
 import pickle
 import sys
-import time
-import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
@@ -44,6 +40,8 @@ import qp_backends
 from experiments.record import environment, save_figure, save_json, save_tables
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.optional import optional
+from minimax_cal.ground.parallel import WorkersLost, in_parallel
 from minimax_cal.ground.tables import Table
 
 if TYPE_CHECKING:
@@ -53,9 +51,6 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 CACHE = Path("results/cache")
-PATIENCE = 5.0  # for a scheduler, and for its first worker, to answer [s]
-DESERTED = 30.0  # a cluster without workers, which a nanny may yet start again [s]
-WATCH = 1.0  # how often that is looked at [s]
 LIBRARIES = tuple(Path(package.__path__[0]) for package in (minimax_cal, qp_backends))
 SOLVERS = ("daqp", "osqp", "clarabel", "proxsuite", "quadprog", "piqp", "highspy", "scs")
 NUMERICS = ("numpy", "scipy", "qpsolvers", "cvxpy", *SOLVERS)
@@ -98,10 +93,11 @@ def sweep(
     if results:
         click.echo(f"{name}: {len(results)} of {len(jobs)} parts were kept", err=True)
     waiting = [number for number in range(len(jobs)) if number not in results]
-    calls = [(function, number, jobs[number], code if cluster else "") for number in waiting]
+    calls = [(function, jobs[number], code if cluster else "") for number in waiting]
     try:
         with closing(run(calls, jobs_in_parallel, cluster, description or name)) as arriving:
-            for number, result in arriving:
+            for at, result in arriving:
+                number = waiting[at]
                 write_part(paths[number], result)
                 results[number] = result
     finally:
@@ -111,17 +107,17 @@ def sweep(
     return [results[number] for number in range(len(jobs))]
 
 
-Call = tuple[Callable[..., Any], int, Any, str]  # what `part` takes
+Call = tuple[Callable[..., Any], Any, str]  # what `part` takes
 
 
-def part(function: Callable[[J], R], number: int, job: J, code: str) -> tuple[int, R]:
+def part(function: Callable[[J], R], job: J, code: str) -> R:
     """One job where it runs; code, if any, is the fingerprint that it must find there."""
     if code and fingerprint(function) != code:
         raise OptionError(
             "a worker of the cluster runs other code or other versions of numpy, scipy or the QP "
             "solvers; bring it to the state of this machine and start it again"
         )
-    return number, function(job)
+    return function(job)
 
 
 def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
@@ -143,124 +139,21 @@ def progress(items: Iterator[R], total: int, description: str) -> Iterator[R]:
 def run(
     calls: Sequence[Call], jobs_in_parallel: int, cluster: str, description: str
 ) -> Generator[tuple[int, Any], None, None]:
-    """Results of `part` for each call, in the order they finish."""
-    if calls:
-        arriving = on_cluster(calls, cluster) if cluster else here(calls, jobs_in_parallel)
-        with closing(arriving):
-            yield from progress(arriving, len(calls), description)
-
-
-def here(calls: Sequence[Call], jobs_in_parallel: int) -> Generator[tuple[int, Any], None, None]:
-    """Run calls by joblib in processes of one thread each on this machine."""
-    joblib = needed("joblib", "experiments")
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = joblib.Parallel(n_jobs=jobs_in_parallel, return_as="generator_unordered")
-        arriving = parallel(joblib.delayed(part)(*call) for call in calls)
-        loky = import_module("joblib.externals.loky.process_executor")
-        try:
-            yield from arriving
-        except loky.BrokenProcessPool as error:
-            raise click.ClickException(
-                "a process of this sweep died: too little memory, or it was killed; give fewer "
-                f"--jobs ({type(error).__name__})"
-            ) from error
-        finally:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
-                arriving.close()
-
-
-def on_cluster(calls: Sequence[Call], cluster: str) -> Generator[tuple[int, Any], None, None]:
-    """Run calls on a Dask cluster, which deals with workers that come and go.
-
-    Not by joblib's Dask backend (1.6): it waits for ever when Dask itself fails, as where a job
-    kills its worker, and it runs on this machine alone while the cluster has one worker.
-    """
-    distributed = needed("distributed", "distributed")
-    with connected(cluster) as client:
-        need_modules(client, cluster, {__name__, calls[0][0].__module__})
-        futures = client.map(part, *zip(*calls, strict=True), pure=False)
-        try:
-            for future in finished(client, futures):
-                yield future.result()
-        except (distributed.KilledWorker, CancelledError, OSError) as error:
-            raise click.ClickException(f"{cluster}: {' '.join(str(error).split())}") from error
-
-
-def finished(client: Any, futures: Sequence[Any]) -> Iterator[Any]:
-    """Futures as they finish.  Raises OSError when nobody has been at work on them for long."""
-    distributed = needed("distributed", "distributed")
-    waiting, seen = set(futures), time.monotonic()
-    while waiting:
-        with suppress(distributed.TimeoutError), client.as_current():
-            done = distributed.wait(waiting, timeout=WATCH, return_when="FIRST_COMPLETED").done
-            waiting -= done
-            yield from done
-        if client.status == "running" and client.scheduler_info()["workers"]:
-            seen = time.monotonic()
-        elif time.monotonic() - seen > DESERTED:
-            raise OSError(
-                f"no scheduler or no workers for {DESERTED:g} s; start them again, and then this"
-            )
-
-
-def need_modules(client: Any, cluster: str, modules: set[str]) -> None:
-    """Raises OptionError unless scheduler and workers have modules; Dask would lose its workers."""
+    """The number of each call of `part` and its result, in the order they finish."""
+    if not calls:
+        return
+    modules = [calls[0][0].__module__]
+    work = in_parallel(part, calls, modules, processes=jobs_in_parallel, cluster=cluster)
     try:
-        for module in modules:
-            client.run_on_scheduler(import_module, module)
-            client.run(import_module, module)
-    except ModuleNotFoundError as error:
-        raise OptionError(
-            f"{cluster} has no module {error.name!r}; start scheduler and workers in the project's "
-            f"folder, with the same packages: python -m dask worker {cluster} --nthreads 1"
-        ) from error
-
-
-@contextmanager
-def connected(cluster: str) -> Iterator[Any]:
-    """A client of the Dask scheduler, which has at least one worker.  Raises OptionError."""
-    distributed = needed("distributed", "distributed")
-    look_for(cluster)
-    with distributed.Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
-        try:
-            client.wait_for_workers(1, timeout=PATIENCE)
-        except TimeoutError as error:
-            raise OptionError(
-                f"{cluster}: the scheduler has no workers; start some in the project's folder: "
-                f"python -m dask worker {cluster} --nworkers N --nthreads 1"
-            ) from error
-        yield client
-
-
-def look_for(cluster: str) -> None:
-    """Raises OptionError unless a Dask scheduler answers soon; a client might wait for ever."""
-    distributed = needed("distributed", "distributed")
-
-    async def identity() -> Any:
-        async with distributed.rpc(cluster, timeout=PATIENCE) as scheduler:
-            return await scheduler.identity()
-
-    try:
-        found = asyncio.run(asyncio.wait_for(identity(), PATIENCE))["type"]
-    except Exception as error:  # no such host, no answer, or an answer of something else
-        what = " ".join(str(error).split()) or f"no answer in {PATIENCE:g} s"
-        raise OptionError(
-            f"no Dask scheduler at {cluster!r} ({what}); start one with python -m dask scheduler "
-            "and give its address as tcp://host:port"
-        ) from error
-    if found != "Scheduler":
-        raise OptionError(f"{cluster} is a Dask {found.lower()}; give the scheduler's address")
+        with closing(work):
+            yield from progress(work, len(calls), description)
+    except WorkersLost as error:
+        raise click.ClickException(str(error)) from error
 
 
 def needed(module: str, extra: str) -> Any:
     """An optional module.  Raises OptionError with the command that installs it."""
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        raise OptionError(
-            f"this needs {error.name!r}: pip install 'minimax-cal[{extra}]'"
-        ) from error
+    return optional(module, "this", f"minimax-cal[{extra}]")
 
 
 # ---- what is kept ----------------------------------------------------------------------------

@@ -26,9 +26,10 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.judging.watching.health import check
 from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.simulate import Truth, gravity, random_poses, simulate
+from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import load_robot
+from minimax_cal.robots.sampling import random_poses
 
 ARMS = ("irb2600", "irb120", "ur10")
 SHIFT = 2e-4  # of a joint's zero [rad]

@@ -115,7 +115,7 @@ def linear_optimum(rows: Rows, lower: Array, upper: Array) -> tuple[Array, float
     kept = [cp.norm(r, axis=1) <= t]
     kept += [rows.c + rows.C @ d >= lower, rows.c + rows.C @ d <= upper] if len(rows.c) else []
     problem = cp.Problem(cp.Minimize(t), kept)
-    problem.solve(solver="CLARABEL", tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+    problem.solve(solver="CLARABEL", tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
     return np.asarray(d.value), float(problem.value)
 
 

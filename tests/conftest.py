@@ -8,6 +8,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
+from browsing import browsing  # stands beside this
 
 import minimax_cal as mc
 from minimax_cal.cli import main
@@ -18,8 +19,16 @@ SHARED = ROOT.parent / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The site is built first: no other test takes as long, and one process waits for none."""
-    items.sort(key=lambda item: item.path.name != "test_docs.py")
+    """Site, README and the like come first: they take longest, and no process waits for them."""
+    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Tests beside each other stay in one process, which then makes their fixtures once."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 @pytest.fixture
@@ -50,6 +59,19 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     from served import serving  # stands beside those tests
 
     with serving(tmp_path_factory.mktemp("sessions")) as found:
+        yield found
+
+
+@pytest.fixture(scope="session")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the browser keeps what it is given."""
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="session")
+def driver(downloads: Path) -> Iterator[Any]:
+    """The browser of all tests that look at pages."""
+    with browsing(downloads) as found:
         yield found
 
 

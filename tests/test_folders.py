@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from minimax_cal.modelling.effects import EFFECTS
+
 ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
@@ -51,6 +53,19 @@ def test_imports_point_down(path: Path) -> None:
         assert package not in ("experiments", "tests")
         if package == "minimax_cal" and inner:
             assert inner.partition(".")[0] in allowed, f"{folder} imports {module}"
+
+
+def test_no_name_of_an_effect_is_compared() -> None:
+    """What an effect does, it states; who must speak of one takes the name from its law."""
+    above = {"faults/nests.py", "faults/sessions.py", "evidence/periodogram.py"}  # name their own
+    found = set()
+    for path in MODULES:
+        if path.parent.name != "effects" or path.parent.parent.name != "modelling":
+            constants = (n.value for n in ast.walk(ast.parse(path.read_text()))
+                         if isinstance(n, ast.Constant) and isinstance(n.value, str))  # fmt: skip
+            if EFFECTS.keys() & set(constants):
+                found.add("/".join(path.parts[-2:]))
+    assert found == above
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "qp_backends").glob("*.py")), ids=lambda p: p.stem)

@@ -24,9 +24,9 @@ from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.reach import Outcome, Reach, arm_of, bent, lever_of, motion, seen
-from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_poses
 
 FRAMES = ("best-fit", "flange", "own")
 SAMPLE = 200  # poses that place a nominal base where no calibration did

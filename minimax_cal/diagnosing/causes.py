@@ -9,19 +9,22 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, explained, heard, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
+from minimax_cal.diagnosing.scatter import weighed_anew
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.library import Candidate, Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
+from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.time import SESSION_JUMP
 
 FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
@@ -50,23 +53,37 @@ class Causes:
 
 def causes_of(
     study: Study, faults: Sequence[Fault], exclude: Sequence[str], progress: Progress
-) -> Causes:
-    """The effects that explain a study's errors, beside faults that are known."""
+) -> tuple[Study, Causes]:
+    """The effects that explain a study's errors, beside faults that are known.
+
+    And the study, its rows weighed by the noises that were found beside the effects.
+    """
     progress("effects")
     lib, choice = chosen(study, exclude)
+    traces = left_by(study, choice)
+    loud = heard(traces, explained(study.rows, choice), study.rows.count)
+    plain, study = study, weighed_anew(study, choice.known, each=loud is None)
+    if study is not plain:
+        progress("effects beside noises that differ")
+        lib, choice = chosen(study, exclude, choice.chosen)
+        traces = left_by(study, choice)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
-        lib, choice = chosen(study, (*exclude, "backlash"))
-    progress("what remains")
-    traces = structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
+        play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
+        lib, choice = chosen(study, (*exclude, *play))
+        traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
-    ripple = "gear_ripple" not in exclude
+    ripple = GEAR_RIPPLE.name not in exclude
     effects = judged_again(effects, choice, study.data, lib, ripple)
-    return Causes(
-        (*faults, *read_back), lib, ripple, choice, tuple(effects), traces, lib.untestable
-    )
+    every = (*faults, *read_back)
+    return study, Causes(every, lib, ripple, choice, tuple(effects), traces, lib.untestable)
+
+
+def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
+    """Traces of what the effects leave."""
+    return structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
 
 
 def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
@@ -80,24 +97,26 @@ def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
 def named_in(choice: Choice) -> list[Named]:
     """The effects selected with their motions: of few parameters each its own, else together."""
     out = []
-    for one in choice.fits:
-        motion = choice.library.columns[:, one.candidate.main].T
-        motion = motion if len(motion) <= FEW else (one.value @ motion)[None]
-        out.append(Named(one.candidate.term, motion))
+    for candidate, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
+        motion = choice.library.columns[:, candidate.main].T
+        motion = motion if len(motion) <= FEW else (value @ motion)[None]
+        out.append(Named(candidate.term, motion))
     return out
 
 
-def chosen(study: Study, exclude: Sequence[str]) -> tuple[Library, Choice]:
-    """The library and what it explains."""
+def chosen(
+    study: Study, exclude: Sequence[str], first: Sequence[Candidate] = ()
+) -> tuple[Library, Choice]:
+    """The library and what it explains.  first: what was chosen with other weights."""
     lib = library(study.scene, study.rows, exclude)
-    if "session_jump" not in exclude:
+    if SESSION_JUMP.name not in exclude:
         lib = with_jumps(lib, study)
-    return lib, selection.select(lib, ripple="gear_ripple" not in exclude)
+    return lib, selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
 
 
 def with_jumps(lib: Library, study: Study) -> Library:
     """The library with jumps at the moments that the errors show."""
-    jumps = [Term("session_jump", "frame", {"since": t}) for t in study.moments.tolist()]
+    jumps = [Term(SESSION_JUMP.name, "frame", {"since": t}) for t in study.moments.tolist()]
     terms = [(term, 1.0) for term in jumps]  # tried against chance when they were found
     return replace(lib, candidates=(*lib.candidates, *lib.with_terms(terms))) if terms else lib
 
@@ -107,8 +126,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
 
     Asked of what the effects leave: a joint that always lacks the same part of its move settles.
     """
-    effects = {c.term.effect for c in choice.chosen}
-    if not effects & {"backlash", "settling"}:
+    if not any(EFFECTS[c.term.effect].of_move for c in choice.chosen):
         return []
     rest = rest_of(study.rows, choice.noise, choice.known)
     error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
@@ -122,7 +140,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
 def by_weight(choice: Choice) -> list[int]:
     """The effects in the order in which each takes most of what is left, points weighing alike."""
     lib = choice.library
-    fields = [lib.products.clear(one.candidate.main) for one in choice.fits]
+    fields = [lib.products.clear(candidate.main) for candidate in choice.chosen]
     sizes = [len(field) for field in fields]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     columns = np.concatenate([np.zeros((0, len(lib.rows.error))), *fields])
@@ -146,7 +164,7 @@ def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     """The terms of each effect selected, the weightiest first, all lines of a joint together."""
     out: dict[tuple[str, str], list[Term]] = {}
     for number in by_weight(choice):
-        term = choice.fits[number].candidate.term
+        term = choice.chosen[number].term
         out.setdefault((term.effect, term.place), []).append(term)
     return [tuple(terms) for terms in out.values()]
 
@@ -193,8 +211,8 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
     out: dict[tuple[str, str], Finding] = {}
     keys = [(found.term.effect, found.term.place) for found in findings]
     for key, found in zip(keys, findings, strict=True):
-        if found.term.effect == "gear_ripple" or keys.count(key) > 1:
-            turns = found.fixed["waves_per_turn"]
+        turns = found.fixed.get("waves_per_turn")
+        if turns and (EFFECTS[key[0]].follows == "wave" or keys.count(key) > 1):
             names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
         if key not in out:

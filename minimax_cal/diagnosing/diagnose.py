@@ -51,7 +51,9 @@ from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
 from minimax_cal.modelling.effects.table import EFFECTS
+from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.robots.robot import Robot, load_robot
 
 NOT_ASKED = Beyond(reason="not asked for")
@@ -137,7 +139,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
-    causes = causes_of(study, clean.faults, options.exclude, progress)
+    study, causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
     steps = steps_of(asked, study, judges, spoken, ladder)
@@ -150,6 +152,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     progress("remainder")
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes, study, ladder, rest)
+    noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
     if verdict == "none" and shaky(floor, noise, steps[-1]):
         verdict = "not_repeatable"
     beyond = NOT_ASKED
@@ -198,7 +201,7 @@ def in_rungs(
     progress("gap ladder")
     spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
-    if "joint_error_map" in exclude:
+    if JOINT_ERROR_MAP.name in exclude:
         return causes, spoken, ladder
     progress("error maps of joints")
     spoken, ladder = with_maps(spoken, ladder)
@@ -319,7 +322,7 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     jumped = session_jumps(cell.placed(sound), cell.error(sound))
     told = (*found, *more, *jumped)
-    remarks = tuple(fault.text for fault in told if fault.effect != "target_shift")
+    remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
     moments = sound.columns["clock"][rows]
     return Clean(sound, data, faults, remarks, None if more else fit, moments)

@@ -25,7 +25,8 @@ from minimax_cal.diagnosing.remainder import (
 )
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.maps import FINEST, range_of, sines
+from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
+from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
 from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
@@ -137,10 +138,10 @@ def term_of(fit: Joint, block: Block, at: Beside, variance: float) -> Term:
     curve = at.value[-block.columns.shape[-1] :] @ sines(x, low, high, block.columns.shape[-1])
     turns, share = strongest_wave(x, curve)
     if share > ONE_WAVE:
-        return Term("gear_ripple", block.place, {"turns": turns})
+        return Term(GEAR_RIPPLE.name, block.place, {"turns": turns})
     size *= BESIDE / float(np.sqrt(variance))
     choice = {"low": low, "high": high, "length": length, "size": size}
-    return Term("joint_error_map", block.place, choice)
+    return Term(JOINT_ERROR_MAP.name, block.place, choice)
 
 
 def strongest_wave(x: Array, curve: Array) -> tuple[float, float]:

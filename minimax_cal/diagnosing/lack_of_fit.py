@@ -15,7 +15,9 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
+from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
+from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.effects.scene import Scene, turning
@@ -225,8 +227,28 @@ def structure(
     return tuple(found)
 
 
+def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None:
+    """The least probable structure that matters, beside what was explained and beside the noise.
+
+    explained: weighed square that the effects explain.  count: of rows.
+    """
+    least = max(MATTERS * explained, WORTH * count)
+    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
+    return min(loud, key=lambda trace: trace.p, default=None)
+
+
+def explained(rows: Rows, choice: Choice) -> float:
+    """Weighed square that the effects explain."""
+    none = np.zeros((len(rows.error), 0))
+    without, left = (rest_of(rows, choice.noise, known).total for known in (none, choice.known))
+    return without - left
+
+
 def share(features: Array, rest: Rest) -> tuple[float, float]:
-    """F test that the rest has no more than its share in the span of features (N, D)."""
+    """F test that the rest has no more than its share in the span of features (N, D).
+
+    If the pose that tells most is off by itself, without it: one outlier is no structure.
+    """
     before = np.linalg.norm(features, axis=0)
     features = features[:, before > 0.0] / before[before > 0.0]
     features = features - rest.basis @ (rest.basis.T @ features)
@@ -238,13 +260,22 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     unit = vectors[:, kept] / np.sqrt(values[kept])
     pull = unit.T @ (features.T @ rest.rows)
     d = len(kept)
-    wide = inflation(features @ (unit @ pull), rest.rows, rest.group, rest.dof)
+    told = features @ unit
+    field = told @ pull
+    wide = inflation(field, rest.rows, rest.group, rest.dof)
     inside = float(pull @ pull) / wide
     outside = max(rest.total - inside, 1e-300)
     if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0
-    p = stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d)
-    return float(p), inside - d
+    p = float(stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d))
+    own = rest.group == int(np.argmax(np.bincount(rest.group, field * rest.rows)))
+    size = float(rest.rows[own] @ rest.rows[own])
+    if stats.chi2.sf(size, own.sum()) * (rest.group.max() + 1) < STRUCTURE:
+        gain, taken = float(field[own] @ rest.rows[own]) / wide, float((told[own] ** 2).sum())
+        fewer, free = max(d - taken, 1.0), max(rest.dof - d - own.sum() + taken, 1.0)
+        ratio = ((inside - gain) / fewer) / (max(outside - size + gain, 1e-300) / free)
+        p = max(p, float(stats.f.sf(ratio, fewer, free)))
+    return p, inside - d
 
 
 def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:

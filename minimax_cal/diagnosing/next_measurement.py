@@ -22,6 +22,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term, fields_of, of_sessions
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.transforms import level_to
 
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
@@ -360,8 +361,7 @@ def fields(site: Site, term: Term) -> tuple[Fields, Fields, list[int]]:
 def at_foot(site: Site, probes: Array, centre: Array) -> Array:
     """(d, 3, 3, poses) motion of three points of the foot.  probes: (d, 6, 3, m) as `fields`."""
     rows = site.plan.rows("foot", max(AGAIN))
-    up = site.scene.robot.up
-    across = np.linalg.svd(up[None])[2][1:]
+    across = level_to(site.scene.robot.up)
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     feet = FOOT * site.scene.robot.reach() * np.stack([np.cos(angle), np.sin(angle)], 1) @ across
     mean = probes[..., rows].mean(axis=1)

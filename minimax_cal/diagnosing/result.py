@@ -20,6 +20,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.history import with_history
@@ -150,8 +151,8 @@ class Finding:
         """
         if self.curve.size:
             return of_curve(self.curve)
-        scale, units = [1e3 if unit == "m" else 1.0 for unit in self.units], self.units
-        units = tuple("mm" if unit == "m" else unit for unit in units)
+        scale = [in_files(unit)[0] for unit in self.units]
+        units = tuple(in_files(unit)[1] for unit in self.units)
         if self.motion:
             scale = [1e3 * size for size in self.motion]
             units = tuple(TOLD_AS.get(unit, unit) for unit in self.units)

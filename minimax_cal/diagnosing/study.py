@@ -28,6 +28,7 @@ class Study:
 
     model, fit: geometry alone, with the frames of the sessions.  scene: what effects look at.
     rows: rotated, for the two noises.  moments: (j,) of the clock at which all targets jumped.
+    uneven: variance of an instrument's coordinate in the mean over that in its best direction.
     """
 
     robot: Robot
@@ -37,6 +38,7 @@ class Study:
     scene: Scene
     rows: Rows
     moments: Array = field(default_factory=lambda: np.zeros(0))
+    uneven: float = 1.0
 
     @property
     def geometric(self) -> Cell:

@@ -8,13 +8,13 @@ import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes
 from minimax_cal.diagnosing.gap import Ladder
-from minimax_cal.diagnosing.lack_of_fit import Trace, rest_of
+from minimax_cal.diagnosing.lack_of_fit import explained, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import CERTAIN, HALF, MATTERS, STRUCTURE, WORTH
-
-OF_ANGLE = {"gear_error", "encoder_gain", "gravity_compensator"}  # functions of one joint angle
+from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 
 Structure = tuple[str, float]
 
@@ -30,10 +30,10 @@ def judged(
     worst = min(traces, key=lambda trace: trace.p)
     structure = (worst.name, min(1.0, worst.p * len(traces)))
     sure = [found for found in findings if found.established]
-    loud = heard(traces, explained(study, causes), study.rows.count)
+    loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
     if loud:
         return "unknown", (loud.name, structure[1])
-    if patched([found for found in sure if np.isfinite(found.size)]):
+    if patched([found for found in sure if np.isfinite(found.size)], study.scene):
         return "unknown", ("two laws for one joint may stand for one that is not known",
                            structure[1])  # fmt: skip
     loose = sum(f.size for f in causes.effects if not f.established and f.p_value < CERTAIN)
@@ -46,35 +46,22 @@ def judged(
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
 
 
-def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None:
-    """The least probable structure that matters, beside what was explained and beside the noise.
-
-    explained: weighed square that the effects explain.  count: of rows.
-    """
-    least = max(MATTERS * explained, WORTH * count)
-    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
-    return min(loud, key=lambda trace: trace.p, default=None)
-
-
-def explained(study: Study, causes: Causes) -> float:
-    """Weighed square that the effects explain."""
-    none = np.zeros((len(study.rows.error), 0))
-    without, left = (
-        rest_of(study.rows, causes.choice.noise, known).total
-        for known in (none, causes.choice.known)
-    )
-    return without - left
-
-
-def patched(findings: Sequence[Finding]) -> bool:
+def patched(findings: Sequence[Finding], scene: Scene) -> bool:
     """Whether the weightiest effect needs another law of its joint's angle: likely one unknown."""
     if not findings:
         return False
     first = max(findings, key=lambda found: found.size).term
-    if first.effect not in OF_ANGLE:
+    if not turns_by_angle(first, scene):
         return False
-    others = [f.term for f in findings if f.term.effect in OF_ANGLE and f.term is not first]
+    others = [f.term for f in findings if f.term is not first and turns_by_angle(f.term, scene)]
     return any("all" in (first.place, t.place) or t.place == first.place for t in others)
+
+
+def turns_by_angle(term: Term, scene: Scene) -> bool:
+    """Whether it turns a joint by a formula of that joint's angle, other than a fine wave."""
+    effect = EFFECTS[term.effect]
+    by_formula = effect.follows == "angle" and not effect.is_map
+    return by_formula and term.columns(scene).only_turns
 
 
 def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> bool:

@@ -10,14 +10,13 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
-from minimax_cal.evidence.library import Aside, Candidate, Library
-from minimax_cal.evidence.noise import Noise, inflation
-from minimax_cal.evidence.products import within
+from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
+from minimax_cal.evidence.limits import LINES
+from minimax_cal.evidence.noise import Noise, inflation, triangles
+from minimax_cal.evidence.products import LEAST, within
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.table import EFFECTS
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
-SAME = 1e-12  # added to products of unit columns where some are the same
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
 
 
@@ -85,13 +84,12 @@ class Settings:
         value = value[..., 0]
         return value, (basis**2 @ kept[..., None])[..., 0], (value * pull).sum(axis=-1)
 
-    def added_all(self, same: Sequence[Candidate], dof: int) -> tuple[Array, Array, Array, Array]:
+    def added_all(self, kind: Kind, dof: int) -> tuple[Array, Array, Array, Array]:
         """Decrease of the square by each candidate; values, their variances; Occam's factor.
 
-        Doubts have the prior that the values found imply.  same: of equal numbers of columns.
+        Doubts have the prior that the values found imply.
         """
-        main = np.array([c.main for c in same])
-        both = np.concatenate([main, np.array([c.doubt for c in same])], axis=1)
+        main, both = kind.main, kind.both
         d = main.shape[1]
         block = self.blocks(both)
         none = np.zeros((len(self.ratios), *main.shape))
@@ -99,7 +97,7 @@ class Settings:
         if both.shape[1] == d:
             return gain, value, inverse, np.zeros(gain.shape)
         variance = np.maximum(self.total[:, None] - gain, 1e-300)[..., None] / dof
-        owner = np.broadcast_to([c.owner for c in same], (*gain.shape, both.shape[1] - d))
+        owner = np.broadcast_to(kind.owner, (*gain.shape, both.shape[1] - d))
         size = np.maximum(np.abs(np.take_along_axis(value, owner, axis=-1)), 1e-30)
         ridge = np.concatenate([none, variance / size**2], axis=-1)
         value, inverse, gain = self.solve(both, block, ridge)
@@ -112,7 +110,7 @@ class Settings:
 class Bench:
     """Where candidates are compared: beside what was chosen, over several ratios of the noises.
 
-    tries: candidates that are compared, for the chance of a false name.  dof: degrees of freedom.
+    tries: laws that are compared, for the chance of a false name.  dof: degrees of freedom.
     fixed: what is projected out, in rows.
     """
 
@@ -131,7 +129,7 @@ class Bench:
 
     @cached_property
     def everyone(self) -> list[Added]:
-        """Every candidate of the library, the best first."""
+        """Candidates that are worth it, the best first, and the best of each kind."""
         found = self.ranked(self.library.candidates)
         if self.library.lines is not None:
             found += self.lines.ranked(self.library.lines.candidates)
@@ -155,33 +153,39 @@ class Bench:
         """A candidate beside what was chosen, at its best ratio."""
         line = self.line(c)
         if line is None:
-            return self.compared([c])[0]
-        return replace(self.lines.compared([line])[0], candidate=c)
+            return self.compared(Kind.of([c]))[0]
+        return replace(self.lines.compared(Kind.of([line]))[0], candidate=c)
 
     def ranked(self, among: Sequence[Candidate]) -> list[Added]:
-        """Candidates by evidence."""
-        kinds: dict[tuple[int, int], list[Candidate]] = {}
-        for c in among:
-            kinds.setdefault((len(c.main), len(c.doubt)), []).append(c)
-        found = [one for same in kinds.values() for one in self.compared(same)]
+        """Candidates that are worth it by evidence, and the best of each kind."""
+        found = [one for kind in kinds(tuple(among)) for one in self.compared(kind)]
         return sorted(found, key=lambda one: -one.evidence)
 
-    def compared(self, same: list[Candidate]) -> list[Added]:
-        """Candidates with the same numbers of columns and doubts, all at once."""
-        s = self.settings
-        gain, value, inverse, volume = s.added_all(same, self.dof)
+    def compared(self, kind: Kind) -> list[Added]:
+        """Candidates of a kind that are worth it, and the best."""
+        s, each = self.settings, np.arange(len(kind.candidates))
+        gain, value, inverse, volume = s.added_all(kind, self.dof)
         rest = np.maximum(s.total[:, None] - gain, 1e-300)
         cost = self.dof * np.log(rest) + s.logs[:, None]
-        out = []
-        for i, (c, at) in enumerate(zip(same, np.argmin(cost, axis=0), strict=True)):
-            variance = float(rest[at, i] / self.dof)
-            up = max(self.base - float(cost[at, i]), 0.0)
-            sigma = np.sqrt(np.maximum(inverse[at, i] * variance, 0.0))
-            worth = up - float(volume[at, i]) - occam(c, up)
-            worth -= prior_penalty(c, value[at, i], sigma)
-            ratio = float(s.ratios[at])
-            out.append(Added(c, up, worth, ratio, variance, value[at, i], sigma))
-        return out
+        at = np.argmin(cost, axis=0)
+        variance = rest[at, each] / self.dof
+        up = np.maximum(self.base - cost[at, each], 0.0)
+        value = value[at, each]
+        sigma = np.sqrt(np.maximum(inverse[at, each] * variance[:, None], 0.0))
+        worth = up - volume[at, each] - occam(kind, up) - prior_penalty(kind, value, sigma)
+        shown = np.union1d(np.flatnonzero(worth > 0.0), [np.argmax(worth)])
+        return [
+            Added(
+                kind.candidates[i],
+                float(up[i]),
+                float(worth[i]),
+                float(s.ratios[at[i]]),
+                float(variance[i]),
+                value[i],
+                sigma[i],
+            )
+            for i in shown.tolist()
+        ]
 
     def p_value(self, one: Added, wide: float = 1.0) -> float:
         """Probability that a candidate without effect gains so much, the best of all tries.
@@ -191,7 +195,11 @@ class Bench:
         d = len(one.candidate.main) + one.candidate.shapes
         free = max(self.dof - d, 1)
         ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d / wide
-        return float(min(1.0, fdtrc(d, free, ratio) * self.tries * one.candidate.tries))
+        return float(min(1.0, fdtrc(d, free, ratio) * self.looked_at(one.candidate)))
+
+    def looked_at(self, c: Candidate) -> float:
+        """Candidates of its kind, over the share of the level that the kind has."""
+        return c.tries / LINES if c.is_line else self.tries / (1.0 - 2.0 * LINES)
 
     def improbable(self, one: Added, level: float) -> bool:
         """Whether a gain is less probable than a level, by all rows and by groups of them."""
@@ -253,37 +261,38 @@ class Fixed:
 
     def white(self, columns: Array, at: int) -> tuple[Array, Array]:
         """Columns (d, N) and the error (N,), projected, their rows of the same variance."""
-        both = np.concatenate([columns, self.error[None]]) * self.weights[at]
-        part = solve_triangular(self.factors[at], self.rows @ both.T, lower=True)
-        back = solve_triangular(self.factors[at], self.rows, lower=True)
-        left = (both / np.maximum(self.weights[at], 1e-300) - part.T @ back) * np.sqrt(
-            self.weights[at]
-        )
+        both = np.concatenate([columns, self.error[None]])
+        root = np.sqrt(self.weights[at])
+        factor = self.factors[at]
+        part = solve_triangular(factor, self.rows @ (both * self.weights[at]).T, lower=True)
+        value = solve_triangular(factor, part, lower=True, trans="T")
+        left = (both - value.T @ self.rows) * root
         return left[:-1], left[-1]
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
+        s, d = len(self.weights), len(columns)
+        weighed = (columns[None] * self.weights[:, None]).reshape(s * d, self.weights.shape[1])
+        shared = (self.rows @ weighed.T).reshape(-1, s, d)
         part = np.stack([
-            solve_triangular(factor, (self.rows * weight) @ columns.T, lower=True).T
-            for factor, weight in zip(self.factors, self.weights, strict=True)
+            solve_triangular(factor, shared[:, i], lower=True, check_finite=False).T
+            for i, factor in enumerate(self.factors)
         ])  # fmt: skip
-        pull = (self.weights * self.error) @ columns.T
+        pull = (weighed @ self.error).reshape(s, d)
         return part, pull - (part @ self.before[..., None])[..., 0]
 
 
-def occam(c: Candidate, gain: float) -> float:
-    """What d free parameters must gain to be worth it: d (1 + log of the gain of each)."""
-    d = len(c.main) + c.shapes
-    return d * (1.0 + float(np.log(max(gain / d, 1.0)))) + 2.0 * float(np.log(c.tries))
+def occam(kind: Kind, gain: Array) -> Array:
+    """What d free parameters must gain to be worth it (c,): d (1 + log of the gain of each)."""
+    d = kind.free
+    return np.asarray(d * (1.0 + np.log(np.maximum(gain / d, 1.0))) + 2.0 * np.log(kind.tries))
 
 
-def prior_penalty(c: Candidate, value: Array, sigma: Array) -> float:
-    """What values far beyond the usual cost, and signs that no body has."""
-    effect = EFFECTS[c.term.effect]
-    cost = float(((value / effect.typical) ** 2).sum())
-    if effect.positive and len(value) == 1 and value[0] < 0.0:
-        cost += float((value[0] / max(sigma[0], 1e-300)) ** 2)
-    return cost
+def prior_penalty(kind: Kind, value: Array, sigma: Array) -> Array:
+    """What values far beyond the usual cost (c,), and signs that no body has."""
+    cost = ((value / kind.typical[:, None]) ** 2).sum(axis=1)
+    wrong = kind.positive & (value[:, 0] < 0.0)
+    return np.asarray(cost + wrong * (value[:, 0] / np.maximum(sigma[:, 0], 1e-300)) ** 2)
 
 
 def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ()) -> Bench:
@@ -291,53 +300,74 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
 
     fits: values of the chosen, where their doubts matter.
     """
-    products = lib.products
+    products, rows = lib.products, lib.rows
     main, loose, ridge = columns_of(chosen, fits)
     noise, dof = products.noise(main), products.dof(main)
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
-    p, fit = products.columns.fixed - 1, products.span.shape[1]
-    fixed, error, whole = products.across(ratios, index)
-    gram = np.concatenate(
-        [products.told_apart(fixed[:, :, :p], axis=2), fixed[:, :, p + 1 + index]], axis=2
-    )
-    r = fit + len(main)
-    gram[:, range(r, r + len(loose)), range(r, r + len(loose))] += ridge * noise.variance  # a prior
-    factors = triangles(gram)
+    at = products.at(ratios, index)
+    q, each = len(main), range(len(index))
+    gram = at.lines[:, :, index].copy()
+    gram[:, each, each] += LEAST * at.whole[:, index]
+    gram[:, range(q, len(index)), range(q, len(index))] += ridge * noise.variance  # a prior
+    factor = triangles(gram)
+    both = np.concatenate([at.pull[..., None], at.lines], axis=2)
     part = np.stack([
-        solve_triangular(factor, lines[:, p:], lower=True, check_finite=False).T
-        for factor, lines in zip(factors, fixed, strict=True)
-    ])  # fmt: skip
+        solve_triangular(lower, lines, lower=True, check_finite=False).T
+        for lower, lines in zip(factor, both, strict=True)
+    ]) if len(index) else np.zeros((len(ratios), both.shape[2], 0))  # fmt: skip
     before, part = part[:, 0], part[:, 1:]
-    square = error[:, p]
-    total = np.maximum(square - (before**2).sum(axis=1), ROUNDING * square + 1e-300)
-    size = np.einsum("sff->sf", factors)[:, :r]
-    spread = np.log1p(ratios[:, None] * lib.rows.variance_ratio[products.kept]).sum(axis=1)
+    total = np.maximum(at.error[:, 0] - (before**2).sum(axis=1), ROUNDING * at.square + 1e-300)
+    size = np.einsum("sff->sf", factor)[:, :q]
+    spread = np.log1p(ratios[:, None] * rows.variance_ratio[products.kept]).sum(axis=1)
     settings = Settings(
         ratios=ratios,
         part=part,
         before=before,
-        pull=error[:, p + 1 :] - (part @ before[..., None])[..., 0],
+        pull=at.error[:, 1:] - (part @ before[..., None])[..., 0],
         total=total,
-        whole=whole,
-        logs=spread + 2.0 * np.log(size).sum(axis=1),
-        own=lambda index: products.among(ratios, index),
+        whole=at.whole,
+        logs=spread + at.logs + 2.0 * np.log(size).sum(axis=1),
+        own=at.among,
     )
-    geometry = products.told_apart(products.columns.clear[:p], axis=0)
-    rows = np.concatenate([geometry, products.clear(index)])
-    weights = products.kept / (1.0 + np.outer(ratios, lib.rows.variance_ratio))
-    held = Fixed(rows, factors, weights, before, lib.rows.error)
-    return Bench(lib, tuple(chosen), noise, settings, held, dof, float(lib.count))
+    held = Fixed(
+        np.concatenate([products.geometry(), products.clear(index)]),
+        stacked(at.factor, at.part[:, :, 1:], factor),
+        products.kept / (1.0 + np.outer(ratios, rows.variance_ratio)),
+        np.concatenate([at.part[:, :, 0], before], axis=1),
+        rows.error,
+    )
+    tries = float(sum(not c.is_line for c in lib.candidates))
+    return Bench(lib, tuple(chosen), noise, settings, held, dof, tries)
 
 
-def triangles(gram: Array) -> Array:
-    """(s, f, f) lower triangles whose squares are matrices (s, f, f)."""
-    scale = np.sqrt(np.einsum("sff->sf", gram))[..., None]
-    unit = gram / scale / np.swapaxes(scale, 1, 2)
-    try:
-        return np.asarray(scale * np.linalg.cholesky(unit))
-    except np.linalg.LinAlgError:  # two of the chosen are the same on these poses
-        return np.asarray(scale * np.linalg.cholesky(unit + SAME * np.eye(gram.shape[-1])))
+def stacked(first: Array, part: Array, second: Array) -> Array:
+    """Lower triangles of two sets of columns, (s, r, r) and (s, q, q), and (s, r, q) between."""
+    r = first.shape[1]
+    whole = np.zeros((len(first), r + second.shape[1], r + second.shape[1]))
+    whole[:, :r, :r], whole[:, r:, r:] = first, second
+    whole[:, r:, :r] = np.swapaxes(part, 1, 2)
+    return whole
+
+
+def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
+    """Values and sigmas (d,) of the parameters of effects, estimated together.
+
+    fits: the effects; their values are the sizes of their doubts.
+    """
+    main, loose, ridge = columns_of([one.candidate for one in fits], fits)
+    index = np.concatenate([main, loose])
+    if not len(index):
+        return ()
+    at = lib.products.at(np.array([noise.ratio]), index)
+    gram = at.lines[0][:, index].copy()
+    gram[range(len(main), len(index)), range(len(main), len(index))] += ridge * noise.variance
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(scale, scale), 1e-12, hermitian=True)
+    value = inverse @ (at.pull[0] / scale) / scale
+    sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
+    cuts = np.cumsum([len(one.candidate.main) for one in fits])
+    return tuple(zip(np.split(value, cuts)[:-1], np.split(sigma, cuts)[:-1], strict=True))
 
 
 def columns_of(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class Candidate:
     """A term with its columns in the matrix of all candidates.
 
     main: (d,) columns.  doubt: (r,) further columns, one sigma each per unit of main[owner].
-    tries: how many variants like this one were looked at to find it.
+    tries: of a line, how many frequencies were looked at, at all joints, to find it and its like.
     """
 
     term: Term
@@ -44,6 +45,60 @@ class Candidate:
     def key(self) -> tuple[str, str]:
         """Effect and place."""
         return self.term.effect, self.term.place
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it was found by a search over frequencies."""
+        return self.tries > 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """Candidates of equal numbers of columns and doubts, compared all at once.
+
+    main: (c, d) columns; both: (c, d + r) those of doubts besides; owner: (c, r).  free: (c,)
+    parameters that each is charged for; tries: (c,).  typical: (c,) size of a parameter;
+    positive: (c,) whether no body has the other sign.
+    """
+
+    candidates: tuple[Candidate, ...]
+    main: Array
+    both: Array
+    owner: Array
+    free: Array
+    tries: Array
+    typical: Array
+    positive: Array
+
+    @staticmethod
+    def of(same: Sequence[Candidate]) -> Kind:
+        """Of candidates."""
+        main, doubt = (np.array([getattr(c, name) for c in same]) for name in ("main", "doubt"))
+        effects = [EFFECTS[c.term.effect] for c in same]
+        return Kind(
+            tuple(same),
+            main,
+            np.concatenate([main, doubt], axis=1),
+            np.array([c.owner for c in same]),
+            np.array([len(c.main) + c.shapes for c in same]),
+            np.array([c.tries for c in same]),
+            np.array([effect.typical for effect in effects]),
+            np.array(
+                [
+                    effect.positive and len(c.main) == 1
+                    for c, effect in zip(same, effects, strict=True)
+                ]
+            ),
+        )
+
+
+@lru_cache(maxsize=32)
+def kinds(candidates: tuple[Candidate, ...]) -> tuple[Kind, ...]:
+    """Candidates by their numbers of columns and doubts."""
+    found: dict[tuple[int, int], list[Candidate]] = {}
+    for c in candidates:
+        found.setdefault((len(c.main), len(c.doubt)), []).append(c)
+    return tuple(map(Kind.of, found.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +178,6 @@ class Library:
             return np.asarray(self.lines.clear[index])
         return self.products.clear(index)
 
-    @property
-    def count(self) -> int:
-        """How many candidates there are."""
-        return len(self.candidates) + (len(self.lines.candidates) if self.lines else 0)
-
     def only(self, poses: Array) -> Library:
         """The library for some of the poses, of which the others' columns are taken away.
 
@@ -139,9 +189,8 @@ class Library:
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""
         products, count = self.products, self.products.columns.count
-        across, _, whole = products.across(np.zeros(1), np.zeros(0, dtype=int))
-        own = products.among(np.zeros(1), np.arange(count)[:, None])[0, :, 0, 0]
-        left = own - (across[0, :, products.columns.fixed :] ** 2).sum(axis=0)
+        at = products.at(np.zeros(1), np.zeros(0, dtype=int))
+        whole, left = at.whole, at.among(np.arange(count)[:, None])[0, :, 0, 0]
         every = (products.columns.raw**2).sum(axis=0)  # what a part shows less of is rounding
         clear = (left > FAINT * whole[0]) & (whole[0] > GONE * every)
         shown = tuple(c for c in self.candidates if clear[c.main].all())
@@ -181,11 +230,11 @@ class Stack:
         fields = columns.displacement(self.scene)
         if not np.any(fields):
             return None
-        doubts, owners = [np.zeros((0, *fields.shape[1:]))], []
+        every, owners = [fields], []
         for number, doubt in columns.doubts(self.scene):
-            doubts.append(doubt)
+            every.append(doubt)
             owners += [number] * len(doubt)
-        main, doubt = self.place(fields), self.place(np.concatenate(doubts))
+        main, doubt = np.split(self.place(np.concatenate(every)), [len(fields)])
         return Candidate(term, main, doubt, np.array(owners, dtype=int), tries)
 
 

@@ -16,6 +16,12 @@ NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so man
 TUNINGS = 3  # rounds of a finer search
 MOST = 30  # effects: the IRB 120 has about twenty
 
+LINES = 0.1  # share of the level for lines near a told ratio, and as much for all other lines
+UNSTEADY = 1e-3  # chance that halves of a joint's sweep differ so much in a line
+APART = 0.1  # of a line's gain, by which they may differ however sure they are: those of gears do
+# by less than 0.09 on the Meca500 and the IRB 120, a curve's by 0.1 to 1.1 on the UR10
+UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed anew
+
 # ---- what else it could be -----------------------------------------------------------------------
 
 BAND = 12.0  # of evidence: what fits worse by less may be the truth (blind_gap: in 99.9 % of sets)

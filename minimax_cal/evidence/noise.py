@@ -9,19 +9,18 @@ Thompson 1971].
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from minimax_cal.evidence.ratios import likeliest
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers.scalar import least_between
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
+SAME = 1e-12  # added to products of unit columns where some are the same
 FREE = 3  # degrees of freedom below which no noise is told from another
-RATIOS = np.concatenate([[0.0], np.logspace(-3, 5, 17)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,40 +166,41 @@ def restricted(rows: Rows, known: Array) -> Noise:
     if dof < FREE:
         return Noise(0.0, float(rows.error @ rows.error) / max(rows.count, 1) + 1e-18, 0.0)
 
-    def grams(ratios: Array) -> Array:
+    def cost(ratios: Array) -> tuple[Array, Array]:
         halves = (columns / np.sqrt(1.0 + r * rows.variance_ratio)[:, None] for r in ratios)
-        return np.array([half.T @ half for half in halves])
+        gram = np.array([half.T @ half for half in halves])
+        return costs(gram, ratios, rows.variance_ratio, dof)
 
-    return likeliest(grams, rows, dof)
+    ratio = likeliest(lambda ratios: cost(ratios)[0])
+    return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
 
-def likeliest(
-    grams: Callable[[Array], Array], rows: Rows, dof: int, kept: Array | None = None
-) -> Noise:
-    """Noise at which rows are likeliest [Patterson and Thompson 1971].
-
-    grams: of (r,) ratios, the weighted products (r, p + 1, p + 1) of what is fitted and, last, the
-    error.  kept: (N,) rows that count, None for all.
-    """
-    varied = rows.variance_ratio if kept is None else rows.variance_ratio[kept]
-
-    def parts(ratios: Array) -> tuple[Array, Array]:
-        gram = grams(ratios)
-        gram[:, -1, -1] += 1e-300
-        scale = np.sqrt(np.einsum("rpp->rp", gram))
-        eye = 1e-13 * np.eye(gram.shape[-1])
-        factor = np.linalg.cholesky(gram / (scale[:, :, None] * scale[:, None, :]) + eye)
-        logs = np.log(np.einsum("rpp->rp", factor)) + np.log(scale)
-        squares = np.exp(2.0 * logs[:, -1])
-        spread = np.log1p(ratios[:, None] * varied).sum(axis=1)
-        return dof * np.log(squares) + spread + 2.0 * logs[:, :-1].sum(axis=1), squares
-
-    best = int(np.argmin(parts(RATIOS)[0]))
-    ratio = float(RATIOS[best])
-    if best:
-        low, high = np.log(RATIOS[max(best - 1, 1)]), np.log(RATIOS[min(best + 1, len(RATIOS) - 1)])
-        if high > low:
-            found, _ = least_between(lambda x: float(parts(np.exp([x]))[0][0]), low, high, 0.05)
-            ratio = float(np.exp(found))
-    variance = float(parts(np.array([ratio]))[1][0]) / dof
+def noise_of(ratio: float, variance: float, rows: Rows) -> Noise:
+    """Both noises of a ratio and of the variance of the instrument."""
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))
+
+
+def costs(gram: Array, ratios: Array, varied: Array, dof: int) -> tuple[Array, Array]:
+    """-2 log restricted likelihood (g,) at ratios (g,) [Patterson and Thompson 1971].
+
+    And squares (g,) of what is left of the error.  gram: (g, p + 1, p + 1) weighted products of
+    what is fitted and, last, the error.  varied: variance ratios of the rows that count.
+    """
+    gram = gram + 0.0
+    gram[:, -1, -1] += 1e-300
+    logs = np.log(np.einsum("rpp->rp", triangles(gram)))
+    squares = np.exp(2.0 * logs[:, -1])
+    spread = np.log1p(ratios[:, None] * varied).sum(axis=1)
+    return dof * np.log(squares) + spread + 2.0 * logs[:, :-1].sum(axis=1), squares
+
+
+def triangles(gram: Array) -> Array:
+    """(s, f, f) lower triangles whose squares are matrices (s, f, f), as near as those allow."""
+    scale = np.sqrt(np.maximum(np.einsum("sff->sf", gram), 1e-300))[..., None]
+    unit = gram / scale / np.swapaxes(scale, 1, 2)
+    try:
+        return np.asarray(scale * np.linalg.cholesky(unit))
+    except np.linalg.LinAlgError:  # two columns are the same, or the geometry imitates one
+        lift = SAME + 2.0 * np.maximum(-np.linalg.eigvalsh(unit)[:, 0], 0.0)
+        eye = np.eye(gram.shape[-1])
+        return np.asarray(scale * np.linalg.cholesky(unit + lift[:, None, None] * eye))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
+import numpy as np
+from scipy.stats import chi2
+
+from minimax_cal.evidence.limits import APART, UNSTEADY
 from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
@@ -12,39 +16,81 @@ from minimax_cal.modelling.effects.table import Term
 
 SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has fewer teeth
 DENSITY = 4.0  # frequencies tried for each one that is independent
+TIMES = (1, 2)  # waves of a gear in each turn of its motor
+BESIDE = 1.0  # a strain wave gear turns by one more or less than its ratio tells
 
 
 def strongest_lines(
-    scene: Scene,
-    rows: Rows,
-    noise: Noise,
-    known: Array,
-    *,
-    most: int = 1,
-    kept: Array | None = None,
+    scene: Scene, rows: Rows, noise: Noise, known: Array, *, kept: Array | None = None
 ) -> list[tuple[Term, float]]:
-    """The strongest line of each joint, with the number of independent frequencies tried.
+    """The strongest line of each joint near its gear's ratio, and any, if it stays.
 
-    known: (N, q) columns that are fitted already.  kept: (N,) rows that count, None for all.
+    With the number of independent frequencies tried of such lines at all joints.  known: (N, q)
+    columns that are fitted already.  kept: (N,) rows that count, None for all.
     """
     weight = noise.weights(rows) * (1.0 if kept is None else kept)
     pull = weight * remaining(rows, weight, known)
     arms = rows.of(scene.jacobian)
-    poses = scene.poses
-    found = []
+    near: list[Term] = []
+    free: list[Term] = []
+    tried_near, tried = 2.0, 2.0  # a line is never found at once
     for j in sweeping(scene):
-        span = max(float(np.ptp(scene.q[j])) / (2.0 * np.pi), 0.1)
-        step = 1.0 / (DENSITY * span)
-        turns = np.arange(SLOWEST, FASTEST, step)
-        tries = float(len(turns)) / DENSITY * 2.0
-        score = (arms[:, j] * pull).reshape(poses, -1).sum(axis=1)
-        size = (arms[:, j] ** 2 * weight).reshape(poses, -1).sum(axis=1)
-        gain = power(*sums(turns, scene.q[j], score, size))
-        for at in np.argsort(-gain)[:most]:
-            near = turns[at] + step * np.linspace(-1.0, 1.0, 41)
-            best = near[int(np.argmax(power(*sums(near, scene.q[j], score, size))))]
-            found.append((Term("gear_ripple", f"J{j + 1}", {"turns": float(best)}), tries))
-    return found
+        score = (arms[:, j] * pull).reshape(scene.poses, -1).sum(axis=1)
+        size = (arms[:, j] ** 2 * weight).reshape(scene.poses, -1).sum(axis=1)
+        line, place = Line(scene.q[j], score, size), f"J{j + 1}"
+        for low, high in bands(abs(float(scene.robot.ratio[j]))):
+            turns, tries = line.strongest(low, high)
+            near.append(Term("gear_ripple", place, {"turns": turns}))
+            tried_near += tries
+        turns, tries = line.strongest(SLOWEST, FASTEST)
+        tried += tries
+        if line.stays(turns):
+            free.append(Term("gear_ripple", place, {"turns": turns}))
+    return [*((term, tried_near) for term in near), *((term, tried) for term in free)]
+
+
+def bands(ratio: float) -> list[tuple[float, float]]:
+    """Where lines of a gear may be, whose ratio is told; none for NaN."""
+    return [(k * (ratio - BESIDE), k * (ratio + BESIDE)) for k in TIMES if ratio > SLOWEST]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """What poses tell of waves of one joint's angle.
+
+    q: (m,) angles.  score, size: (m,) weighed products of its motion with the errors and itself.
+    """
+
+    q: Array
+    score: Array
+    size: Array
+
+    @property
+    def sweep(self) -> float:
+        """In turns; a wave is resolved from another that makes one more in it."""
+        return max(float(np.ptp(self.q)) / (2.0 * np.pi), 0.1)
+
+    def gain(self, turns: Array) -> Array:
+        """(f,) by equally spaced waves a turn."""
+        return power(*sums(turns, self.q, self.score, self.size))
+
+    def strongest(self, low: float, high: float) -> tuple[float, float]:
+        """The strongest of a band, and the number of independent frequencies in it."""
+        step = 1.0 / (DENSITY * self.sweep)
+        turns = np.arange(low, high + step, step)
+        near = turns[int(np.argmax(self.gain(turns)))] + step * np.linspace(-1.0, 1.0, 41)
+        return float(near[int(np.argmax(self.gain(near)))]), len(turns) / DENSITY * 2.0
+
+    def stays(self, turns: float) -> bool:
+        """Whether both halves of the sweep show a wave, of the same frequency, size and phase."""
+        low = self.q < np.median(self.q)
+        whole = float(self.gain(turns + np.array([0.0, 1e-3]))[0])
+        more = -whole
+        for half in (low, ~low):
+            own = Line(self.q[half], self.score[half], self.size[half])
+            near = turns + np.linspace(-1.0, 1.0, 41) / own.sweep
+            more += float(own.gain(near).max())
+        return bool(chi2.sf(more, 4) > UNSTEADY or more < APART * whole)
 
 
 def sums(turns: Array, q: Array, score: Array, size: Array) -> tuple[Array, Array, float]:

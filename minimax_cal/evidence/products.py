@@ -1,25 +1,24 @@
 """Cross-products of columns, rows weighed for any ratio of the noises, each formed once.
 
-A row with the variance ratio v weighs 1/(1 + ratio v).  Along the logarithm of the ratio that is a
-smooth step whose nearest poles lie pi beside the real line, so that a polynomial through so many
-Chebyshev points in every decade gives all weights, and with them all products, to rounding.  The
-products of some poses are those of all poses less those of the others.
+Products at the nodes of a decade give those at any ratio there (see `ratios`).  The products of
+some poses are those of all poses less those of the others.  The geometry is projected out once at
+every node; what is left is as smooth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from minimax_cal.evidence.noise import FREE, RATIOS, Noise, Rows, likeliest, told_apart
+from minimax_cal.evidence.noise import FREE, Noise, Rows, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
 from minimax_cal.ground.arrays import Array
 
-NODES = 20  # points in a decade of ratios; as many ratios asked for pay for them
-ALL = slice(None)
-ANGLES = np.pi * (2.0 * np.arange(NODES) + 1.0) / (2.0 * NODES)
+LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
+BLOCK = 4_000_000  # weighed numbers that are held at once
 
 
 class Columns:
@@ -63,92 +62,122 @@ class Columns:
         return np.asarray(columns.T - (columns.T @ basis) @ basis.T)
 
 
-def grown(store: Array, count: int) -> Array:
-    """The store with room for so many rows."""
-    if count <= len(store):
+def grown(store: Array, count: int, axis: int = 0) -> Array:
+    """The store with room for so many along an axis."""
+    if count <= store.shape[axis]:
         return store
-    more = np.empty((max(count, 3 * len(store) // 2), store.shape[1]))
-    more[: len(store)] = store
-    return more
+    room = max(count, 3 * store.shape[axis] // 2) - store.shape[axis]
+    shape = (*store.shape[:axis], room, *store.shape[axis + 1 :])
+    return np.concatenate([store, np.empty(shape)], axis=axis)
+
+
+Formed = Callable[[Array, int, int], Array]  # products (f, g, d) of columns (f,) with some
+
+
+class Lines:
+    """Products of some columns with all, at g ratios, each formed when it is first asked for.
+
+    form: of columns (f,), with those from a first to before a last, (f, g, d).
+    """
+
+    def __init__(self, form: Formed, depth: int) -> None:
+        self.form = form
+        self.held = np.empty((0, depth, 0))
+        self.place: dict[int, int] = {}
+        self.width = 0
+
+    def places(self, index: Array, width: int) -> Array:
+        """(f,) where the products of columns are held, with so many others at least."""
+        known = len(self.place)
+        new = np.array([i for i in dict.fromkeys(index.tolist()) if i not in self.place], dtype=int)
+        self.held = grown(grown(self.held, known + len(new)), width, axis=2)
+        if width > self.width:
+            if known:
+                old = np.array(list(self.place))
+                self.held[:known, :, self.width : width] = self.form(old, self.width, width)
+            self.width = width
+        if len(new):
+            self.held[known : known + len(new), :, : self.width] = self.form(new, 0, self.width)
+            self.place.update(zip(new.tolist(), range(known, known + len(new)), strict=True))
+        return np.array([self.place[i] for i in index.tolist()], dtype=int)
+
+    def across(self, index: Array, start: int, stop: int) -> Array:
+        """(f, g, d) products of columns with those from a first to before a last."""
+        at = self.places(index, stop)
+        return np.asarray(self.held[at, :, start:stop])
+
+    def square(self, index: Array, width: int) -> Array:
+        """(g, f, f) products among columns."""
+        at = self.places(index, width)
+        return np.moveaxis(self.held[at[:, None], :, index[None]], -1, 0)
 
 
 class Sums:
-    """Products at some ratios, summed over some rows, each formed when it is first asked for.
+    """Products at some ratios, summed over some rows.
 
-    ratios: (g,).  rows: of the sums, all or some.  total: sums that are taken less these.
-    once: whether they are asked for only once.
+    ratios: (g,).  out: (n,) rows that the total counts and these do not, None for all rows.
     """
 
     def __init__(
-        self,
-        columns: Columns,
-        ratios: Array,
-        rows: slice | Array = ALL,
-        total: Sums | None = None,
-        *,
-        once: bool = False,
+        self, columns: Columns, ratios: Array, out: Array | None = None, total: Sums | None = None
     ) -> None:
-        self.columns, self.rows, self.total, self.once = columns, rows, total, once
-        spread = columns.rows.variance_ratio[rows]
-        self.weights = 1.0 / (1.0 + np.outer(ratios, spread))  # (g, N)
-        self.lines: dict[int, Array] = {}
+        self.columns, self.ratios, self.out, self.total = columns, ratios, out, total
+        spread = columns.rows.variance_ratio
+        self.weights = 1.0 / (1.0 + np.outer(ratios, spread if out is None else spread[out]))
+        self.lines = Lines(self.weighed, len(ratios))
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
+        self.here = np.empty((0, self.weights.shape[1]))
+        self.copied = 0
 
-    def across(self, index: Array) -> Array:
-        """(f, g, D) products of some columns with all."""
-        self.form(index)
-        return np.stack([self.lines[int(i)] for i in index])
+    def fields(self) -> Array:
+        """(p + 1 + D, n) columns at the rows that are summed here."""
+        every = self.columns.clear
+        if self.out is None:
+            return every
+        self.here = grown(self.here, len(every))
+        if len(every) > self.copied:
+            self.here[self.copied : len(every)] = every[self.copied :][:, self.out]
+            self.copied = len(every)
+        return self.here[: len(every)]
 
-    def square(self, index: Array) -> Array:
-        """(g, f, f) products among some columns."""
-        if self.once:
-            own = self.columns.clear[index]
-            halves = (own * weight for weight in np.sqrt(self.weights))
-            return np.stack([half @ half.T for half in halves])
-        self.form(index)
-        return np.stack([self.lines[int(i)][:, index] for i in index], axis=1)
-
-    def form(self, index: Array) -> None:
-        """Form the products of some columns with all that are there."""
-        width = len(self.columns.clear)
-        once = {int(i) for i in index}  # two of the chosen may share a column
-        short = sorted((self.width(i), i) for i in once if self.width(i) < width)
-        for start, group in groupby(short, key=lambda one: one[0]):
-            members = [i for _, i in group]
-            new = self.between(members, start)
-            for i, line in zip(members, new, strict=True):
-                self.lines[i] = np.concatenate([self.lines[i], line], axis=1) if start else line
-
-    def between(self, members: list[int], start: int) -> Array:
-        """(f, g, d) products of some columns with all from a first on; the fewer are weighed."""
-        mine = self.columns.clear[members][:, self.rows]
-        there = self.columns.clear[start:, self.rows]
-        out = np.empty((len(mine), len(self.weights), len(there)))
-        for i, weight in enumerate(self.weights):
-            few = len(mine) < len(there)
-            out[:, i] = (mine * weight) @ there.T if few else mine @ (there * weight).T
+    def products(self, index: Array, start: int, stop: int) -> Array:
+        """(f, g, d) of columns with those from a first to before a last."""
         if self.total is None:
-            return out
-        self.total.form(np.array(members))
-        return np.stack([self.total.lines[i][:, start:] for i in members]) - out
+            return self.lines.across(index, start, stop)
+        return self.total.products(index, start, stop) - self.weighed(index, start, stop)
 
-    def width(self, i: int) -> int:
-        """How many products of a column are there already."""
-        return self.lines[int(i)].shape[1] if int(i) in self.lines else 0
+    def weighed(self, index: Array, start: int, stop: int) -> Array:
+        """(f, g, d) as `products`, of the rows here; the fewer columns are weighed."""
+        fields = self.fields()
+        there = fields[start:stop]
+        if len(there) < len(index):
+            return np.swapaxes(self.spread(there, fields[index]), 0, 2)
+        return self.spread(fields[index], there)
+
+    def spread(self, few: Array, many: Array) -> Array:
+        """(f, g, d) weighed products of columns (f, n) and (d, n)."""
+        g, n = self.weights.shape
+        out = np.empty((len(few), g, len(many)))
+        step = max(1, BLOCK // (g * max(n, 1)))
+        for i in range(0, len(few), step):
+            block = few[i : i + step, None] * self.weights
+            out[i : i + step] = (block.reshape(-1, n) @ many.T).reshape(-1, g, len(many))
+        return out
 
     def among(self, index: Array) -> Array:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
+        if self.total is not None:
+            return self.total.among(index) - within(self.fields()[index], self.weights)
         mark = (index.tobytes(), index.shape[1])
         if mark not in self.sets:
-            own = within(self.columns.clear[index][..., self.rows], self.weights)
-            self.sets[mark] = own if self.total is None else self.total.among(index) - own
+            self.sets[mark] = within(self.fields()[index], self.weights)
         return self.sets[mark]
 
     def squares(self) -> Array:
         """(D, g) squares of candidates' columns as they are."""
-        new = self.columns.plain[len(self.whole) : self.columns.count, self.rows]
-        more = new**2 @ self.weights.T
+        new = self.columns.plain[len(self.whole) : self.columns.count]
+        more = (new if self.out is None else new[:, self.out]) ** 2 @ self.weights.T
         if self.total is not None:
             more = self.total.squares()[len(self.whole) :] - more
         self.whole = np.concatenate([self.whole, more])
@@ -165,6 +194,104 @@ def within(fields: Array, weights: Array) -> Array:
     return out
 
 
+class Beside:
+    """What is left of products at some ratios when the geometry is projected out.
+
+    span: (p, r) combinations of the geometry's columns that the rows tell apart.
+    factor: (g, r, r) lower triangles of their products.  logs: (g,) log determinants of those.
+    error: (g,) squares of the error, unprojected.
+    """
+
+    def __init__(self, sums: Sums, span: Array) -> None:
+        self.sums, self.span = sums, span
+        depth, r = len(sums.ratios), span.shape[1]
+        p = len(span)
+        index = np.arange(p)
+        gram = span.T @ np.moveaxis(sums.products(index, 0, p), 0, 1) @ span
+        self.factor = triangles(gram)
+        self.inverse = np.linalg.inv(self.factor)
+        self.logs = 2.0 * np.log(np.einsum("grr->gr", self.factor)).sum(axis=1)
+        self.error = sums.products(np.array([p]), p, p + 1)[0, :, 0]
+        self.lines = Lines(self.left, depth)
+        self.sets: dict[tuple[bytes, int], Array] = {}
+        self.held = np.empty((depth, r, 0))
+        self.known = 0
+
+    @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return len(self.sums.columns.clear)
+
+    @property
+    def part(self) -> Array:
+        """(g, r, p + 1 + D) coordinates of all columns in the geometry's span."""
+        width, known = self.width, self.known
+        if width > known:
+            self.held = grown(self.held, width, axis=2)
+            raw = self.sums.products(np.arange(len(self.span)), known, width)
+            turned = self.span.T @ np.moveaxis(raw, 0, 1)
+            self.held[:, :, known:width] = self.inverse @ turned
+            self.known = width
+        return np.asarray(self.held[:, :, :width])
+
+    def left(self, index: Array, start: int, stop: int) -> Array:
+        """(f, g, d) products of columns with those from a first to before a last."""
+        part = self.part
+        shared = np.swapaxes(part[:, :, index], 1, 2) @ part[:, :, start:stop]
+        return np.asarray(self.sums.products(index, start, stop) - np.moveaxis(shared, 0, 1))
+
+    def across(self, index: Array) -> Array:
+        """(f, g, p + 1 + D) products of columns with all."""
+        return self.lines.across(index, 0, self.width)
+
+    def square(self, index: Array) -> Array:
+        """(g, f, f) products among columns."""
+        return self.lines.square(index, self.width)
+
+    def among(self, index: Array) -> Array:
+        """(c, d, d, g) products within each of c sets of columns (c, d)."""
+        mark = (index.tobytes(), index.shape[1])
+        if mark not in self.sets:
+            part = self.part[:, :, index]  # (g, r, c, d)
+            part = np.moveaxis(part, 1, -1)
+            shared = part @ np.swapaxes(part, -1, -2)
+            self.sets[mark] = self.sums.among(index) - np.moveaxis(shared, 0, -1)
+        return self.sets[mark]
+
+
+View = tuple[Array, Beside, Array]  # which ratios (s,), of which products, how (s, g) combined
+
+
+@dataclass(frozen=True, eq=False)
+class At:
+    """Products at ratios (s,), geometry projected out, of q columns and the error with all.
+
+    lines: (s, q, D) with the candidates'.  error: (s, 1 + D) of the error with itself and those.
+    square: (s,) of the error, unprojected.  whole: (s, D) squares of the candidates' as they are.
+    factor: (s, r, r) lower triangles of the geometry's products; part: (s, r, 1 + q) coordinates
+    of the error and of the q columns in its span; logs: (s,) log determinants.
+    pull: (s, q) of the q columns with the error.  views: where the ratios come from.
+    """
+
+    lines: Array
+    error: Array
+    square: Array
+    whole: Array
+    factor: Array
+    part: Array
+    logs: Array
+    pull: Array
+    views: Sequence[View]
+
+    def among(self, index: Array) -> Array:
+        """(s, c, d, d) products within sets of candidates' columns (c, d)."""
+        out = np.empty((len(self.logs), *index.shape, index.shape[1]))
+        for here, beside, between in self.views:
+            own = beside.among(index + beside.sums.columns.fixed)
+            out[here] = np.moveaxis(own @ between.T, -1, 0)
+        return out
+
+
 class Products:
     """Products for any ratio, of all rows or of those that are kept.
 
@@ -173,9 +300,8 @@ class Products:
 
     def __init__(self, columns: Columns, kept: Array, all: Products | None = None) -> None:
         self.columns, self.kept, self.all = columns, kept, all
-        self.grid = self.summed(RATIOS)
-        self.decades: dict[int, Sums] = {}
-        self.asked: dict[int, int] = {}
+        self.formed: dict[int | None, Beside] = {}
+        self.summed: dict[int | None, Sums] = {}
         self.noises: dict[bytes, Noise] = {}
 
     def clear(self, index: Array) -> Array:
@@ -186,39 +312,39 @@ class Products:
         """The products of some rows only.  kept: (N,)."""
         return Products(self.columns, kept, self.all or self)
 
-    def summed(self, ratios: Array, decade: int | None = None) -> Sums:
-        """Products at some ratios, or at the nodes of a decade."""
-        if self.all is None:
-            return Sums(self.columns, ratios)
-        total = self.all.grid if decade is None else self.all.decade(decade)
-        return Sums(self.columns, ratios, np.flatnonzero(~self.kept), total)
+    def sums(self, number: int | None) -> Sums:
+        """Products at the nodes of a decade of ratios; None: at RATIOS."""
+        if number not in self.summed:
+            ratios = RATIOS if number is None else nodes(number)
+            if self.all is None:
+                made = Sums(self.columns, ratios)
+            else:
+                out = np.flatnonzero(~self.kept)
+                made = Sums(self.columns, ratios, out, self.all.sums(number))
+            self.summed[number] = made
+        return self.summed[number]
 
-    def decade(self, number: int) -> Sums:
-        """Products at the nodes of a decade of ratios."""
-        if number not in self.decades:
-            self.decades[number] = self.summed(10.0 ** nodes(number), number)
-        return self.decades[number]
+    def beside(self, number: int | None) -> Beside:
+        """What the geometry leaves of the products of a decade; None: at RATIOS."""
+        if number not in self.formed:
+            self.formed[number] = Beside(self.sums(number), self.span)
+        return self.formed[number]
 
-    def parts(self, ratios: Array, asked: int) -> list[tuple[int | None, Array, Sums, Array]]:
-        """Number of the decade, which ratios (s,), of which products and how (s, g) combined.
-
-        asked: by how much this counts towards forming the products of a decade.
-        """
-        numbers = np.floor(np.log10(np.maximum(ratios, 1e-300))).astype(int)
+    def views(self, ratios: Array) -> list[View]:
+        """Which ratios (s,), of which products, and how (s, g) combined."""
         if ratios is RATIOS:
-            return [(None, np.arange(len(RATIOS)), self.grid, np.eye(len(RATIOS)))]
-        out: list[tuple[int | None, Array, Sums, Array]] = []
+            return [(np.arange(len(RATIOS)), self.beside(None), np.eye(len(RATIOS)))]
+        logs = np.log10(np.maximum(ratios, 1e-300))
+        numbers = np.floor(logs).astype(int)
+        out: list[View] = []
         for number in map(int, np.unique(numbers)):
             here = np.flatnonzero(numbers == number)
-            self.asked[number] = self.asked.get(number, 0) + asked * len(here)
             if ratios[here[0]] == 0.0:
-                out.append((number, here, self.grid, np.eye(1, len(RATIOS))))
-            elif self.all is None and self.asked[number] <= NODES:
-                once = Sums(self.columns, ratios[here], once=True)
-                out.append((None, here, once, np.eye(len(here))))
+                first = np.broadcast_to(np.eye(1, len(RATIOS)), (len(here), len(RATIOS)))
+                out.append((here, self.beside(None), first))
             else:
-                between = interpolation(np.log10(ratios[here]), nodes(number))
-                out.append((number, here, self.decade(number), between))
+                between = interpolation(logs[here] - number, NODES)
+                out.append((here, self.beside(number), between))
         return out
 
     @cached_property
@@ -227,8 +353,7 @@ class Products:
         p = self.columns.fixed - 1
         if self.all is None:
             return np.eye(p)
-        index = np.arange(p)
-        return told_apart(self.grid.square(index)[0])
+        return told_apart(self.sums(None).products(np.arange(p), 0, p)[:, 0])
 
     @cached_property
     def count(self) -> int:
@@ -242,80 +367,53 @@ class Products:
         return self.count - int(self.span.shape[1]) - len(index)
 
     def noise(self, index: Array) -> Noise:
-        """The noise beside some of the candidates' columns."""
+        """The noise beside some of the candidates' columns, by restricted maximum likelihood."""
         mark = index.tobytes()
         if mark not in self.noises:
-            self.noises[mark] = self.likeliest(index)
+            self.noises[mark] = self.estimated(index)
         return self.noises[mark]
 
-    def likeliest(self, index: Array) -> Noise:
+    def estimated(self, index: Array) -> Noise:
         """The noise, computed."""
-        rows, p, dof = self.columns.rows, self.columns.fixed - 1, self.dof(index)
+        rows, dof = self.columns.rows, self.dof(index)
         if dof < FREE:
             error = rows.error[self.kept]
             return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
-        chosen = np.concatenate([np.arange(p), self.columns.fixed + index, [p]])
-        turn = block_diag(self.span, np.eye(len(index) + 1))
+        chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])
+        varied = rows.variance_ratio[self.kept]
 
-        formed: dict[int, Array] = {}
-
-        def grams(ratios: Array) -> Array:
+        def cost(ratios: Array) -> tuple[Array, Array]:
             gram = np.empty((len(ratios), len(chosen), len(chosen)))
-            for number, here, summed, combined in self.parts(ratios, 0):
-                if number is None:
-                    gram[here] = np.tensordot(combined, summed.square(chosen), 1)
-                    continue
-                if number not in formed:
-                    formed[number] = summed.square(chosen)
-                gram[here] = np.tensordot(combined, formed[number], 1)
-            return gram if self.all is None else turn.T @ gram @ turn
+            logs, least = np.empty(len(ratios)), np.empty((len(ratios), len(index)))
+            for here, beside, between in self.views(ratios):
+                gram[here] = np.tensordot(between, beside.square(chosen), 1)
+                least[here] = LEAST * (between @ beside.sums.squares()[index].T)
+                logs[here] = between @ beside.logs
+            gram[:, range(len(index)), range(len(index))] += least
+            value, squares = costs(gram, ratios, varied, dof)
+            return value + logs, squares
 
-        return likeliest(grams, rows, dof, self.kept)
+        ratio = likeliest(lambda ratios: cost(ratios)[0])
+        return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
-    def told_apart(self, lines: Array, axis: int) -> Array:
-        """The geometry's columns along an axis, as the combinations that the rows tell apart."""
-        if self.all is None:
-            return lines
-        return np.asarray(np.moveaxis(np.moveaxis(lines, axis, -1) @ self.span, -1, axis))
+    def geometry(self) -> Array:
+        """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
+        return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
 
-    def across(self, ratios: Array, index: Array) -> tuple[Array, Array, Array]:
-        """Products of the geometry and of some candidates' columns with all (s, f, p + 1 + D), of
-        the error with all (s, p + 1 + D), and squares of the candidates' as they are (s, D).
-        """
-        p = self.columns.fixed - 1
-        fixed = np.concatenate([np.arange(p), p + 1 + index, [p]])
-        out = np.empty((len(ratios), len(fixed), len(self.columns.clear)))
-        whole = np.empty((len(ratios), self.columns.count))
-        for _, here, summed, combined in self.parts(ratios, 1):
-            out[here] = np.moveaxis(combined @ summed.across(fixed), 1, 0)
-            whole[here] = combined @ summed.squares().T
-        lines, error = out[:, :-1], out[:, -1]
-        if self.all is not None:
-            geometry = self.told_apart(lines[:, :p], axis=1)
-            lines = np.concatenate([geometry, lines[:, p:]], axis=1)
-        return lines, error, whole
-
-    def among(self, ratios: Array, index: Array) -> Array:
-        """(s, c, d, d) products within sets of candidates' columns (c, d)."""
-        out = np.empty((len(ratios), *index.shape, index.shape[1]))
-        for _, here, summed, combined in self.parts(ratios, 0):
-            own = summed.among(index + self.columns.fixed)
-            out[here] = np.moveaxis(own @ combined.T, -1, 0)
-        return out
-
-
-def nodes(number: int) -> Array:
-    """(g,) Chebyshev points of a decade, as powers of ten."""
-    return np.asarray(number + 0.5 - 0.5 * np.cos(ANGLES))
-
-
-def interpolation(x: Array, at: Array) -> Array:
-    """(s, g) values at x of the polynomials that are 1 at one Chebyshev point and 0 at the others.
-
-    By the barycentric formula [Berrut and Trefethen 2004].
-    """
-    off = x[:, None] - at
-    met = off == 0.0
-    part = np.where(np.arange(len(at)) % 2, -1.0, 1.0) * np.sin(ANGLES) / np.where(met, 1.0, off)
-    part = np.where(met.any(axis=1, keepdims=True), met.astype(float), part)
-    return np.asarray(part / part.sum(axis=1, keepdims=True))
+    def at(self, ratios: Array, index: Array) -> At:
+        """Products at ratios (s,) of some candidates' columns (q,) and of the error."""
+        s, q, r, p = len(ratios), len(index), self.span.shape[1], self.columns.fixed - 1
+        fixed = np.concatenate([[p], p + 1 + index])
+        lines = np.empty((s, 1 + q, len(self.columns.clear) - p))
+        square, logs = np.empty(s), np.empty(s)
+        whole = np.empty((s, self.columns.count))
+        factor, part = np.empty((s, r, r)), np.empty((s, r, 1 + q))
+        views = self.views(ratios)
+        for here, beside, between in views:
+            lines[here] = np.moveaxis(between @ beside.across(fixed)[:, :, p:], 1, 0)
+            whole[here] = between @ beside.sums.squares().T
+            square[here], logs[here] = between @ beside.error, between @ beside.logs
+            factor[here] = np.tensordot(between, beside.factor, 1)
+            part[here] = np.tensordot(between, beside.part[:, :, fixed], 1)
+        pull = lines[:, 1:, 0]
+        return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, pull, views)

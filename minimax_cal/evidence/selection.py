@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
-from minimax_cal.evidence.bench import Added, Bench, bench, columns_of
+from minimax_cal.evidence.bench import Added, Bench, bench, columns_of, together
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
@@ -32,6 +34,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+DRIVEN = {"time": "time", "move": "move", "approach": "move"}  # effects that follow one thing
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -39,19 +42,35 @@ NOTHING: Array = np.zeros(0, dtype=int)
 class Choice:
     """The effects selected.
 
-    library: with all columns that were tried.  fits: of each, the others given.
-    benches: of each, for its rivals.  noise: with all of them.
+    library: with all columns that were tried.  found: the effects, as each was when it was chosen.
+    noise: with all of them.
     """
 
     library: Library
-    fits: tuple[Added, ...]
-    benches: tuple[Bench, ...]
+    found: tuple[Added, ...]
     noise: Noise
 
     @property
     def chosen(self) -> tuple[Candidate, ...]:
         """The candidates."""
-        return tuple(one.candidate for one in self.fits)
+        return tuple(one.candidate for one in self.found)
+
+    @cached_property
+    def benches(self) -> tuple[Bench, ...]:
+        """Of each effect, for its rivals: beside the others."""
+        every = range(len(self.found))
+        return tuple(bench(self.library, *without(self.found, number)) for number in every)
+
+    @cached_property
+    def fits(self) -> tuple[Added, ...]:
+        """Each effect beside the others."""
+        pairs = zip(self.benches, self.chosen, strict=True)
+        return tuple(table.added(candidate) for table, candidate in pairs)
+
+    @cached_property
+    def estimates(self) -> tuple[tuple[Array, Array], ...]:
+        """Values and sigmas (d,) of the parameters of each effect, all estimated together."""
+        return together(self.library, self.found, self.noise)
 
     @property
     def known(self) -> Array:
@@ -76,19 +95,19 @@ def select(
     ripple: bool = True,
     level: float = LEVEL,
     seldom: int = SELDOM,
+    first: Sequence[Candidate] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
     at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
     of a false name on data without an effect.  seldom: of more than REFINED effects each is
-    compared anew after so many, and at the end.
+    compared anew after so many, and at the end.  first: what was chosen with other weights.
     """
-    fits: list[Added] = []
+    lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
-        return Choice(lib, (), (), noise)
-    tables: dict[tuple[int, ...], Bench] = {}
+        return Choice(lib, (), noise)
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
@@ -97,30 +116,55 @@ def select(
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
             break
-        tables[tuple(id(c) for c in table.chosen)] = table
         lib, best = addition(lib, table, level)
         if not best:
-            lib, fits = refined(lib, fits, level) if len(fits) > REFINED else (lib, fits)
             break
         fits = [*fits, *best]
         if len(fits) <= REFINED or len(fits) % seldom == 0:
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
-    noise = noise_beside(lib, fits)
-    benches = []
-    for i, one in enumerate(fits):
-        chosen, others = without(fits, i)
-        table = tables.get(tuple(map(id, chosen))) or bench(lib, chosen, others)
-        if not table.knows(one.candidate):  # tuned since
-            table = bench(lib, chosen, others)
-        benches.append(table)
-    final = tuple(b.added(one.candidate) for b, one in zip(benches, fits, strict=True))
-    return Choice(lib, final, tuple(benches), noise)
+    if len(fits) > REFINED:
+        lib, fits = refined(lib, fits, level)
+    lib, fits = one_course(lib, fits)
+    fits = needed(lib, fits, level)
+    return Choice(lib, tuple(fits), noise_beside(lib, fits))
+
+
+def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
+    """The effects without those that the others made needless, the weakest first."""
+    while fits:
+        noise = noise_beside(lib, fits)
+        values = together(lib, fits, noise)
+        signals = [
+            float(((value / np.maximum(sigma, 1e-300)) ** 2).sum()) / len(value)
+            for value, sigma in values
+        ]
+        weakest = int(np.argmin(signals))
+        chosen, others = without(fits, weakest)
+        table = bench(lib, chosen, others)
+        if table.p_value(table.added(fits[weakest].candidate)) <= level:
+            break
+        fits = others
+    return fits
+
+
+def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
+    """The library and the effects that were chosen of another, in their order."""
+    fits: list[Added] = []
+    known = {c.term.text: c for c in lib.candidates}
+    for c in first:
+        mine = known.get(c.term.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
+        if mine is None:
+            continue
+        if c.term.text not in known:
+            lib = replace(lib, candidates=(*lib.candidates, mine))
+        fits.append(bench(lib, [one.candidate for one in fits], fits).added(mine))
+    return lib, fits
 
 
 def plain(lib: Library) -> tuple[Candidate, ...]:
     """The candidates without lines that were found: those of an earlier round."""
-    return tuple(c for c in lib.candidates if c.tries == 1.0)
+    return tuple(c for c in lib.candidates if not c.is_line)
 
 
 def noise_beside(lib: Library, fits: Sequence[Added]) -> Noise:
@@ -173,6 +217,8 @@ def tuned(table: Bench, best: Added) -> Added:
     for _ in range(TUNINGS):
         term = best.candidate.term
         near = EFFECTS[term.effect].finer(table.library.scene, term.choice)
+        if not near:
+            break
         aside = table.library.aside([(replace(term, choice=choice), 1.0) for choice in near])
         ranked = table.beside(aside).ranked(aside.candidates)
         if not ranked or ranked[0].evidence <= best.evidence:
@@ -196,13 +242,13 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
         return lib, fits
     for _ in range(3):
         changed = False
-        for number in range(
-            min(len(fits) - 1, REFINED)
-        ):  # the last one was just chosen beside the others
+        others_than_last = range(min(len(fits) - 1, REFINED))  # it was just chosen beside them
+        for number in others_than_last:
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
-            top = next(o for o in table.everyone if not repeated(o.candidate, chosen))
+            others_best = (o for o in table.everyone if not repeated(o.candidate, chosen))
+            top = next(others_best, own)
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True
@@ -212,6 +258,31 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
                 fits[number] = own
         if not changed:
             break
+    return lib, fits
+
+
+def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
+    """Two names of one driver give way to one whose course is tuned, where that explains as much.
+
+    A law of time or moves with a course that is not quite its own calls for a second one.
+    """
+    for pair in combinations(fits, 2):
+        drivers = {DRIVEN.get(EFFECTS[one.candidate.term.effect].follows) for one in pair}
+        keys = {one.candidate.key for one in pair}
+        free = [c for c in lib.candidates if c.key in keys and c.shapes]
+        if len(drivers) > 1 or None in drivers or not free:
+            continue
+        others = [one for one in fits if one not in pair]
+        chosen = [one.candidate for one in others]
+        table = bench(lib, chosen, others)
+        first = table.added(pair[0].candidate)
+        beside = bench(lib, [*chosen, first.candidate], [*others, first])
+        both = first.evidence + beside.added(pair[1].candidate).evidence
+        near = table.ranked(free)[0]
+        best = tuned(table, near)
+        if best.evidence > both - TIE:
+            lib, best = adopted(lib, best, near.candidate)
+            return one_course(lib, [*others, best])
     return lib, fits
 
 

@@ -23,7 +23,14 @@ from minimax_cal.fitting.claims import (
     unseen_suspects,
 )
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
-from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
+from minimax_cal.fitting.fit import (
+    Fit,
+    KeptDistance,
+    Parameters,
+    Provenance,
+    WorstCase,
+    link_by_link,
+)
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
@@ -51,15 +58,15 @@ from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.parameters import State, links_of
-from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
-JUMP = ("session_jump", "session_jump:frame")  # without its moment
+JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 NAMED = 5  # implausible changes that are told one by one
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
@@ -235,7 +242,7 @@ def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) 
     if not len(rows):
         return options
     since = float(poses.data.columns["clock"][rows[np.argmax(sizes)]])
-    found = Term("session_jump", "frame", {"since": since})
+    found = Term(SESSION_JUMP.name, "frame", {"since": since})
     return replace(options, effects=[found if e in JUMP else e for e in options.effects])
 
 
@@ -269,7 +276,7 @@ def judged(
         status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
-        parameters=parameter_table(robot, solved),
+        parameters=parameters_of(solved),
         accuracy={
             "nominal": accuracy(before[:, held]),
             "train": accuracy(after[:, ~held]),
@@ -350,41 +357,25 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
-def parameter_table(robot: Robot, solved: Solved) -> Parameters:
+def parameters_of(solved: Solved) -> Parameters:
     """Every parameter, link by link.
 
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
     Those of `session_jump` tell where it stands in a further session (`stations.jumps`).
     """
-    names, n = solved.names, robot.joints
-    known = solved.identification.active
-    sigma = solved.uncertainty.sigma
-    axes, more = solved.nominal.rotation, len(solved.units)
+    known, sure = solved.identification, solved.uncertainty
 
     def values(x: State, frames: Frames) -> Array:
-        turn = rotation_vector(axes.T @ x.rotation)
-        parts = (links_of(x.mdh), axes.T @ x.origin, turn, x.target_positions.reshape(-1))
-        stood = jumps(frames, x.base)
-        effects = x.effects[len(stood) :] if len(x.effects) else np.zeros(more - len(stood))
-        return np.concatenate([*parts, stood, effects])
+        stood, effects = jumps(frames, x.base), np.zeros(len(solved.units))
+        effects[len(effects) - len(x.effects) :] = x.effects
+        effects[: len(stood)] = stood
+        return replace(x, effects=effects).along(solved.nominal.rotation)
 
     before = values(solved.nominal, solved.start)
-    value = np.where(known, values(solved.state, solved.frames), before)
-    order = [kind * n + joint for joint in range(n) for kind in range(5)]
-    every = tuple(
-        Parameter(
-            name=names.all[i],
-            value=float(value[i]),
-            nominal=float(before[i]),
-            sigma=float(sigma[i]),
-            unit=solved.uncertainty.units[i],
-            identifiable=bool(known[i]),
-            reason=solved.identification.reasons.get(names.all[i], ""),
-        )
-        for i in (*order, *range(5 * n, names.count))
-    )
-    return Parameters(every, solved.uncertainty.dof)
+    after = np.where(known.active, values(solved.state, solved.frames), before)
+    every = link_by_link(solved.names, sure.units, before, after, sure.sigma, known)
+    return Parameters(every, sure.dof)
 
 
 def worst_case(

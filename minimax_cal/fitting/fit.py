@@ -30,6 +30,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
@@ -39,6 +40,7 @@ from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
+from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
@@ -52,7 +54,6 @@ ACCURACIES = (  # where accuracy is told: title, key
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 NOT_IDENTIFIED = "not identified because"
-MILLI = {"m": (1e3, "mm"), "rad": (1e3, "mrad")}  # how people read a parameter
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,12 @@ class Parameter:
     @property
     def scale(self) -> tuple[float, str]:
         """Factor and unit in which people read it: millimetres, milliradians."""
-        return MILLI.get(self.unit, (1.0, self.unit))
+        return for_people(self.unit)
 
     @property
     def written(self) -> tuple[float, str]:
         """Factor and unit in files: only lengths are scaled, to millimetres."""
-        return (1e3, "mm") if self.unit == "m" else (1.0, self.unit)
+        return in_files(self.unit)
 
     @property
     def why_not(self) -> str:
@@ -176,6 +177,32 @@ class Parameters(Sequence[Parameter]):
                 "reason": [p.reason for p in self.every],
             }
         )  # fmt: skip
+
+
+def link_by_link(
+    names: Names,
+    units: Sequence[str],
+    before: Array,
+    after: Array,
+    sigma: Array,
+    known: Identification,
+) -> tuple[Parameter, ...]:
+    """Every parameter in the order in which people read them.
+
+    units: of each, SI.  before, after, sigma: (p,) as drawn, as found and how sure [SI].
+    """
+    return tuple(
+        Parameter(
+            name=names.all[i],
+            value=float(after[i]),
+            nominal=float(before[i]),
+            sigma=float(sigma[i]),
+            unit=units[i],
+            identifiable=bool(known.active[i]),
+            reason=known.reasons.get(names.all[i], ""),
+        )
+        for i in names.link_by_link
+    )
 
 
 def parameter_table(parameters: Iterable[Parameter]) -> Table:

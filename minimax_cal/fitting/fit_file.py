@@ -51,6 +51,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.transforms import transform
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 
@@ -463,10 +464,9 @@ def nominal_of(
         targets = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.target_names]
     except FAULTS:
         return None
-    base = np.eye(4)
-    base[:3, :3] = cell.base[:3, :3] @ rotation(-turn)
-    base[:3, 3] = base[:3, :3] @ was
-    if not np.abs(base[:3, :3] @ at - cell.base[:3, 3]).max() < 1e-5:
+    axes = cell.base[:3, :3] @ rotation(-turn)
+    base = transform(axes, axes @ was)
+    if not np.abs(axes @ at - cell.base[:3, 3]).max() < 1e-5:
         return None
     return Cell(robot, base, cell.target_names, 1e-3 * np.array(targets, dtype=float))
 

@@ -18,6 +18,7 @@ from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers.least_squares import solve_normal
 
 PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count as parallel
@@ -210,13 +211,6 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
             gone.append(int(chosen[rows[at]]))
             waits[at] = False
     return gone
-
-
-def random_joints(robot: Robot, size: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Joint values (*size, n) over the joints' whole range, at most one turn [rad, m]."""
-    span = np.where(robot.prismatic, 0.5, np.pi)
-    lower, upper = np.maximum(robot.lower, -span), np.minimum(robot.upper, span)
-    return rng.uniform(lower, upper, (*size, robot.joints))
 
 
 def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:

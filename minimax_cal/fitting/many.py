@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.optional import optional
+from minimax_cal.ground.parallel import in_parallel
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot, load_robot
 
 Data = Measurements | str | Path | tuple[ArrayLike, ArrayLike]
-INSTALL = "minimax-cal[experiments]"
 
 
 def calibrate_many(
@@ -40,17 +39,11 @@ def calibrate_many(
     if len(arms) != len(data):
         raise CalibrationError(f"{len(arms)} robots for {len(data)} data sets; give one for each")
     loaded = [arm if isinstance(arm, Robot) else load_robot(arm) for arm in arms]
+    calls = [(arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True)]
     if jobs == 1 and not cluster:
-        return tuple(one(arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True))
-    joblib = optional("joblib", "calibrate_many in several processes", INSTALL)
-    work = [
-        joblib.delayed(one)(arm, sheet, options) for arm, sheet in zip(loaded, data, strict=True)
-    ]
-    if not cluster:
-        return tuple(joblib.Parallel(n_jobs=jobs)(work))
-    distributed = optional("distributed", "a Dask cluster", "minimax-cal[distributed]")
-    with distributed.Client(cluster), joblib.parallel_config(backend="dask"):
-        return tuple(joblib.Parallel()(work))
+        return tuple(one(*call) for call in calls)
+    found = dict(in_parallel(one, calls, processes=jobs, cluster=cluster))
+    return tuple(found[number] for number in range(len(calls)))
 
 
 def one(robot: Robot, data: Data, options: dict[str, Any]) -> Fit | CalibrationError:

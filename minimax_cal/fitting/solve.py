@@ -39,10 +39,10 @@ from minimax_cal.modelling.model import (
     with_poses,
 )
 from minimax_cal.modelling.near import nearby
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots.robot import Robot
-from minimax_cal.solvers import least_squares, minimax
-from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
 from minimax_cal.solvers.minimax import Optimum, Sqp
 from minimax_cal.solvers.status import Status
 
@@ -286,8 +286,7 @@ def wanted(robot: Robot, model: Model, options: Options) -> tuple[Array, Array, 
     names = model.names
     allowed = ~names.match(options.fix, "fix")
     if options.only == OFFSETS:
-        n, zeros = robot.joints, np.zeros(names.count, dtype=bool)
-        zeros[np.arange(n) + np.where(robot.prismatic, n, 2 * n)] = True
+        zeros = np.isin(np.arange(names.count), zero_positions(robot.prismatic))
         allowed &= zeros | ~names.links
     order = identify.drop_order(robot, names)
     kept = names.match(options.free, "free")
@@ -394,9 +393,7 @@ def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
 
     The turn that fits the errors best vanishes for half a turn too: start near the answer.
     """
-    points, method = float(model.counts.sum()), method_of(task.options.method)
-    problem = SumOfSquares(model)
-    return least_squares.solve(problem, stage.state.batch(), 1, points, method, least_squares.NEAR)
+    return nearby(model, stage.state, task.options.method)
 
 
 def worst_case(

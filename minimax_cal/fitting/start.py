@@ -17,6 +17,7 @@ from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.transforms import nearest_rotation
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
@@ -75,7 +76,7 @@ class Turning:
         from the 24 turns of a cube too.
         """
         guess = np.linalg.lstsq(self.matrix, self.right, rcond=1e-9)[0].reshape(3, 3)
-        found = self.polished(project(sign * guess[None]), sign)
+        found = self.polished(nearest_rotation(sign * guess[None]), sign)
         if self.alone(sign * found[0], guess):
             return found
         return min(found, self.polished(CUBE, sign), key=lambda one: one[1])
@@ -157,14 +158,6 @@ def linear_rows(model: Model, mdh: Array, centre: Array, poses: slice) -> Array:
     rows[..., -1] = links.origin.T
     rows *= np.sqrt(weight)[..., None, None]
     return np.asarray(rows[weight > 0.0].reshape(-1, rows.shape[-1]))
-
-
-def project(matrix: Array) -> Array:
-    """The nearest rotations, by SVD.  matrix: (..., 3, 3)."""
-    u, _, vt = np.linalg.svd(matrix)
-    flip = np.ones((*matrix.shape[:-2], 3))
-    flip[..., 2] = np.linalg.det(u @ vt)
-    return np.asarray((u * flip[..., None, :]) @ vt)
 
 
 def search(

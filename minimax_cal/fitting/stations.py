@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.start import fit_base, project
+from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.measurements import Measurements
@@ -22,6 +22,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import nearest_rotation, transform
 
 LEAST = 3  # points that give a frame
 ALONE = 12  # poses of a session that place the robot by themselves
@@ -96,10 +97,8 @@ def fitting(data: Measurements, robot: Robot, state: State) -> Array:
     there = Cell.of(robot, state, data.target_names).predict(data.q)[data.seen]
     here = data.y[data.seen]
     centre, goal = here.mean(axis=0), there.mean(axis=0)
-    turn = project(((there - goal).T @ (here - centre))[None])[0]
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, goal - turn @ centre
-    return pose
+    turn = nearest_rotation((there - goal).T @ (here - centre))
+    return transform(turn, goal - turn @ centre)
 
 
 def turned_in(frames: Frames, state: State) -> tuple[Frames, State]:
@@ -109,8 +108,7 @@ def turned_in(frames: Frames, state: State) -> tuple[Frames, State]:
     steps = state.effects[: steps_of(frames)].reshape(-1, 6)
     base, out = state.base, dict(frames)
     for name, step in zip(list(frames)[1:], steps, strict=True):
-        jump = np.eye(4)
-        jump[:3, :3], jump[:3, 3] = kinematics.rotation(step[3:]), step[:3]
+        jump = transform(kinematics.rotation(step[3:]), step[:3])
         out[name] = base @ np.linalg.inv(jump) @ np.linalg.inv(base) @ frames[name]
     rest = np.concatenate([0.0 * steps.reshape(-1), state.effects[steps.size :]])
     return out, replace(state, effects=rest)

@@ -27,12 +27,13 @@ from minimax_cal.evidence.noise import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
+from minimax_cal.ground.units import in_files
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior, with_poses
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
 
@@ -142,8 +143,7 @@ class Poses:
     @cached_property
     def arm(self) -> Array:
         """(m, r, n) motion of the points per unit of each joint."""
-        n, flat = self.estimator.model.names.joints, self.estimator.model.prismatic
-        return self.every[1][..., np.arange(n) + np.where(flat, n, 2 * n)]
+        return self.every[1][..., zero_positions(self.estimator.model.prismatic)]
 
     @cached_property
     def weighted(self) -> Array:
@@ -313,7 +313,7 @@ class Uncertainty:
         names = self.names.all
         return {
             "names": [names[i] for i in known],
-            "units": ["mm" if self.units[i] == "m" else self.units[i] for i in known],
+            "units": [in_files(self.units[i])[1] for i in known],
             "rows": rows.tolist(),
             "source": self.source,
             "degrees_of_freedom": self.dof,
@@ -330,7 +330,7 @@ def quantile(level: float, dof: float) -> float:
 
 def scales(units: tuple[str, ...]) -> Array:
     """(p,) what a parameter is multiplied by in JSON: 1e3 for lengths."""
-    return np.array([1e3 if unit == "m" else 1.0 for unit in units])
+    return np.array([in_files(unit)[0] for unit in units])
 
 
 def noise_of(estimator: Estimator, state: State) -> Noise:
@@ -422,7 +422,7 @@ def uncertainty_of(
     names, active = few.model.names, few.model.active
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[np.ix_(active, active)] = 0.5 * (found + found.T) * len(rows) / len(group)
-    own = tuple("m" if length else "rad" for length in names.linear[: names.geometric])
+    own = names.units[: names.geometric]
     listen = partial(noise_of, few, state)
     return Uncertainty(names, (*own, *units), covariance, listen, dof, source)
 
@@ -476,7 +476,7 @@ def position_factor(
     factor = jacobian @ root
     if not jitter:
         return np.asarray(factor)
-    joints = np.arange(n) + np.where(model.prismatic, n, 2 * n)
+    joints = zero_positions(model.prismatic)
     return np.concatenate([factor, known.noise.jitter * jacobian[..., joints]], axis=-1)
 
 
@@ -505,7 +505,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)
     names = Names(cell.robot.joints, cell.target_names, effects)
-    units = (*("m" if x else "rad" for x in names.linear[: names.geometric]), *own)
+    units = (*names.units[: names.geometric], *own)
     try:
         part = content["covariance"]
         place = np.array([names.index(str(name)) for name in part["names"]], dtype=int)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import tempfile
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.errors import CalibrationError, OptionError
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
 MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
@@ -81,6 +82,15 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
         raise CalibrationError(f"{path}: is a folder; name a file")
     if not resolved(path).parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
+
+
+def made_folder(path: Path) -> Path:
+    """The folder, made where it is not there.  Raises CalibrationError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be made ({error.strerror})") from error
+    return path
 
 
 def json_text(content: object) -> str:
@@ -153,6 +163,14 @@ def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationErr
         return text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def read_toml(path: Path | str) -> dict[str, Any]:
+    """The content of a TOML file.  Raises OptionError."""
+    try:
+        return tomllib.loads(read_text(path, kind=OptionError))
+    except tomllib.TOMLDecodeError as error:
+        raise OptionError(f"{path}: is not TOML ({error})") from error
 
 
 def finite(value: float) -> float | None:

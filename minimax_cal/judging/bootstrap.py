@@ -25,6 +25,7 @@ from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.redrawn import Draw, solved_at_once
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import Model, SumOfSquares, with_poses
@@ -98,10 +99,9 @@ class Bootstrap:
 
     def table(self, level: float = 0.95) -> Table:
         """Every parameter with its percentiles, in mm, mrad, or the effect's own unit."""
-        shown = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
         rows: list[tuple[Cell, ...]] = []
         for i, (low, high) in enumerate(self.interval(level)):
-            unit, scale = shown.get(self.units[i], (self.units[i], 1.0))
+            scale, unit = for_people(self.units[i])
             numbers = (self.value[i], self.sigma[i], low, high)
             rows.append((self.names[i], unit, *(scale * float(number) for number in numbers)))
         return Table(
@@ -113,7 +113,7 @@ class Bootstrap:
 
     def to_dict(self, level: float = 0.95) -> dict[str, Any]:
         """For JSON, lengths in millimetres."""
-        scale = np.array([1e3 if unit == "m" else 1.0 for unit in self.units])
+        scale = np.array([in_files(unit)[0] for unit in self.units])
         ends = self.interval(level) * scale[:, None]
         rms = self.rms_interval(level)
         known = np.isfinite(rms.low)
@@ -122,7 +122,7 @@ class Bootstrap:
             "lost": self.lost,
             "level": level,
             "parameters": [
-                {"name": name, "unit": "mm" if unit == "m" else unit, "sigma": float(sigma),
+                {"name": name, "unit": in_files(unit)[1], "sigma": float(sigma),
                  "interval": ends[i].tolist()}
                 for i, (name, unit, sigma) in enumerate(
                     zip(self.names, self.units, self.sigma * scale, strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, permutations, product
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot
 
 STANDS_OUT = 8.0  # times the typical error, and 4 times what 95 % keep to: worth a look
+MOST_ORDERED = 5  # targets of which all orders are tried
 TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
 
 
@@ -129,7 +130,7 @@ def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
     """
     k = len(error_of)
     squared = np.nan_to_num(error_of) ** 2
-    orders = list(permutations(range(k))) if k <= 4 else transpositions(k)
+    orders = list(orders_of(k))
     cost = np.stack([squared[range(k), order, :].sum(axis=0) for order in orders])
     best = cost.argmin(axis=0)
     return np.array(orders)[best], cost.min(axis=0), cost[0]
@@ -174,15 +175,15 @@ def check_spread(data: Measurements) -> None:
         )
 
 
-def transpositions(k: int) -> list[tuple[int, ...]]:
-    """The identity and all exchanges of two of k targets."""
-    out = [tuple(range(k))]
-    for a, b in product(range(k), range(k)):
-        if a < b:
-            order = list(range(k))
-            order[a], order[b] = b, a
-            out.append(tuple(order))
-    return out
+def orders_of(k: int) -> Iterator[tuple[int, ...]]:
+    """The orders of k targets that are tried, their own first: of many only exchanges of two."""
+    if k <= MOST_ORDERED:
+        yield from permutations(range(k))
+        return
+    own = tuple(range(k))
+    yield own
+    for a, b in combinations(own, 2):
+        yield (*own[:a], b, *own[a + 1 : b], a, *own[b + 1 :])
 
 
 def collinear(data: Measurements) -> bool:

@@ -343,7 +343,7 @@ def nearest_means(q: Array, count: int, rng: np.random.Generator) -> Array:
         size = np.bincount(label, minlength=count)
         total = np.stack([np.bincount(label, column, count) for column in q.T], axis=1)
         means = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], means)
-    return label
+    return np.asarray(label)
 
 
 def region_name(data: Measurements, rows: Array) -> str:

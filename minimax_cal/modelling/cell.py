@@ -21,6 +21,7 @@ from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import rotation, rotation_vector
 from minimax_cal.robots.robot import Robot, checked_poses, robot_from_dict, told_missing
+from minimax_cal.robots.transforms import transform
 
 LATE = 0.1  # of a session: so far beyond its ends, effects of time are not extrapolated silently
 
@@ -167,10 +168,9 @@ def pose_to_dict(pose: Array) -> dict[str, list[float]]:
 
 def pose_from_dict(content: Mapping[str, Any]) -> Array:
     """From `pose_to_dict`.  Raises KeyError, TypeError, ValueError."""
-    pose = np.eye(4)
     turn = np.array(content["rotation_vector_rad"], dtype=float)
-    pose[:3, :3] = rotation(turn.reshape(3))
-    pose[:3, 3] = np.array(content["translation_mm"], dtype=float).reshape(3) * 1e-3
+    place = np.array(content["translation_mm"], dtype=float)
+    pose = transform(rotation(turn.reshape(3)), 1e-3 * place.reshape(3))
     if not np.isfinite(pose).all() or np.abs(pose).max() > FARTHEST:
         raise ValueError("a pose is not of plausible numbers")
     return pose
@@ -275,7 +275,7 @@ def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
             f"{data.source}: {named}: taken to be measured from where session "
             f"{next(iter(frames))} was (the fit knows {', '.join(frames)})"
         )
-    timed = [t.label for t in cell.effects.terms if {"constant", "fast", "since"} & t.choice.keys()]
+    timed = [t.label for t in cell.effects.terms if t.by_clock]
     if timed and "clock" not in data.columns:
         column = clock.column if clock else "visit order"
         place = clock.on(data).columns.get("clock") if clock else None

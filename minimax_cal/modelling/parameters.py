@@ -19,6 +19,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.transforms import transform
 
 BASE_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
 
@@ -55,9 +56,18 @@ class State:
     @property
     def base(self) -> Array:
         """(4, 4) pose of the base in the measurement frame, of a single state."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.rotation, self.origin
-        return pose
+        return transform(self.rotation, self.origin)
+
+    def along(self, axes: Array) -> Array:
+        """(p,) all parameters of a single state as people are told them, in the order of `Names`.
+
+        axes: (3, 3) a rotation, along and from which the base's origin and turn are told.
+        """
+        turn = kinematics.rotation_vector(axes.T @ self.rotation)
+        base = (axes.T @ self.origin, turn)
+        return np.concatenate(
+            [links_of(self.mdh), *base, self.target_positions.reshape(-1), self.effects]
+        )
 
     @property
     def geometry(self) -> tuple[Array, Array, Array, Array]:
@@ -130,6 +140,17 @@ class Names:
         """Place of a name."""
         return self.all.index(name)
 
+    @cached_property
+    def units(self) -> tuple[str, ...]:
+        """(p,) SI; effects count as lengths."""
+        return tuple("m" if length else "rad" for length in self.linear)
+
+    @property
+    def link_by_link(self) -> Array:
+        """(p,) the order in which people read them: joint after joint, then the rest."""
+        links = np.arange(5 * self.joints).reshape(5, -1).T.reshape(-1)
+        return np.concatenate([links, np.arange(5 * self.joints, self.count)])
+
     def match(self, patterns: Iterable[str], option: str) -> Array:
         """(p,) True where the name of a link parameter matches.  Raises OptionError.
 
@@ -153,6 +174,12 @@ class Names:
                 raise OptionError(f"{option}: no parameter called {pattern!r}; {hint}")
             chosen |= hits
         return chosen
+
+
+def zero_positions(prismatic: Array) -> Array:
+    """(n,) which parameters say where each joint's zero is: theta, or d where it slides."""
+    n = len(prismatic)
+    return np.arange(n) + np.where(prismatic, n, 2 * n)
 
 
 def links_of(mdh: Array) -> Array:

@@ -14,8 +14,10 @@ from minimax_cal.ground.options import option
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import MASS_PER_METRE, torques
+from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import transform
 
 MOST_POSES, MOST_TARGETS = 1_000_000, 20
 
@@ -100,10 +102,9 @@ def simulate(
     n = robot.joints
     errors = rng.normal(size=(n, 5)) * ([truth.length] * 2 + [truth.angle] * 3)
     real = robot.with_mdh(robot.mdh + errors)
-    base = np.eye(4)
-    base[:3, :3] = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
+    turn = scipy.spatial.transform.Rotation.random(rng=rng).as_matrix()
     aside = rng.normal(size=3)
-    base[:3, 3] = truth.distance * aside / np.linalg.norm(aside)
+    base = transform(turn, truth.distance * aside / np.linalg.norm(aside))
     angle = 2.0 * np.pi * (np.arange(targets) + 0.3 * rng.uniform(size=targets)) / targets
     spots = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0.0 * angle], axis=1) * truth.circle
     cell = Cell(real, base, tuple(f"smr{i + 1}" for i in range(targets)), spots)
@@ -123,29 +124,8 @@ def simulate(
     return Simulation(data, cell)
 
 
-def random_poses(robot: Robot, count: int, rng: np.random.Generator, span: float = np.pi) -> Array:
-    """Joint values (count, n) within the limits and one turn, the flange above the floor."""
-    most = np.where(robot.prismatic, 0.5, span)
-    lower, upper = np.maximum(robot.lower, -most), np.minimum(robot.upper, most)
-    chosen = np.empty((0, robot.joints))
-    for _ in range(100):
-        q = rng.uniform(lower, upper, (4 * count, robot.joints))
-        high = robot.pose(q)[:, :3, 3] @ robot.up > 0.1 * robot.reach()
-        chosen = np.concatenate([chosen, q[high]])[:count]
-        if len(chosen) == count:
-            return chosen
-    # an arm that hangs below its base: every pose is as good as another
-    return rng.uniform(lower, upper, (count, robot.joints))
-
-
 def gravity(robot: Robot, q: Array) -> Array:
     """Gravity torques (m, n), in the controller's sense [N m]; assumed masses where unknown."""
     links = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic)
-    known = np.isfinite(robot.mass) & np.isfinite(robot.com).all(axis=1)
-    length = np.hypot(robot.mdh[:, 0], robot.mdh[:, 1])
-    halfway = np.zeros((robot.joints, 3))
-    halfway[:, 0] = -0.5 * robot.mdh[:, 0]
-    mass = np.where(known, robot.mass, MASS_PER_METRE * length)
-    com = np.where(known[:, None], robot.com, halfway)
-    bend = torques(links, mass, com, robot.up).T * robot.sign
+    bend = torques(links, *masses_of(robot), robot.up).T * robot.sign
     return np.where(robot.prismatic, 0.0, bend)

@@ -21,6 +21,7 @@ from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import model_of
+from minimax_cal.robots.transforms import shift
 
 SAMPLE = 1000  # poses that tell which parameters are identifiable
 CHUNK = 2048  # poses whose Jacobian of all parameters is kept at a time
@@ -156,9 +157,7 @@ def with_effects(cell: Cell, texts: Sequence[str], q: Array) -> Cell:
 
 def cell_ahead(cell: Cell, place: Array) -> Cell:
     """A cell whose measurement frame has the base's axes and its origin at a place (3,) [m]."""
-    base = np.eye(4)
-    base[:3, 3] = -place
-    return Cell(cell.robot, base, cell.target_names, cell.target_positions, cell.effects)
+    return Cell(cell.robot, shift(*-place), cell.target_names, cell.target_positions, cell.effects)
 
 
 def ring(count: int, radius: float = 0.1) -> Array:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.kinematics import Chain, cross
+
+if TYPE_CHECKING:
+    from minimax_cal.robots.robot import Robot
 
 G = 9.80665  # [m/s^2]
 MASS_PER_METRE = 60.0  # of links whose mass the robot file does not tell [kg/m]: an assumption
@@ -53,3 +58,18 @@ def tubes(mdh: Array) -> tuple[Array, Array]:
     ca, sa = np.cos(mdh[:, 3]), np.sin(mdh[:, 3])
     halfway = -0.5 * np.stack([mdh[:, 0], mdh[:, 1] * sa, mdh[:, 1] * ca], axis=1)
     return MASS_PER_METRE * np.hypot(mdh[:, 0], mdh[:, 1]), halfway
+
+
+def weighed(robot: Robot) -> Array:
+    """(n,) True for links whose mass and centre of gravity the robot file tells."""
+    return np.isfinite(robot.mass) & np.isfinite(robot.com).all(axis=1)
+
+
+def masses_of(robot: Robot, least: float = 0.0) -> tuple[Array, Array]:
+    """(n,) masses [kg] and (n, 3) centres in the link frames [m]: as told, else those of tubes.
+
+    least: of any link [kg].
+    """
+    known, (tube, halfway) = weighed(robot), tubes(robot.mdh)
+    mass = np.maximum(np.where(known, robot.mass, tube), least)
+    return mass, np.where(known[:, None], robot.com, halfway)

@@ -84,6 +84,19 @@ def difference(one: Array, other: Array) -> float:
     return float(np.abs(one - other).max(initial=0.0))
 
 
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotations nearest to matrices (..., 3, 3), by SVD [Kabsch 1976]."""
+    u, _, vt = np.linalg.svd(matrix)
+    flip = np.ones((*matrix.shape[:-2], 3))
+    flip[..., 2] = np.linalg.det(u @ vt)
+    return np.asarray((u * flip[..., None, :]) @ vt)
+
+
+def level_to(direction: Array) -> Array:
+    """(2, 3) unit vectors across a direction (3,) and each other."""
+    return np.asarray(np.linalg.svd(direction[None])[2][1:])
+
+
 def along(direction: Array) -> Array:
     """The smallest rotation that takes z to a direction: (3, 3)."""
     c = float(direction[2])
@@ -162,8 +175,7 @@ def shared_base(one: Array, other: Array) -> Array:
         rows += [np.hstack([turning, np.zeros((9, 3))]), np.hstack([moving, eye - a[:3, :3]])]
         right += [np.zeros(9), a[:3, 3]]
     found = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=1e-9)[0]
-    u, _, v = np.linalg.svd(found[:9].reshape(3, 3))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    rotation = nearest_rotation(found[:9].reshape(3, 3))
     stacked = np.vstack([eye - a[:3, :3] for a in one])
     rest = np.concatenate([a[:3, 3] - rotation @ b[:3, 3] for a, b in zip(one, other, strict=True)])
     return transform(rotation, np.linalg.lstsq(stacked, rest, rcond=1e-9)[0])

@@ -16,7 +16,7 @@ from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html.more_charts import waterfall
-from minimax_cal.reporting.html.page import figure_data, needed, part
+from minimax_cal.reporting.html.page import figure_data, needed, template
 from minimax_cal.robots.robot import builtin_robots, load_robot
 from minimax_cal.serving.cell import Point, points_of
 from minimax_cal.serving.sessions import GIVEN, SCRIPT, Choices, Session, mark
@@ -62,16 +62,16 @@ def state_of(at: Session, job: Job | None) -> dict[str, Any]:
     return {
         "name": at.name,
         "choices": chosen.model_dump(mode="json"),
-        "robots": robots(at),
+        "robots": robots(at, chosen),
         "steps": {name: how(at, chosen, name, job) for name in STEPS},
         "panels": panels(at, chosen, job),
         "views": views(at),
     }
 
 
-def robots(at: Session) -> list[tuple[str, str]]:
+def robots(at: Session, chosen: Choices) -> list[tuple[str, str]]:
     """Value and label of every robot to choose: those built in, and files that were dropped."""
-    known = at.choices.files() - {at.choices.robot}
+    known = chosen.files() - {chosen.robot}
     dropped = [(name, name) for name in at.given() if name not in known]
     return [*dropped, *builtins()]
 
@@ -136,9 +136,9 @@ def macros() -> Any:
     from markupsafe import Markup
 
     jinja, _ = needed()
-    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
-    pages.globals["grid"] = lambda table: Markup(table.html())
-    return pages.from_string(part("panels.html.jinja", "minimax_cal.serving")).module
+    found = template(jinja, "panels.html.jinja", "minimax_cal.serving")
+    found.globals["grid"] = lambda table: Markup(table.html())
+    return found.module
 
 
 def files_panel(at: Session, chosen: Choices, job: Job | None) -> Panel:

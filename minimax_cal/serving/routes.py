@@ -20,7 +20,7 @@ from starlette.routing import Route
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.reporting.html.charts import PALETTE
-from minimax_cal.reporting.html.page import needed, part
+from minimax_cal.reporting.html.page import needed, part, template
 from minimax_cal.serving.cell import view_of
 from minimax_cal.serving.panels import diagnosis_words, state_of
 from minimax_cal.serving.sessions import (
@@ -109,8 +109,7 @@ async def words_of(request: Request) -> dict[str, Any]:
 def page(name: str) -> Any:
     """A template of this package."""
     jinja, _ = needed()
-    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
-    return pages.from_string(part(name, "minimax_cal.serving"))
+    return template(jinja, name, "minimax_cal.serving")
 
 
 @asked

@@ -8,7 +8,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import made_folder
 from minimax_cal.ground.optional import optional
 from minimax_cal.reporting.html.page import needed
 
@@ -30,7 +31,7 @@ def serve(folder: Path, port: int | None, ready: Callable[[str], object]) -> Non
     from minimax_cal.serving.guard import Door, Guard
     from minimax_cal.serving.routes import application
 
-    root = made(folder)
+    root = made_folder(folder).resolve()
     listener = listening(port)
     door = Door(listener.getsockname()[1], secrets.token_urlsafe(24))
     config = uvicorn.Config(
@@ -40,15 +41,6 @@ def serve(folder: Path, port: int | None, ready: Callable[[str], object]) -> Non
     ready(door.url)
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
-
-
-def made(folder: Path) -> Path:
-    """The folder of the sessions, made if need be.  Raises CalibrationError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"{folder}: cannot be made ({error.strerror})") from error
-    return folder.resolve()
 
 
 def listening(port: int | None) -> socket.socket:

@@ -6,15 +6,18 @@ import json
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.robot import builtin_robots
-from minimax_cal.serving.sessions import GIVEN, Choices, Session
+from minimax_cal.serving.sessions import GIVEN, Choices, Session, mark
 
 POSES, USED, UNDERSTOOD = "poses.csv", "used.csv", "understood.json"
 FIT, DIAGNOSIS, REPORT, NEXT = "fit.json", "diagnosis.json", "report.html", "next.csv"
 URDF, MJCF, CORRECTED = "robot.urdf", "robot.xml", "corrected.csv"
 PROGRAM = "minimax-cal"
+KEPT = 64  # results whose data are remembered
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,8 @@ def diagnosing(at: Session, chosen: Choices) -> tuple[Command, ...]:
 def judging(at: Session, chosen: Choices) -> tuple[Command, ...]:
     """The report, with the requirement."""
     results = [fitted(at)]
-    if data_of(at, DIAGNOSIS) and data_of(at, DIAGNOSIS) == data_of(at, FIT):
+    diagnosed = data_of(*mark(at.folder / DIAGNOSIS))
+    if diagnosed and diagnosed == data_of(*mark(at.folder / FIT)):
         results.append(DIAGNOSIS)
     limits = {"rms": chosen.rms, "max": chosen.most}
     told = ", ".join(f"{name} {limit:g}" for name, limit in limits.items() if limit)
@@ -136,10 +140,11 @@ def fitted(at: Session) -> str:
     return FIT
 
 
-def data_of(at: Session, result: str) -> str:
-    """SHA-256 of the measurements of a result, empty where it tells none."""
+@lru_cache(maxsize=KEPT)
+def data_of(path: str, moment: int, size: int) -> str:
+    """SHA-256 of the measurements of a result's file at a moment, empty where it tells none."""
     try:
-        content = json.loads((at.folder / result).read_bytes())
+        content = json.loads(Path(path).read_bytes())
         return str(content["provenance"]["data_sha256"])
     except (OSError, ValueError, KeyError, TypeError):
         return ""

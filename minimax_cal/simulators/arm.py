@@ -15,20 +15,21 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.compliance import WHOLE
-from minimax_cal.modelling.effects.gears import joints_at
-from minimax_cal.modelling.effects.scene import Scene, joint_of, mask_of, unmasked
-from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
+from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE, WHOLE
+from minimax_cal.modelling.effects.gears import BACKLASH, ENCODER_GAIN, JOINT_COUPLING, joints_at
+from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of, unmasked
+from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import random_poses
-from minimax_cal.robots.gravity import LEAST_MASS
+from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.springs import Springs, springs_of
 
 SAMPLES = 120  # poses at which laws and springs are compared
 NEGLIGIBLE = 1e-9  # [rad]
-GIVES_WAY = ("joint_compliance", "link_bending", "base_flex")
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Arm:
 
 def assumed(robot: Robot) -> bool:
     """Whether masses have to be assumed: the robot does not tell all of them."""
-    return not bool(np.isfinite(robot.mass).all() and np.isfinite(robot.com).all())
+    return not bool(weighed(robot).all())
 
 
 def stiff(robot: Robot, masses: tuple[Array, Array]) -> Arm:
@@ -111,9 +112,8 @@ def arm_of(
     q = sample(robot) if q is None or not len(q) else q
     poses = still(q, cell.target_names, robot) if measured is None else measured
     scene = cell.scene(poses)
-    mass, com = scene.masses
-    own = (np.maximum(mass, LEAST_MASS), com)
-    parts = Parts(replace(stiff(robot, masses or own), spots=cell.target_positions))
+    begun = stiff(robot, masses or masses_of(robot, LEAST_MASS))
+    parts = Parts(replace(begun, spots=cell.target_positions))
     for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
         ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
     change = np.zeros(sum(len(values) for _, values in parts.firm))
@@ -153,9 +153,7 @@ def with_springs(arm: Arm, found: Springs, state: State) -> Arm:
     state: geometry, base and targets of the fit.
     """
     after = state.step(found.change)
-    mount = np.eye(4)
-    mount[:3, :3] = state.rotation.T @ after.rotation
-    mount[:3, 3] = state.rotation.T @ (after.origin - state.origin)
+    mount = inverse(state.base) @ after.base
     arm = with_tool(arm, found.sag, found.drawn)
     return replace(
         arm,
@@ -224,11 +222,19 @@ Element = Callable[[Parts, Scene, Term, Array], None]
 
 def without_element(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """What turns joints goes to the command map, the rest is named."""
-    if term.columns(scene).shift.size:
-        why = WHY.get(term.effect, "a simulator has no element for it")
-        parts.left_out.append(f"{term.label}: {why}")
-    else:
+    if term.columns(scene).only_turns:
         parts.mapped.append((term, values))
+    else:
+        parts.left_out.append(f"{term.label}: {why_not(EFFECTS[term.effect])}")
+
+
+def why_not(effect: Effect) -> str:
+    """Why a simulator cannot hold an effect."""
+    if effect.follows == "time":
+        return "changes with time or temperature; the file is the arm at the start"
+    if effect.moves == "instrument":
+        return "of the instrument and not of the arm"
+    return "a simulator has no element for it"
 
 
 def kept(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
@@ -260,7 +266,7 @@ def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     value = float(values[0])
     if value <= 0.0:  # no spring does that; others may take over what it does
         parts.grouped = True
-    elif term.effect == "base_flex":
+    elif EFFECTS[term.effect].moves == "foot":
         parts.put(base=parts.arm.base + value)
     else:
         link = joint_of(term.place)
@@ -313,24 +319,16 @@ def balancer(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     parts.put(balance=Balance(float(values[0]), **choice))
 
 
-ELEMENTS: dict[str, Element] = {
-    "joint_compliance": compliance,
-    "link_bending": softness,
-    "base_flex": softness,
-    "tool_flex": tool,
-    "encoder_gain": kept,
-    "backlash": kept,
-    "joint_coupling": kept,
-    "gravity_compensator": balancer,
-}
 FIRM: dict[str, Element] = {
-    "encoder_gain": encoder,
-    "backlash": backlash,
-    "joint_coupling": coupling,
+    ENCODER_GAIN.name: encoder,
+    BACKLASH.name: backlash,
+    JOINT_COUPLING.name: coupling,
 }
-WHY = {  # effects that a file cannot hold
-    "thermal_growth": "changes with time or temperature; the file is the arm at the start",
-    "frame_drift": "changes with time; the file is the arm at the start",
-    "target_shift": "changes with time; the file is the arm at the start",
-    "target_offset": "of the instrument and not of the arm",
+ELEMENTS: dict[str, Element] = {
+    JOINT_COMPLIANCE.name: compliance,
+    LINK_BENDING.name: softness,
+    BASE_FLEX.name: softness,
+    TOOL_FLEX.name: tool,
+    GRAVITY_COMPENSATOR.name: balancer,
+    **dict.fromkeys(FIRM, kept),
 }

@@ -100,7 +100,7 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
     sure = {
         term.text
         for finding in told.findings
-        if getattr(finding, "established", True)
+        if finding.established
         for term in finding.terms
         if term.effect in EFFECTS
     }
@@ -111,8 +111,7 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
 def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
     """Terms for a robot whose masses may be known: then each joint has one torque."""
     return tuple(
-        replace(term, choice={}) if term.effect == "joint_compliance" and not assumed(robot)
-        else term
+        replace(term, choice={}) if "parts" in term.choice and not assumed(robot) else term
         for term in terms
     )  # fmt: skip
 
@@ -121,14 +120,13 @@ def fitted(fit: Fit, terms: Sequence[Term]) -> Fit:
     """The same poses fitted with some effects; that fit itself where they are its own."""
     if [t.text for t in terms] == [t.text for t in fit.cell.effects.terms]:
         return fit
-    given = [t if t.choice or t.effect != "joint_compliance" else t.label for t in terms]
-    return again(fit, effects=tuple(given))
+    return again(fit, effects=tuple(t if t.choice else t.label for t in terms))
 
 
 def maps(term: Term, fit: Fit) -> bool:
     """Whether an effect without an element turns joints only."""
     told = with_history(fit.data)
-    return not term.columns(fit.cell.scene(told)).shift.size
+    return term.columns(fit.cell.scene(told)).only_turns
 
 
 def marked(data: Measurements, held: Array) -> Measurements:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.gravity import G
 from minimax_cal.robots.robot import Robot
-from minimax_cal.robots.transforms import head, inverse, link, tail
+from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
 from minimax_cal.simulators.arm import Arm
 
 TIME = 0.02  # in which a spring comes to rest [s]
@@ -206,7 +206,7 @@ def bends(layout: Layout, arm: Arm) -> None:
         length = float(np.linalg.norm(end - start))
         seat = layout.seats[i]
         along = (end - start) / length
-        across = np.linalg.svd(along[None])[2][1:]
+        across = level_to(along)
         body = wrapped(layout.bodies[i], layout.bodies[i + 1], f"bend{i + 1}")
         for point, share in enumerate(GAUSS):
             at = seat[:3, :3] @ (start + share * (end - start)) + seat[:3, 3]
@@ -236,7 +236,7 @@ def base(layout: Layout, arm: Arm) -> None:
     foot = layout.seats[0] @ inverse(head(robot.mdh[0]))
     if arm.base > 0.0:
         _, _, inertia = carried(arm)
-        level = np.linalg.svd(robot.up[None])[2][1:]
+        level = level_to(robot.up)
         first = next(i for i, child in enumerate(body) if child.tag in ("joint", "freejoint"))
         for letter, axis in zip("xy", level, strict=True):
             new = spring(
@@ -283,9 +283,7 @@ def targets(layout: Layout, arm: Arm, names: Sequence[str]) -> None:
     soft = bool(np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0)
     body = sagging(layout.bodies[-1], end, arm) if soft else layout.bodies[-1]
     for name, point in zip(names, arm.spots, strict=True):
-        at = np.eye(4)
-        at[:3, 3] = point
-        mark(body, name, at if soft else end @ at)
+        mark(body, name, shift(*point) if soft else end @ shift(*point))
 
 
 def mark(body: ET.Element, name: str, pose: Array) -> None:
@@ -333,7 +331,7 @@ def across_themselves(matrix: Array) -> Array:
         return np.eye(3)
     _, vectors = np.linalg.eigh(half)
     first = vectors.sum(axis=1) / np.sqrt(3.0)
-    plane = np.linalg.svd(first[None])[2][1:]
+    plane = level_to(first)
     _, turned = np.linalg.eigh(plane @ half @ plane.T)
     both = (
         (turned[:, 0] + turned[:, 1]) / np.sqrt(2.0),

@@ -21,7 +21,7 @@ from minimax_cal.correcting.exporters.correct import NOTED, laid, match, seated
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.ground.files import read_raw
-from minimax_cal.robots.gravity import G
+from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
 from minimax_cal.robots.urdf_file import ASSUMED, parse_xml, walk
@@ -179,7 +179,6 @@ def corrected(
             "the written model follows the calibrated robot"
         )
     tree = deepcopy(given.tree)
-    masses = (chain.robot.mass, chain.robot.com)
     robot = arm.robot if arm else nominal
     foot = base @ arm.mount if arm else base
     layout = seats(given, tree, chain, (nominal, base), (robot, foot))
@@ -191,7 +190,8 @@ def corrected(
             body.attrib.pop("gravcomp", None)
     if arm and assumed(chain.robot):  # a file of ours: it has no masses of its own
         ours(layout, arm)
-    arm = in_gravity(arm, chain.gravity) if arm else stiff(nominal, known(masses))
+    held = stiff(nominal, masses_of(chain.robot, LEAST_MASS))
+    arm = in_gravity(arm, chain.gravity) if arm else held
     equip(layout, arm)
     for parent in list(tree.iter("body")):
         for site in [e for e in parent if e.tag == "site" and e.get("name") in ("flange", *names)]:
@@ -208,12 +208,6 @@ def ours(layout: Layout, arm: Arm) -> None:
     for text in layout.root.iter("text"):
         if text.get("name") == ROBOT:
             text.set("data", json.dumps(arm.robot.to_dict()))
-
-
-def known(masses: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Masses for choosing gains only, where they are not known."""
-    mass, com = masses
-    return np.where(np.isfinite(mass), mass, 30.0), np.nan_to_num(com)
 
 
 def in_gravity(arm: Arm, gravity: float) -> Arm:

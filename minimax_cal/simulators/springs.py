@@ -16,9 +16,9 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.bending import bent, tilted
+from minimax_cal.modelling.effects.bending import TOOL_FLEX, bent, tilted
 from minimax_cal.modelling.effects.scene import Scene, joint_of, turning, unmasked
-from minimax_cal.modelling.effects.table import Fitted, Term
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 
 Masses = tuple[Array, Array]  # (n,) [kg] and (n, 3) centres of gravity in the link frames [m]
 
@@ -126,7 +126,7 @@ def beside(scene: Scene, laws: Fitted, geometry: Array, firm: Sequence[Term]) ->
     yield geometry
     for term in firm:
         yield np.moveaxis(term.columns(scene).displacement(scene), 0, -1)
-    if any(term.effect == "tool_flex" for term in laws.terms):
+    if any(EFFECTS[term.effect].moves == "tool" for term in laws.terms):
         yield tool_columns(scene)
 
 
@@ -134,12 +134,12 @@ def places_of(scene: Scene, laws: Fitted) -> list[tuple[str, int]]:
     """What gives way: joints, links, the base; for a whole arm all joints that turn."""
     out: dict[tuple[str, int], None] = {}
     for term in laws.terms:
-        if term.effect == "joint_compliance":
+        if "parts" in term.choice:
             joints = [part // 4 for part in unmasked(term.choice["parts"])]
             out |= {("joint", j): None for j in (turning(scene) if term.place == "all" else joints)}
-        elif term.effect == "link_bending":
+        elif term.place[0] == "L":
             out[("link", joint_of(term.place))] = None
-        elif term.effect == "base_flex":
+        elif EFFECTS[term.effect].moves == "foot":
             out[("base", 0)] = None
     return list(out)
 
@@ -149,7 +149,7 @@ def tool_columns(scene: Scene) -> Array:
 
     Eight turns per direction of gravity, none of them about gravity itself; drawn along z.
     """
-    whole = Term("tool_flex", "all", {"lever": 2.0}).columns(scene).displacement(scene)
+    whole = Term(TOOL_FLEX.name, "all", {"lever": 2.0}).columns(scene).displacement(scene)
     turns = np.einsum("dkcm,de->kcme", whole[:9], TRACELESS)
     return np.concatenate([turns, whole[9][..., None]], axis=-1)
 

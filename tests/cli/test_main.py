@@ -131,7 +131,7 @@ def test_the_same_seed_gives_the_same_numbers(
         (("calibrate", "irb2600", "CSV", "-o", "/no/such/folder/fit.json"), "cannot be written"),
         (("calibrate", "irb2600", "absent.csv"), "absent.csv"),
         (("calibrate", "irb26", "CSV"), "irb2600"),
-        (("calibrate", "ur10", "CSV"), "error"),
+        (("calibrate", "ur10", "CSV", "--objective", "sum"), "error"),
         (("evaluate", "CSV", "CSV"), "is not JSON"),
         (("calibrate", "irb2600"), "DATA"),
         (("callibrate", "irb2600", "CSV"), "callibrate"),

@@ -9,12 +9,19 @@ from conftest import run
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.fitting.instruments import flange_poses, write_relative
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.judging.saved import open_saved
 from minimax_cal.modelling.simulate import Truth, simulate
 
 MM = 1e-6  # of numbers that went through a file in mm
+
+
+@pytest.fixture(scope="module")
+def found(here: Path) -> mc.Diagnosis:
+    """The diagnosis that stands in the file."""
+    return load_diagnosis(here / "diagnosis.json")
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +60,9 @@ def test_every_command_takes_every_result(
     assert (tmp_path / "report.html").read_text().count("<table") > 3
 
 
-def test_rungs_are_those_of_the_ladder(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = mc.diagnose("ur10", here / "gap.csv")
+def test_rungs_are_those_of_the_ladder(
+    here: Path, found: mc.Diagnosis, capsys: pytest.CaptureFixture[str]
+) -> None:
     held = found.data.take(found.held)
     assert len(found.ladder) == len(found.rungs()) >= 3
     for number, step in enumerate(found.ladder):
@@ -98,10 +106,10 @@ def test_a_relative_calibration_is_placed_by_the_data(here: Path) -> None:
     )
 
 
-def test_a_diagnosis_tells_a_fit_its_effects(here: Path) -> None:
+def test_a_diagnosis_tells_a_fit_its_effects(here: Path, found: mc.Diagnosis) -> None:
     path, data = here / "diagnosis.json", here / "gap.csv"
-    found = mc.diagnose("ur10", data)
-    fits = [mc.calibrate("ur10", data, effects=source) for source in (path, str(path), found)]
+    told = (path, str(path), found)
+    fits = [mc.calibrate("ur10", data, "sum", effects=source) for source in told]
     labels = {tuple(term.label for term in fit.cell.effects.terms) for fit in fits}
     assert labels == {("joint_compliance:all",)}
     assert fits[0].accuracy["holdout"].rms_mm < 0.2 * found.ladder[1].holdout.rms_mm
@@ -109,6 +117,6 @@ def test_a_diagnosis_tells_a_fit_its_effects(here: Path) -> None:
     content["effects"][0]["established"] = False
     doubtful = here / "doubtful.json"
     doubtful.write_text(json.dumps(content))
-    assert not mc.calibrate("ur10", data, effects=doubtful).cell.effects.terms
+    assert not mc.calibrate("ur10", data, "sum", effects=doubtful).cell.effects.terms
     with pytest.raises(mc.OptionError, match="is no diagnosis"):
         mc.calibrate("ur10", data, effects=here / "fit.json")

@@ -24,7 +24,8 @@ from minimax_cal.correcting.target_file import ADDED, read_targets
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
 from minimax_cal.modelling.reach import Outcome, Reach, arm_of, motion
-from minimax_cal.modelling.simulate import Simulation, Truth, gravity, random_poses, simulate
+from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
+from minimax_cal.robots.sampling import random_poses
 
 Move = Callable[[Array], Array]
 

@@ -184,7 +184,7 @@ def test_a_quarter_turn_that_changed_is_told() -> None:
         ("a.mod", "robtarget p:=[[900,2,900],[1,0,0,0]," + AXES + "\nMoveL p,v1,z1,tX;",
          [], "a.mod:2: moves with tX"),
         ("a.mod", "robtarget p:=[[900,2,900],[1,0,0,0]," + AXES,
-         ["--tool", "tY"], "--tool 'tY'"),
+         ["--tool", "tY"], "--tool tY"),
         ("a.src", "E6POS P={X 1,Y 2,Z 3,A 0,B 0,C 0,S 2,X 4}", [], "X stands twice"),
         ("a.src", "PTP {X 1,Y 2,Z q,A 0,B 0,C 0}", [], "no number"),
         ("a.dat", "\0", [], "is no text"),

@@ -22,8 +22,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.drivers import own_value
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
-from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots.kinematics import rotation
+from minimax_cal.robots.sampling import random_poses
 
 M = 60
 SPOTS = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])

@@ -60,3 +60,17 @@ def test_what_was_fitted_is_not_found_again() -> None:
     rest = rest_of(made.rows, Noise(0.1, 1e-10, 0.0), column)
     root = rest.root
     assert abs(rest.rows @ (column[:, 0] * root)) < 1e-8 * np.linalg.norm(column[:, 0] * root)
+
+
+def test_one_pose_that_is_off_is_no_structure() -> None:
+    """Of many functions few poses have each a part of its own, and one row is 9 sigmas off."""
+    made = study(6e-6, 1.0, 0, poses=50)
+    rng, noise = np.random.default_rng(1), Noise(0.5, 1e-10, 0.0)
+    spread = np.sqrt(1e-10 * (1.0 + 0.5 * made.rows.variance_ratio))
+    none = np.zeros((len(spread), 0))
+    for pose in (0, 8, 24):
+        error = spread * rng.normal(size=len(spread))
+        row = np.flatnonzero(made.rows.group == pose)[8]
+        error[row] += 9.0 * spread[row]
+        found = structure(made.scene, replace(made.rows, error=error), noise, none)
+        assert min(t.p for t in found if "wave" not in t.name) * len(found) > 0.005

@@ -10,7 +10,7 @@ from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.library import library
+from minimax_cal.evidence.library import Kind, library
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.fitting.options import Options, silent
@@ -98,7 +98,7 @@ def test_values_are_those_of_least_squares() -> None:
     c = next(c for c in lib.candidates if c.key == ("encoder_gain", "J2"))
     settings = selection.bench(lib, ()).settings
     still = int(np.flatnonzero(settings.ratios == 0.0)[0])
-    gain, value, *_ = (x[still] for x in settings.added_all([c], 1))
+    gain, value, *_ = (x[still] for x in settings.added_all(Kind.of([c]), 1))
     matrix = np.concatenate([made.rows.basis, lib.columns[:, c.main]], axis=1)
     expected, squares, *_ = np.linalg.lstsq(matrix, made.rows.error, rcond=None)
     assert_allclose(value[0, 0], expected[-1], rtol=1e-8)

@@ -8,8 +8,9 @@ import minimax_cal as mc
 from experiments.hand_eye import Placed, closed_form, linearise, mdh_pose, place, twists
 from experiments.poses import exp, inverse, pose_residual
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.simulate import Simulation, random_poses
+from minimax_cal.modelling.simulate import Simulation
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.sampling import random_poses
 
 LENGTH = 0.1
 

@@ -15,9 +15,11 @@ from numpy.testing import assert_allclose
 from experiments import errata, measuring_loop, splits
 from experiments.__main__ import STUDIES
 from experiments.conditions import PAPER, Errors
+from experiments.convergence import Row, moved_of
 from experiments.courses import Course, rises
 from experiments.index import tables_of
 from experiments.measuring_loop import Job
+from experiments.off_starts import grid
 from experiments.splits import Held
 from experiments.verdicts import HEADER, MISSING, NO, PARTLY, VERDICTS, YES, told
 from experiments.verdicts_m import FIVE, best_of
@@ -70,6 +72,23 @@ def test_a_condition_is_judged_by_what_it_makes_small() -> None:
 def test_rises_are_counted() -> None:
     course = Course(np.array([4.0, 2.0, 3.0, 3.0, 1.0, 1.5]), 6, True, 1.0)
     assert rises(course) == 2
+
+
+def test_starts_moved_by_rounding_stand_beside_the_same_starts() -> None:
+    def row(every: int, lost: int) -> Row:
+        theta, alpha = grid(every)
+        least = theta + alpha > 0.0
+        converged = theta > -1.0
+        converged[lost] ^= True
+        size = len(theta)
+        return Row("nllm", "all, mm", every, np.ones(size), np.ones(size), converged, least, 1.0)
+
+    few = len(grid(3)[0])
+    m = moved_of(row(1, 0), row(3, 7))  # the first start of all is not among the few
+    assert m.starts == few
+    assert_allclose(m.otherwise, 100.0 / few)
+    assert_allclose(abs(np.diff(m.converged)), 100.0 / few)
+    assert m.minimum[0] == m.minimum[1]
 
 
 def test_regions_of_the_joint_space_are_its_clusters() -> None:

@@ -19,8 +19,9 @@ from experiments.poses import (
     triangle,
 )
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.simulate import Truth, random_poses, simulate
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.sampling import random_poses
 
 EXACT = Truth(compliance=0, noise=0, noise_per_metre=0)
 ROUNDING = 1e-12

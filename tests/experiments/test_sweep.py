@@ -1,5 +1,4 @@
 import hashlib
-import importlib.util
 import json
 import os
 import pickle
@@ -8,8 +7,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +22,7 @@ from experiments import sweep as module
 from experiments.index import tables_of
 from experiments.record import save_figure, save_json, save_tables
 from experiments.sweep import Study, study_options, sweep
+from minimax_cal.ground import parallel
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
 
@@ -153,7 +151,7 @@ def test_a_part_holds_data_and_runs_nothing(tmp_path: Path) -> None:
 
 
 def test_a_process_that_dies_ends_the_sweep_in_a_word(tmp_path: Path) -> None:
-    with pytest.raises(click.ClickException, match="a process of this sweep died"):
+    with pytest.raises(click.ClickException, match="a process died"):
         sweep(kill_worker, [0, 1, 2], name="dead", jobs_in_parallel=2, folder=tmp_path)
 
 
@@ -180,6 +178,13 @@ def test_code_of_a_study_is_its_file_and_what_it_imports(tmp_path: Path) -> None
         (tmp_path / f"{name}.py").write_text(text)
     found = [path.stem for path in module.study_files(tmp_path / "study.py")]
     assert found == ["deeper", "helper", "study"]
+
+
+def wait_for(ready: Any, seconds: float = 120.0) -> None:
+    until = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)
 
 
 SCRIPT = """
@@ -226,138 +231,7 @@ def test_functions_and_options_that_cannot_work(tmp_path: Path) -> None:
     assert sweep(work, [], name="empty", folder=tmp_path) == []
 
 
-# ---- on a cluster ----------------------------------------------------------------------------
-
-
-def wait_for(ready: Any, seconds: float = 120.0) -> None:
-    until = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < until, "waited in vain"
-        time.sleep(0.05)
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A real Dask scheduler and two worker processes on loopback."""
-    if importlib.util.find_spec("distributed") is None:
-        pytest.skip("distributed is not installed: pip install 'minimax-cal[distributed]'")
-    folder = tmp_path_factory.mktemp("cluster")
-    file, log = folder / "scheduler.json", (folder / "log").open("w")
-    dask = [sys.executable, "-m", "dask"]
-    settings = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-    place = dict(env=ENVIRONMENT | settings, cwd=folder, stdout=log, stderr=log)
-    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    running = [
-        subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", str(file)], **place)
-    ]
-    try:
-        wait_for(file.exists)
-        address = json.loads(file.read_text())["address"]
-        size = ["--nworkers", "2", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0"]
-        running += [subprocess.Popen([*dask, "worker", address, *size], **place)]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(module, "PATIENCE", 60.0)  # a loaded machine answers late
-            yield address
-    finally:
-        for process in reversed(running):  # workers first: they sign off at the scheduler
-            process.terminate()
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        log.close()
-
-
-def test_a_cluster_gives_the_same_results(
-    cluster: str, expected: list[Found], tmp_path: Path
-) -> None:
-    found = sweep(work, JOBS, name="dask", cluster=cluster, folder=tmp_path)
-    assert same(found, expected)
-    processes = {each.process for each in found}
-    assert len(processes) == 2
-    assert os.getpid() not in processes
-    again = sweep(work, JOBS, name="dask", folder=tmp_path)  # kept: no matter where it ran
-    assert same(again, expected)
-    assert {each.process for each in again} == processes
-
-
-def test_a_cluster_with_other_code_is_refused(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "fingerprint", lambda function: "other")
-    with pytest.raises(OptionError, match="other code"):
-        sweep(work, JOBS, name="other", cluster=cluster, folder=tmp_path)
-
-
-def test_a_cluster_without_the_study_is_refused(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "only_here.py").write_text("def work(job):\n    return job\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    import only_here
-
-    with pytest.raises(OptionError, match="no module 'only_here'"):
-        sweep(only_here.work, [1, 2], name="lost", cluster=cluster, folder=tmp_path)
-
-
-def test_errors_of_a_job_come_back_from_a_cluster(cluster: str, tmp_path: Path) -> None:
-    with pytest.raises(ModuleNotFoundError, match="no extra for"):
-        sweep(missing, [1, 2], name="error", cluster=cluster, folder=tmp_path)
-
-
-def test_a_job_that_kills_its_worker_ends_the_sweep(cluster: str, tmp_path: Path) -> None:
-    with pytest.raises(click.ClickException, match="worker"):  # joblib's backend waits for ever
-        sweep(kill_worker, [0, 1], name="killed", cluster=cluster, folder=tmp_path)
-
-
-@pytest.fixture
-def deserted(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and its one worker, without a nanny; for tests that end them."""
-    pytest.importorskip("distributed")
-    file = tmp_path / "scheduler.json"
-    quiet = dict(env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    dask = [sys.executable, "-m", "dask"]
-    place = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    running = [
-        subprocess.Popen([*dask, "scheduler", *place, "--scheduler-file", str(file)], **quiet)
-    ]
-    try:
-        wait_for(lambda: file.exists() and file.stat().st_size)
-        address = json.loads(file.read_text())["address"]
-        size = ["--no-nanny", "--nthreads", "1", "--dashboard-address", "127.0.0.1:0"]
-        running += [subprocess.Popen([*dask, "worker", address, *size], **quiet)]
-        yield address, running
-    finally:
-        for process in running:
-            process.kill()
-            process.wait()
-
-
-@pytest.mark.parametrize("dead", ["worker", "scheduler"])
-def test_a_deserted_cluster_is_not_waited_for(
-    dead: str,
-    deserted: tuple[str, list[subprocess.Popen[bytes]]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "PATIENCE", 60.0)
-    monkeypatch.setattr(module, "DESERTED", 1.0)
-    monkeypatch.setattr(module, "WATCH", 0.2)
-    address, running = deserted
-    log = tmp_path / "log"
-    jobs = [Job(seed, str(log), 0.3) for seed in range(100)]
-
-    def end() -> None:
-        wait_for(lambda: any(tmp_path.glob("deserted/*.part")))
-        running[dead == "worker"].kill()
-
-    with ThreadPoolExecutor(1) as other:
-        ending = other.submit(end)
-        with pytest.raises(click.ClickException, match="tcp://"):
-            sweep(work, jobs, name="deserted", cluster=address, folder=tmp_path)
-    ending.result()
-    assert len(list(tmp_path.glob("deserted/*.part"))) >= 1  # what arrived is kept
+# ---- options of a study ----------------------------------------------------------------------
 
 
 @click.command()
@@ -375,7 +249,7 @@ def run_toy(*arguments: str) -> Result:
 def test_nobody_at_the_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "PATIENCE", 1.0)
+    monkeypatch.setattr(parallel, "PATIENCE", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # it listens, but never says a word
         port = silent.getsockname()[1]
         for address in (f"tcp://127.0.0.1:{port}", "nonsense", "tcp://127.0.0.1:1"):
@@ -402,7 +276,7 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     result = run_toy(*options)
     assert result.exit_code == 2
-    assert f"pip install 'minimax-cal[{extra}]'" in result.stderr.splitlines()[-1]
+    assert f'pip install ".[{extra}]"' in result.stderr.splitlines()[-1]
 
 
 # ---- all studies -----------------------------------------------------------------------------

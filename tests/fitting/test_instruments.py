@@ -41,7 +41,7 @@ from minimax_cal.fitting.instruments.rows import Closures, Instrument, Wires, st
 from minimax_cal.fitting.instruments.split import free_numbers, misclosures
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import random_poses
+from minimax_cal.robots.sampling import random_poses
 
 NOISE = 15e-6
 

@@ -84,7 +84,7 @@ def test_backends_agree(backend: str, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("times", "name"),
-    [(4, "simulated"), (8, "irb120"), pytest.param(200, "irb120", marks=pytest.mark.slow)],
+    [(2, "simulated"), (3, "irb120"), pytest.param(200, "irb120", marks=pytest.mark.slow)],
 )
 def test_turning_and_moving_the_frame(times: int, name: str) -> None:
     nominal, data = arm_of(name)

@@ -33,7 +33,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import Prior, pose_weights
 from minimax_cal.modelling.parameters import State, links_of
-from minimax_cal.modelling.simulate import Simulation, Truth, random_poses, simulate
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.sampling import random_poses
 
 NOISE = Noise(0.5, (20e-6) ** 2, 15e-6)
 H = 1e-6  # step of the central differences [m, rad]: errors of 1e-9 relative
@@ -576,22 +577,21 @@ def test_the_equivalent_truth_is_the_arm() -> None:
     same = Cell.of(robot, true.state, arm.target_names)
     assert_allclose(same.predict(q), arm.predict(q), rtol=0, atol=1e-9)
     known = true.identification.active
-    nominal = coverage.along(true.nominal.rotation, replace(true.state, mdh=robot.mdh))
-    found = coverage.along(true.nominal.rotation, true.state)
+    axes = true.nominal.rotation
+    nominal, found = replace(true.state, mdh=robot.mdh).along(axes), true.state.along(axes)
     links = np.arange(len(known)) < 5 * robot.joints
     assert np.array_equal(found[~known & links], nominal[~known & links])
     assert not np.allclose(arm.robot.mdh, true.state.mdh, atol=1e-5)
 
 
-def test_values_of_the_study_are_those_of_the_result(robot: mc.Robot, noisy: Simulation) -> None:
+def test_the_base_is_told_along_the_nominal_axes(robot: mc.Robot, noisy: Simulation) -> None:
     fit = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
-    cell = fit.cell
-    state = cell.state
-    value = coverage.along(fit.nominal.base[:3, :3], state)
-    names = fit.uncertainty.names.all
-    for p in fit.parameters:
-        if p.identifiable:
-            assert value[names.index(p.name)] == pytest.approx(p.value, abs=1e-12)
+    axes, base, told = fit.before.base[:3, :3], fit.cell.base, fit.parameters
+    turn = Rotation.from_matrix(axes.T @ base[:3, :3]).as_rotvec()
+    found = [told[f"base_{name}"].value for name in ("x", "y", "z", "rx", "ry", "rz")]
+    assert_allclose(found, [*axes.T @ base[:3, 3], *turn], rtol=0, atol=1e-12)
+    links = {p.name: p.value for p in told if p.name.startswith("theta")}
+    assert list(links.values()) == fit.robot.mdh[:, 2].tolist()
 
 
 def test_coverage_is_counted(rng: np.random.Generator) -> None:

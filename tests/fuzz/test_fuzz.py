@@ -52,9 +52,12 @@ def test_ten_thousand_hostile_runs_end_well() -> None:
 def test_a_case_comes_again_by_its_number() -> None:
     one, other = case(5, 17), case(5, 17)
     assert (one.arguments, one.files) == (other.arguments, other.files)
-    assert {case(5, number).command for number in range(900)} >= {
-        line.split()[0] for line in TEMPLATES
-    } - {"robots", "backends", "diagnose"}
+    left = {line.split()[0] for line in TEMPLATES} - {"robots", "backends", "diagnose"}
+    for number in range(900):
+        left.discard(case(5, number).command)
+        if not left:
+            break
+    assert not left
 
 
 # ---- the judge is not blind -----------------------------------------------------------------
@@ -183,6 +186,7 @@ KEY = st.sampled_from(
 TREE = st.recursive(
     LEAF,
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEY | st.text(max_size=3), inner),
+    max_leaves=20,
 )
 QUIET = settings(deadline=None, derandomize=True, max_examples=100)
 

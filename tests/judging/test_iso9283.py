@@ -31,7 +31,8 @@ from minimax_cal.judging.iso9283.result import CYCLES
 from minimax_cal.judging.iso9283.visits import stops_of
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements, measurements
-from minimax_cal.modelling.simulate import Simulation, random_poses
+from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.robots.sampling import random_poses
 
 TRIANGLE = np.array([[0.1, 0.0, 0.03], [-0.05, 0.09, 0.03], [-0.05, -0.09, 0.03]])
 EXACT = dict(rtol=0, atol=1e-12)

@@ -104,7 +104,7 @@ def test_derivatives_of_a_blend(robot: mc.Robot, noisy: Simulation) -> None:
     blend, rng = Blend(worst, 0.4), np.random.default_rng(0)
     size = len(worst.scale)
     at = blend.step(worst.start, 0.3 * rng.normal(size=size))
-    here, e, step = blend.linearise(at), rng.normal(size=size), 1e-6
+    here, e, step = blend.linearise(at), rng.normal(size=size), 1e-5
     f, c = blend.evaluate(at)
     assert_allclose(here.f, f, rtol=1e-12)
     assert_allclose(here.c, c, rtol=1e-12)
@@ -244,11 +244,12 @@ def test_a_saved_fit_is_enough(robot: mc.Robot, tmp_path: Path) -> None:
         tradeoff(robot)
 
 
-def test_no_compromise_is_looked_for_where_nothing_fits(robot: mc.Robot, noisy: Simulation) -> None:
+def test_no_compromise_is_looked_for_where_nothing_fits(robot: mc.Robot) -> None:
     """One target mirrored: least squares misses by far, and the worst point took minutes."""
-    y = noisy.data.y.copy()
+    data = simulate(robot, 60, 2, seed=5).data
+    y = data.y.copy()
     y[:, 1, 1] *= -1.0
-    found = tradeoff(robot, noisy.data.with_y(y))
+    found = tradeoff(robot, data.with_y(y))
     assert found.status is Status.FAILED
     assert [choice.objective for choice in found.choices] == ["sum"]
     assert "no calibration" in found.headline()

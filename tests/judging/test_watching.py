@@ -12,9 +12,12 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from experiments.watch import SHIFT, Trial, seen_anew, shifted
 from experiments.watch import run as trial
+from minimax_cal.judging.watching import moved
 from minimax_cal.judging.watching.moved import search
 from minimax_cal.judging.watching.opening import watched_of
-from minimax_cal.modelling.simulate import Simulation, Truth, random_poses, simulate
+from minimax_cal.modelling.effects import EFFECTS
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.sampling import random_poses
 
 TRUTH = Truth(compliance=0.0)
 SIGMAS = 4.0  # that an estimate may be off: one of 16 000 is
@@ -282,3 +285,21 @@ def test_compare_command(
     ur10 = mc.calibrate("scara_600", mc.simulate("scara_600", 30).data, "sum")
     with pytest.raises(mc.OptionError, match="compare calibrations of one arm"):
         mc.compare(fit, ur10)
+
+
+def test_the_pick_explains_most_and_zero_positions_go_first() -> None:
+    every, none = np.ones(3, dtype=bool), np.zeros(3, dtype=bool)
+    first = np.array([True, False, False])
+    square = np.array([30.0, 38.0, 20.0])
+    assert moved.picked(square, every, first)[0] == 0  # a link that is not clearly better
+    clearer = np.array([30.0, 38.0 + moved.CLEARER, 20.0])
+    assert moved.picked(clearer, every, first)[0] == 1
+    assert moved.picked(square, ~first, first)[0] == 1  # the zero position may be chance
+    assert moved.picked(square, every, none)[0] == 1  # no zero position at all: the largest
+    rivals = moved.picked(np.array([30.0, 30.0 - 0.9 * moved.LIKEWISE, -np.inf]), every, none)
+    assert rivals == (0, [1])
+
+
+def test_laws_of_the_session_end_with_it() -> None:
+    ended = {name for name, effect in EFFECTS.items() if effect.of_session}
+    assert ended == {"frame_drift", "session_jump", "target_shift", "target_reseat"}

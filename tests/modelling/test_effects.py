@@ -10,13 +10,16 @@ from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects import EFFECTS, Scene, Term
 from minimax_cal.modelling.effects.scene import Columns
 from minimax_cal.modelling.effects.table import Fitted, fitted_from_list, terms
 from minimax_cal.modelling.effects.time import ROOM
-from minimax_cal.modelling.simulate import random_poses
-from minimax_cal.robots.gravity import G
+from minimax_cal.modelling.simulate import gravity
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import MASS_PER_METRE, G
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_poses
 
 DOCS = ROOT / "docs" / "effects.md"
 EXACT = 1e-12  # relative: the same arithmetic by another way
@@ -484,3 +487,26 @@ def test_an_offset_lies_on_the_line_of_sight() -> None:
         turned = np.einsum("ij,kjm->kim", rotation, shift)
         assert_allclose(turned[chosen], away[chosen], rtol=0, atol=EXACT)
         assert not np.delete(turned, chosen, axis=0).any()
+
+
+@pytest.mark.parametrize("name", ["irb2600", "ur10", "scara_600", "meca500"])
+def test_the_simulator_has_the_gravity_of_the_laws(name: str, rng: np.random.Generator) -> None:
+    """Whether masses are told or those of tubes, each of which hangs midway between its ends."""
+    robot = mc.load_robot(name)
+    n, signs = robot.joints, rng.choice([-1.0, 1.0], robot.joints)
+    told = replace(robot, mass=rng.uniform(1, 40, n), com=rng.normal(size=(n, 3)), sign=signs)
+    for arm in (robot, told):
+        q = random_poses(arm, 20, rng)
+        scene = Cell(arm, np.eye(4), ("smr1",), np.zeros((1, 3))).scene(still(q, ("smr1",), arm))
+        assert_allclose(gravity(arm, q), scene.gravity.T * arm.sign, rtol=0, atol=EXACT * 1e4)
+    mass = MASS_PER_METRE * np.linalg.norm(robot.mdh[:, :2], axis=1)
+
+    def energy(q: Array) -> Array:
+        ends = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic).after
+        middle = 0.5 * (ends + np.concatenate([0.0 * ends[:1], ends[:-1]]))
+        return np.asarray(G * np.einsum("n,ncm,c->m", mass, middle, robot.up))
+
+    for j in np.flatnonzero(~robot.prismatic):
+        slope = energy(random_poses(robot, 5, np.random.default_rng(1)) + 1e-30j * np.eye(n)[j])
+        found = gravity(robot, random_poses(robot, 5, np.random.default_rng(1)))[:, j]
+        assert_allclose(found, -slope.imag / 1e-30, rtol=0, atol=EXACT * 1e4)

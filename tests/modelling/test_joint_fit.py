@@ -22,9 +22,9 @@ from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import Model, SumOfSquares, model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import random_poses
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_poses
 from minimax_cal.solvers.least_squares import METHODS, examine
 
 EXAMPLE = ROOT / "examples" / "own_effect.py"

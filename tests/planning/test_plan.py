@@ -22,7 +22,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
-from minimax_cal.modelling.simulate import gravity, random_poses
+from minimax_cal.modelling.simulate import gravity
 from minimax_cal.planning import plan as module
 from minimax_cal.planning import separating, task
 from minimax_cal.planning.designs.criteria import (
@@ -51,6 +51,7 @@ from minimax_cal.planning.prospect import (
 )
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import lengths, shortest, travel, visits
+from minimax_cal.robots.sampling import random_poses
 
 ROUNDING = 1e-9  # relative: the same numbers by other algebra
 SOLVER = 4e-3  # relative: between a relaxation and its bound, which is asked to be 3e-3

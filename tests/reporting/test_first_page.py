@@ -7,7 +7,9 @@ from conftest import run
 from test_report import WORDING, Seen, results
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.judging.tolerance import limits_of
+from minimax_cal.reporting import report
 from minimax_cal.reporting.html import compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
@@ -19,7 +21,7 @@ __all__ = ["results"]  # the fixture
 def whole(results: Path) -> Path:
     """The calibration with the effects of the diagnosis."""
     path = results / "whole.json"
-    mc.calibrate("ur10", results / "poses.csv", effects=results / "gap.json").save(path)
+    mc.calibrate("ur10", results / "poses.csv", "sum", effects=results / "gap.json").save(path)
     return path
 
 
@@ -86,7 +88,7 @@ def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None
 
 
 def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
-    gap = mc.Diagnosis.from_dict(mc.diagnose("ur10", results / "poses.csv").to_dict())
+    gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
         found = rows(rendered(wording, results / "gap.json"))["RMS, within measured poses"]
@@ -142,7 +144,14 @@ def browser() -> None:
 
 
 @pytest.mark.usefixtures("browser")
-def test_paper_and_picture_by_the_ending(results: Path, tmp_path: Path) -> None:
-    for name, start in (("page.pdf", b"%PDF"), ("page.png", b"\x89PNG")):
-        assert run("report", results / "fit.json", "-o", tmp_path / name) == 0
-        assert (tmp_path / name).read_bytes().startswith(start)
+def test_paper_and_picture_by_the_ending(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run("report", results / "fit.json", "-o", tmp_path / "page.png") == 0
+    assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+    printed: list[tuple[str, Path]] = []  # by a browser in `test_pdf_holds_the_whole_report`
+    monkeypatch.setattr(report, "print_pdf", lambda page, path, _: printed.append((page, path)))
+    assert run("report", results / "fit.json", "-o", tmp_path / "page.pdf") == 0
+    ((text, path),) = printed
+    assert path == tmp_path / "page.pdf"
+    assert "accuracy" in Seen(text).text

@@ -3,9 +3,7 @@
 import io
 import json
 import re
-import shutil
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,35 +19,10 @@ from minimax_cal.judging.tolerance import limits_of
 from minimax_cal.reporting.html import compose, read_sources, render
 from minimax_cal.reporting.html.content import Figure
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
-)
-DRIVER = shutil.which("chromedriver") or ""
-pytestmark = pytest.mark.skipif(
-    not (BROWSER and DRIVER), reason="no Chromium with its chromedriver on this machine"
-)
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-gpu",
-    "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--window-size=1100,1400",
-)  # fmt: skip
 A4 = (680, 993)  # pixels between the margins
 PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
 
 __all__ = ["results"]  # the fixture
-
-
-@pytest.fixture(scope="module")
-def driver() -> Iterator[Any]:
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    service = webdriver.ChromeService(DRIVER)
-    found = webdriver.Chrome(options=options, service=service)
-    yield found
-    found.quit()
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +188,40 @@ def test_paper_is_light_and_shows_the_still_view(opened: Any) -> None:
     assert opened.execute_script(shown, ".view .flat") == "none"
 
 
+def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
+    """As wide as a phone, light and dark: nothing stands out of the page."""
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    time.sleep(0.5)
+    wide = "return [document.documentElement.scrollWidth, innerWidth]"
+    width, room = opened.execute_script(wide)
+    button = "const b = document.getElementById('theme').getBoundingClientRect(),"
+    button += " h = document.querySelector('h1').getBoundingClientRect();"
+    clear = opened.execute_script(button + "return b.bottom <= h.top || b.left >= h.right")
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert width <= room
+    assert clear
+
+
+def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
+    found = opened.execute_async_script(
+        """
+        const done = arguments[arguments.length - 1], broken = [];
+        document.addEventListener("securitypolicyviolation", (e) =>
+          broken.push(e.effectiveDirective));
+        const script = document.createElement("script");
+        script.textContent = "window.intruder = 1";
+        document.body.append(script);
+        new Image().src = "http://127.0.0.1:9/x.png";
+        fetch("http://127.0.0.1:9/").catch(() => {}).finally(() =>
+          setTimeout(() => done([window.intruder ?? 0, broken]), 200));
+        """
+    )
+    assert found[0] == 0
+    assert set(found[1]) == {"script-src-elem", "img-src", "connect-src"}
+    opened.get_log("browser")
+
+
 def test_the_first_page_is_one_sheet_with_all_that_is_signed(
     driver: Any, results: Path, tmp_path: Path
 ) -> None:
@@ -244,21 +251,6 @@ def test_the_first_page_is_one_sheet_with_all_that_is_signed(
     assert "Contents" not in text
 
 
-def test_narrow_pages_scroll_in_their_tables_alone(opened: Any) -> None:
-    """As wide as a phone, light and dark: nothing stands out of the page."""
-    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    time.sleep(0.5)
-    wide = "return [document.documentElement.scrollWidth, innerWidth]"
-    width, room = opened.execute_script(wide)
-    button = "const b = document.getElementById('theme').getBoundingClientRect(),"
-    button += " h = document.querySelector('h1').getBoundingClientRect();"
-    clear = opened.execute_script(button + "return b.bottom <= h.top || b.left >= h.right")
-    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert width <= room
-    assert clear
-
-
 def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -> None:
     """The table that is signed needs no scrolling, no button lies on a legend, maps have room."""
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
@@ -270,29 +262,9 @@ def test_a_phone_shows_the_verdict_and_charts_whole(driver: Any, folder: Path) -
         " document.querySelectorAll('.modebar-btn').length, map.getBoundingClientRect().width]"
     )
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    open_page(driver, folder / "good.html")
     assert table <= 390
     assert bars == 0
     assert map_wide > 195  # half of the screen; names and scale beside it had left it 40
-
-
-def test_the_page_itself_forbids_scripts_and_requests(opened: Any) -> None:
-    found = opened.execute_async_script(
-        """
-        const done = arguments[arguments.length - 1], broken = [];
-        document.addEventListener("securitypolicyviolation", (e) =>
-          broken.push(e.effectiveDirective));
-        const script = document.createElement("script");
-        script.textContent = "window.intruder = 1";
-        document.body.append(script);
-        new Image().src = "http://127.0.0.1:9/x.png";
-        fetch("http://127.0.0.1:9/").catch(() => {}).finally(() =>
-          setTimeout(() => done([window.intruder ?? 0, broken]), 200));
-        """
-    )
-    assert found[0] == 0
-    assert set(found[1]) == {"script-src-elem", "img-src", "connect-src"}
-    opened.get_log("browser")
 
 
 def test_hostile_names_are_shown_and_do_nothing(driver: Any, folder: Path) -> None:

@@ -10,7 +10,8 @@ import minimax_cal as mc
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.table import Fitted, Term
 from minimax_cal.modelling.reach import arm_of, bent
-from minimax_cal.modelling.simulate import Simulation, random_poses
+from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.robots.sampling import random_poses
 
 THERE = 1e-7  # of a pose [m, and what turns a point at the lever so far]
 

@@ -1,14 +1,13 @@
 """The page in a real browser: from dropped files to a passed report and a robot to take away."""
 
 import json
-import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from browsing import browsing
 from conftest import run, shared
 from numpy.testing import assert_allclose
 from served import PATIENCE, Served
@@ -16,19 +15,6 @@ from served import PATIENCE, Served
 import minimax_cal as mc
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-BROWSER = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
-)
-DRIVER = shutil.which("chromedriver") or ""
-pytestmark = pytest.mark.skipif(
-    not (BROWSER and DRIVER), reason="no Chromium with its chromedriver on this machine"
-)
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-gpu",
-    "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--window-size=1300,1000",
-    "--force-prefers-reduced-motion",
-)  # fmt: skip
 PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
 POSES, TARGETS = 30, 2
 DIGITS = 1e-8  # of measurements that import writes: half a nanometre and a nanoradian [m]
@@ -40,33 +26,6 @@ Object.defineProperty(input, "files", { value: [file], configurable: true });
 input.dispatchEvent(new Event("change", { bubbles: true }));
 delete input.files;
 """
-
-
-@contextmanager
-def browsing(downloads: Path) -> Iterator[Any]:
-    """A browser of its own; what it keeps goes to a folder."""
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    found = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    try:
-        yield found
-    finally:
-        found.quit()
-
-
-@pytest.fixture(scope="module")
-def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("downloads")
-
-
-@pytest.fixture(scope="module")
-def driver(downloads: Path) -> Iterator[Any]:
-    with browsing(downloads) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -166,15 +125,23 @@ def same_as_the_command_line(folder: Path, robot: str, elsewhere: Path) -> None:
 # ---- the whole way -------------------------------------------------------------------------------
 
 
-def test_from_dropped_files_to_a_passed_report(
-    driver: Any, server: Served, poses: Path, downloads: Path, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def fitted(driver: Any, server: Served, poses: Path) -> Any:
+    """The browser with a session that was dropped and fitted; tests leave it so."""
+    severe(driver), asked(driver)  # of pages before
     begin(driver, server, "Cell 7")
     drop(driver, "measured", poses)
     wait_for(driver, "read")
     assert f"{POSES} poses, 6 joints" in one(driver, "[data-panel=understood]").text
     one(driver, "#robot-choice [value=irb120]").click()
     do(driver, "fit", "#fit")
+    return driver
+
+
+def test_from_dropped_files_to_a_passed_report(
+    fitted: Any, server: Served, downloads: Path, tmp_path: Path
+) -> None:
+    driver = fitted
     folder = session_of(driver, server)
     same_as_the_command_line(folder, "irb120", tmp_path)
     line = f"minimax-cal calibrate irb120 {'poses.csv'} --objective minimax -o fit.json"
@@ -217,7 +184,8 @@ def unticked(driver: Any) -> tuple[str, str]:
     return line, target
 
 
-def test_a_point_can_be_unticked_and_taken_back(driver: Any) -> None:
+def test_a_point_can_be_unticked_and_taken_back(fitted: Any) -> None:
+    driver = fitted
     line, target = unticked(driver)
     assert f"--leave-out={line}:{target} -o used.csv" in one(driver, "[data-said=fit]").text
     assert one(driver, "#points tr.out").get_attribute("id") == f"point-{line}-{target}"
@@ -226,7 +194,8 @@ def test_a_point_can_be_unticked_and_taken_back(driver: Any) -> None:
     assert severe(driver) == []
 
 
-def test_what_is_too_large_is_refused_by_the_page(driver: Any, server: Served) -> None:
+def test_what_is_too_large_is_refused_by_the_page(fitted: Any, server: Served) -> None:
+    driver = fitted
     driver.execute_script(HUGE)
     problem = one(driver, "#problem")
     until(problem.is_displayed, "nothing was said")
@@ -234,7 +203,8 @@ def test_what_is_too_large_is_refused_by_the_page(driver: Any, server: Served) -
     assert not (session_of(driver, server) / "given" / "huge.csv").exists()
 
 
-def test_a_phone_shows_all_of_it(driver: Any) -> None:
+def test_a_phone_shows_all_of_it(fitted: Any) -> None:
+    driver = fitted
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
     time.sleep(0.5)
     wide = driver.execute_script("return [document.documentElement.scrollWidth, innerWidth]")

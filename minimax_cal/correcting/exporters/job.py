@@ -13,6 +13,7 @@ from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
+from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
@@ -103,7 +104,7 @@ def compliance_of(cell: Cell) -> Array:
     out = np.full(cell.robot.joints, np.nan)
     scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
-        if term.effect == "joint_compliance":
+        if term.effect == JOINT_COMPLIANCE.name:
             for name, value in zip(term.columns(scene).names, values, strict=True):
                 if name[1:].isdigit():
                     out[int(name[1:]) - 1] = value

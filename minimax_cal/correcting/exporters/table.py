@@ -18,6 +18,7 @@ from minimax_cal.correcting.exporters import (
 )
 from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
 
 
 def mjcf(job: Job) -> Export:
@@ -64,4 +65,4 @@ def is_written(job: Job, label: str) -> bool:
     """Whether MOC.cfg holds an effect: the compliance of joints, where each has one number."""
     name, _, place = label.partition(":")
     numbers = job.compliance if place == "all" else job.compliance[int(place[1:]) - 1 :][:1]
-    return name == "joint_compliance" and bool((numbers == numbers).any())
+    return name == JOINT_COMPLIANCE.name and bool((numbers == numbers).any())

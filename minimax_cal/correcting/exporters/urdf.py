@@ -17,7 +17,7 @@ from minimax_cal.correcting.exporters.job import (
     triple,
 )
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.gravity import LEAST_MASS, inertia_of, tubes
+from minimax_cal.robots.gravity import LEAST_MASS, inertia_of, masses_of, weighed
 from minimax_cal.robots.robot import LONGEST, Robot
 from minimax_cal.robots.transforms import tail, to_rpy
 from minimax_cal.robots.urdf_file import ASSUMED
@@ -36,7 +36,7 @@ def write(job: Job) -> Export:
 def assumptions(robot: Robot) -> str:
     """What of masses and inertias nobody told, in a sentence."""
     inertias = "inertias are assumed: of solid bodies as long as the links"
-    if np.isfinite(robot.mass).all() and np.isfinite(robot.com).all():
+    if weighed(robot).all():
         return inertias
     return f"masses that the robot file does not tell are assumed (uniform tubes), and {inertias}"
 
@@ -81,16 +81,14 @@ def limit(lower: float, upper: float, kind: str) -> str:
 
 def body(robot: Robot, i: int, name: str) -> str:
     """A <link> with its mass, as the robot tells it or assumed; simulators refuse one without."""
-    told = bool(np.isfinite(robot.mass[i]) and np.isfinite(robot.com[i]).all())
-    tube, halfway = tubes(robot.mdh)
-    mass = max(float(robot.mass[i] if told else tube[i]), LEAST_MASS)
-    com = robot.com if told else halfway
+    masses, com = masses_of(robot, LEAST_MASS)
+    mass = float(masses[i])
     size = number(inertia_of(robot.mdh, i, mass))
     inertia = f'ixx="{size}" ixy="0" ixz="0" iyy="{size}" iyz="0" izz="{size}"'
     return "\n".join(
         [
             f'  <link name="{name}">',
-            "    <inertial>" if told else f'    <inertial {ASSUMED}="true">',
+            "    <inertial>" if weighed(robot)[i] else f'    <inertial {ASSUMED}="true">',
             f'      <origin xyz="{triple(in_link(replace(robot, com=com), i))}" rpy="0 0 0"/>',
             f'      <mass value="{number(mass)}"/>',
             f"      <inertia {inertia}/>",

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.robots.transforms import transform
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 LONGEST = 40  # letters of a number
@@ -108,18 +110,9 @@ def of_quaternion(q: Array, where: str) -> Array:
     size = float(np.linalg.norm(q))
     if abs(size - 1.0) > 1e-3:
         raise DataError(f"{where}: the quaternion has length {size:.4g}; it must be 1")
-    w, x, y, z = q / size
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat(np.roll(q, -1)).as_matrix())  # it wants w last
 
 
 def posed(place: Array, turn: Array) -> Array:
     """(4, 4) of a place (3,) [mm] and a rotation."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, 1e-3 * place
-    return pose
+    return transform(turn, 1e-3 * place)

@@ -127,10 +127,10 @@ def frame_of(given: str, known: dict[str, Array], option: str) -> Array:
     if len(numbers) != 7 or not np.isfinite(numbers).all():
         there = f" ({', '.join(known)})" if known else ""
         raise OptionError(
-            f"--{option} {given!r}: give x,y,z,q1,q2,q3,q4 in mm, or a name declared there{there}"
+            f"{option}={given!r}: give x,y,z,q1,q2,q3,q4 in mm, or a name declared there{there}"
         )
     try:
-        return posed(numbers[:3], of_quaternion(numbers[3:], f"--{option}"))
+        return posed(numbers[:3], of_quaternion(numbers[3:], f"{option}={given!r}"))
     except DataError as error:
         raise OptionError(str(error)) from error
 

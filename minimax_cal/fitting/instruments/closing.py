@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.fitting.identify import random_joints
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.inverse import missing, nearest
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_joints
+from minimax_cal.robots.transforms import transform
 
 LONGEST = 0.5  # step of a joint [rad, m]
 CLOSED = 1e-9  # a gap below this counts as none [m]
@@ -21,8 +22,7 @@ def reach(
     ball: (3,) in the last frame [m].  goal: (m, 3) in the base [m].  q: (m, n) where to start
     [rad, m].  Damped Newton with steps of least norm; what cannot be reached ends nearby.
     """
-    place = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-    place[:, :3, 3] = goal
+    place = transform(np.eye(3), goal)
 
     def look(rows: Array, here: Array) -> tuple[Array, Array]:
         signs = robot.sign

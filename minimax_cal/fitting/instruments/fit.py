@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.fit import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
 from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified
@@ -25,7 +25,7 @@ from minimax_cal.fitting.instruments.start import ball_start, wire_start
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
@@ -183,33 +183,14 @@ def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
     return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
 
 
-def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
+def parameters_of(fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
     """Every parameter, link by link; then target, anchors and, where fitted, offsets."""
-    names, n = fit.instrument.names, robot.joints
-
-    def values(x: State) -> Array:
-        return np.concatenate(
-            [links_of(x.mdh), np.zeros(6), x.target_positions.reshape(-1), x.effects]
-        )
-
-    before, after = values(fit.nominal), values(fit.state)
+    names = fit.instrument.names
+    before, after = (x.along(np.eye(3)) for x in (fit.nominal, fit.state))
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    order = [kind * n + joint for joint in range(n) for kind in range(5)]
-    order += range(5 * n + 6, names.count)
-    active = fit.identification.active
-    return tuple(
-        Parameter(
-            name=names.all[i],
-            value=float(after[i]),
-            nominal=float(before[i]),
-            sigma=float(sigma[i]),
-            unit="m" if names.linear[i] else "rad",
-            identifiable=bool(active[i]),
-            reason=fit.identification.reasons.get(names.all[i], ""),
-        )
-        for i in order
-        if offset or not names.all[i].startswith("offset")
-    )
+    hidden = ("base_",) if offset else ("base_", "offset")
+    every = link_by_link(names, names.units, before, after, sigma, fit.identification)
+    return tuple(p for p in every if not p.name.startswith(hidden))
 
 
 def placed(fit: InstrumentFit, data: RelativeData, options: RelativeOptions) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def from_instrument(
         status=fitted.found.status[0],
         iterations=int(fitted.found.iterations[0]),
         seconds=time.perf_counter() - began,
-        parameters=fit.parameters_of(robot, fitted, offset=options.offset),
+        parameters=fit.parameters_of(fitted, offset=options.offset),
         errors=fit.errors_of(robot, fitted, data, held),
         numbers=fit.count_numbers(data, held),
         turns={},

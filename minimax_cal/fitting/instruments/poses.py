@@ -20,7 +20,6 @@ from minimax_cal.fitting.fit import Fit, Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, wishes
 from minimax_cal.fitting.instruments.split import before_and_after
-from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.measurements import Measurements
@@ -29,6 +28,7 @@ from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import hat, rotation_vector
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import nearest_rotation, transform
 from minimax_cal.solvers.least_squares import solve_normal
 
 LEVER = 0.1  # where nothing tells the ratio of the noises [m]
@@ -74,9 +74,7 @@ def lever_of(data: RelativeData, lever: float | None) -> tuple[float, str]:
 def tool_of(cell: Cell, spots: Array) -> Array:
     """Pose (4, 4) of the measured frame in the flange that fits the reflectors best [m]."""
     centre = cell.target_positions.mean(axis=0)
-    tool = np.eye(4)
-    tool[:3, :3], tool[:3, 3] = project((cell.target_positions - centre).T @ spots), centre
-    return tool
+    return transform(nearest_rotation((cell.target_positions - centre).T @ spots), centre)
 
 
 def pose_errors(cell: Cell, tool: Array, data: RelativeData) -> tuple[Array, Array]:

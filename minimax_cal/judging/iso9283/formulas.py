@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from minimax_cal.fitting.start import project
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.transforms import nearest_rotation
 
 FLAT = 0.02  # targets whose triangle is flatter than this are on a line, as in `gates.collinear`
 
@@ -70,7 +70,7 @@ def turns_of(shape: Array, points: Array) -> Array:
     if len(shape) < 3 or size[1] <= FLAT * size[0] or not whole.any():
         return out
     centred = points[whole] - points[whole].mean(axis=1, keepdims=True)
-    out[whole] = project(np.einsum("vka,kb->vab", centred, own))
+    out[whole] = nearest_rotation(np.einsum("vka,kb->vab", centred, own))
     return out
 
 
@@ -104,7 +104,7 @@ def mean_turn(turn: Array, group: Array, count: int) -> Array:
     """The rotation nearest to those of each group: (count, 3, 3), NaN where none is known."""
     total = mean_of(turn, group, count)
     known = np.isfinite(total[:, 0, 0])
-    total[known] = project(total[known])
+    total[known] = nearest_rotation(total[known])
     return total
 
 

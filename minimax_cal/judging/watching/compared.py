@@ -7,7 +7,8 @@ from typing import Any
 
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Table
-from minimax_cal.judging.watching.moved import joint_of
+from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 
 
@@ -38,19 +39,14 @@ class Difference:
     @property
     def scale(self) -> tuple[float, str]:
         """As people read it."""
-        return (1e3, "mm") if self.unit == "m" else (1e3, "mrad")
+        return for_people(self.unit)
 
-
-@dataclass(frozen=True)
-class Changed:
-    """A parameter whose change explains what differs.  others: would explain it nearly as well."""
-
-    parameter: str
-    by: float
-    sigma: float
-    unit: str
-    p_value: float
-    others: tuple[str, ...]
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: lengths in mm, angles in rad."""
+        scale, unit = in_files(self.unit)
+        told = {"parameter": self.parameter, "unit": unit, "a": scale * self.a, "b": scale * self.b}
+        told |= {"by": scale * self.by, "sigma": scale * self.sigma, "sigmas": self.sigmas}
+        return told | ({"reason": self.reason} if self.reason else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +61,7 @@ class Comparison:
     names: tuple[str, str]
     robot: str
     differences: tuple[Difference, ...]
-    changed: tuple[Changed, ...]
+    changed: tuple[Moved, ...]
     accuracy: tuple[tuple[str, Accuracy, Accuracy], ...]
     same: float
     notices: tuple[str, ...]
@@ -73,7 +69,7 @@ class Comparison:
     @property
     def joints(self) -> tuple[str, ...]:
         """That changed, as J3."""
-        return tuple(dict.fromkeys(joint_of(c.parameter) for c in self.changed))
+        return tuple(dict.fromkeys(c.joint for c in self.changed))
 
     def headline(self) -> str:
         """The result in a sentence or two."""
@@ -81,23 +77,13 @@ class Comparison:
         if not self.changed:
             return f"{self.robot}: no joint differs between {a} and {b} by more than chance allows."
         told = ", ".join(
-            f"{c.parameter} by {1e3 * c.by:+.3f} {'mm' if c.unit == 'm' else 'mrad'}"
-            for c in self.changed
+            f"{c.parameter} by {1e3 * c.by:+.3f} {for_people(c.unit)[1]}" for c in self.changed
         )
         return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
 
     def tables(self) -> tuple[Table, ...]:
         """Which joints changed, accuracy on common poses, every parameter."""
-        changed = Table(
-            "what explains the differences",
-            ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
-            tuple(
-                (c.parameter, joint_of(c.parameter), "mm" if c.unit == "m" else "mrad",
-                 1e3 * c.by, 1e3 * c.sigma, c.p_value, ", ".join(c.others))
-                for c in self.changed
-            ),
-            ("", "", "", "+.4f", ".2g", ".2g", ""),
-        )  # fmt: skip
+        changed = moved_table("what explains the differences", self.changed)
         common = Table(
             "the same poses, base and reflectors placed anew",
             ("poses", "count", "A RMS mm", "A max mm", "B RMS mm", "B max mm"),
@@ -125,24 +111,6 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: lengths in mm, angles in rad."""
-
-        def unit(each: Difference | Changed) -> tuple[float, str]:
-            return (1e3, "mm") if each.unit == "m" else (1.0, each.unit)
-
-        def difference(d: Difference) -> dict[str, Any]:
-            scale, name = unit(d)
-            told = {"parameter": d.parameter, "unit": name, "a": scale * d.a, "b": scale * d.b}
-            told |= {"by": scale * d.by, "sigma": scale * d.sigma, "sigmas": d.sigmas}
-            return told | ({"reason": d.reason} if d.reason else {})
-
-        def changed(c: Changed) -> dict[str, Any]:
-            scale, name = unit(c)
-            return {
-                "parameter": c.parameter, "joint": joint_of(c.parameter), "by": scale * c.by,
-                "sigma": scale * c.sigma, "unit": name, "p_value": c.p_value,
-                "alternatives": list(c.others),
-            }  # fmt: skip
-
         return dict(
             plain(
                 {
@@ -151,9 +119,9 @@ class Comparison:
                     "robot": self.robot,
                     "a": self.names[0],
                     "b": self.names[1],
-                    "changed": [changed(c) for c in self.changed],
+                    "changed": [c.to_dict() for c in self.changed],
                     "p_value_nothing_changed": self.same,
-                    "parameters": [difference(d) for d in self.differences],
+                    "parameters": [d.to_dict() for d in self.differences],
                     "accuracy": [
                         {"poses": where, "a": one.to_dict(), "b": other.to_dict()}
                         for where, one, other in self.accuracy

@@ -20,12 +20,12 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.judging.watching.compared import Changed, Comparison, Difference
-from minimax_cal.judging.watching.moved import CLEARER, LEVEL, LIKEWISE, MOST, ZEROS
+from minimax_cal.judging.watching.compared import Comparison, Difference
+from minimax_cal.judging.watching.moved import MOST, Moved, levels, picked
 from minimax_cal.judging.watching.opening import watched_of
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import links_of
+from minimax_cal.modelling.parameters import links_of, zero_positions
 from minimax_cal.solvers.least_squares import solve_normal
 
 TINY = 1e-300  # in place of a zero
@@ -54,13 +54,13 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     value = [drawn + turn @ (links_of(fit.robot.mdh) - drawn) for fit in fits]
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
     told = [told_by(fit, kept, n) for fit in fits]
-    listed = tuple(differences(one, value, np.asarray(covariance), kept, told))
-    free = np.flatnonzero([not d.reason for d in listed_by_column(listed, n)])
+    each = tuple(differences(one, value, np.asarray(covariance), kept, told))
+    free = np.flatnonzero([not d.reason for d in each])
     found, same = explained(one, value[1] - value[0], np.asarray(covariance), free)
     return Comparison(
         names=(names[0], names[1]),
         robot=one.robot.name,
-        differences=listed,
+        differences=tuple(each[i] for i in one.known.names.link_by_link[: 5 * n]),
         changed=found,
         accuracy=tuple(on_common(one, other)),
         same=same,
@@ -124,10 +124,9 @@ def told_by(fit: Fit, kept: Array, joints: int) -> Array:
 def differences(
     fit: Fit, value: list[Array], covariance: Array, kept: Array, told: list[Array]
 ) -> Iterator[Difference]:
-    """Every link parameter, link by link."""
-    n = fit.robot.joints
-    names, sigma = fit.known.names.all, np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    for i in (kind * n + joint for joint in range(n) for kind in range(5)):
+    """Every link parameter, in the order of `Names`."""
+    names, sigma = fit.known.names, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    for i in range(len(sigma)):
         missing = [which for which, known in zip("AB", told, strict=True) if not known[i]]
         reason = ""
         if i in kept:
@@ -135,35 +134,27 @@ def differences(
         elif missing or sigma[i] == 0.0:
             reason = f"not identified in {' and '.join(missing) or 'A and B'}"
         size = math.nan if reason else float(sigma[i])
-        unit = "m" if i < 2 * n else "rad"
-        yield Difference(names[i], unit, float(value[0][i]), float(value[1][i]), size, reason)
-
-
-def listed_by_column(listed: tuple[Difference, ...], n: int) -> list[Difference]:
-    """The same in the order of the columns."""
-    return [listed[joint * 5 + kind] for kind in range(5) for joint in range(n)]
+        yield Difference(
+            names.all[i], names.units[i], float(value[0][i]), float(value[1][i]), size, reason
+        )
 
 
 def explained(
     fit: Fit, change: Array, covariance: Array, free: Array
-) -> tuple[tuple[Changed, ...], float]:
+) -> tuple[tuple[Moved, ...], float]:
     """Which parameters' changes explain all differences, the clearest first; chance of none.
 
     free: (c,) those that can be compared.  A parameter counts by what it explains of the whole
     [Rao 1948]; the level is shared among all, zero positions first.
     """
-    n, names = fit.robot.joints, fit.known.names.all
-    zeros = np.arange(n) + np.where(fit.robot.prismatic, n, 2 * n)
+    names = fit.known.names
     if not len(free):
         return (), math.nan
     sigma = np.sqrt(np.diag(covariance)[free])
     inverse = np.linalg.pinv(
         covariance[np.ix_(free, free)] / np.outer(sigma, sigma), rcond=SMALLEST, hermitian=True
     )
-    off, is_zero = change[free] / sigma, np.isin(free, zeros)
-    shares = np.where(
-        is_zero, ZEROS / max(is_zero.sum(), 1), (1 - ZEROS) / max((~is_zero).sum(), 1)
-    )
+    off, is_zero = change[free] / sigma, np.isin(free, zero_positions(fit.robot.prismatic))
     total = float(off @ inverse @ off)
     same = float(stats.chi2.sf(total, np.linalg.matrix_rank(inverse)))
     chosen: list[int] = []
@@ -174,29 +165,23 @@ def explained(
         rest = inverse - columns @ solve_normal(gram, columns.T)
         score, size = rest @ off, np.diag(rest)
         open_ = (size > SMALLEST * np.diag(inverse)) & ~np.isin(np.arange(len(free)), chosen)
-        square = np.where(open_, score**2 / np.where(open_, size, 1.0), 0.0)
+        square = np.where(open_, score**2 / np.where(open_, size, 1.0), -np.inf)
         p_value = np.asarray(stats.chi2.sf(square, 1))
-        passed = p_value <= LEVEL * shares
+        passed = p_value <= levels(is_zero)
         if not passed.any():
             break
-        zero, link = (
-            int(np.argmax(np.where(passed & k, square, -1.0))) for k in (is_zero, ~is_zero)
-        )
-        better = passed[link] and square[link] > square[zero] + CLEARER
-        pick = link if better or not passed[zero] else zero
-        lost = square[pick] - square
-        near = [i for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick and open_[i]]
+        pick, near = picked(square, passed, is_zero)
         chosen.append(pick)
-        told.append((float(p_value[pick]), tuple(names[free[i]] for i in near)))
+        told.append((float(p_value[pick]), tuple(names.all[free[i]] for i in near)))
     spread = np.linalg.inv(inverse[np.ix_(chosen, chosen)]) if chosen else np.zeros((0, 0))
     by = (spread @ (inverse[chosen] @ off)) * sigma[chosen]
     sure = np.sqrt(np.diag(spread)) * sigma[chosen]
     return tuple(
-        Changed(
-            names[free[i]],
+        Moved(
+            names.all[free[i]],
             float(by[row]),
             float(sure[row]),
-            "m" if free[i] < 2 * n else "rad",
+            names.units[free[i]],
             *told[row],
         )
         for row, i in enumerate(chosen)

@@ -7,13 +7,17 @@ among all parameters that are looked at [Bonferroni].
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.watching.watched import Rows, Watched
 from minimax_cal.modelling.parameters import links_of
 from minimax_cal.solvers.least_squares import solve_normal
@@ -45,10 +49,50 @@ class Moved:
         """Its joint, as J3."""
         return joint_of(self.parameter)
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: lengths in mm, angles in rad."""
+        scale, unit = in_files(self.unit)
+        return {
+            "parameter": self.parameter, "joint": self.joint, "by": scale * self.by,
+            "sigma": scale * self.sigma, "unit": unit, "p_value": self.p_value,
+            "alternatives": list(self.others),
+        }  # fmt: skip
+
+
+def moved_table(title: str, moved: Sequence[Moved]) -> Table:
+    """What moved, in mm and mrad."""
+    return Table(
+        title,
+        ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
+        tuple(
+            (m.parameter, m.joint, for_people(m.unit)[1], 1e3 * m.by, 1e3 * m.sigma, m.p_value,
+             ", ".join(m.others))
+            for m in moved
+        ),
+        ("", "", "", "+.4f", ".2g", ".2g", ""),
+    )  # fmt: skip
+
 
 def joint_of(parameter: str) -> str:
     """The joint of a link's parameter, as J3."""
     return "J" + parameter.lstrip("abcdefghijklmnopqrstuvwxyz")
+
+
+def levels(zero: Array) -> Array:
+    """(c,) chance that each parameter is named where nothing moved; zero: (c,) as `Candidates`."""
+    counts = [max(int(kind.sum()), 1) for kind in (zero, ~zero)]
+    return LEVEL * np.where(zero, ZEROS / counts[0], (1.0 - ZEROS) / counts[1])
+
+
+def picked(square: Array, passed: Array, zero: Array) -> tuple[int, list[int]]:
+    """The one of those that passed that explains most, and which would do nearly as well.
+
+    A zero position goes before links that are not clearly better.  square: (c,) what each explains,
+    in squared sigmas, -inf where it is not asked.  passed, zero: (c,).
+    """
+    pick = int(np.argmax(np.where(passed, square + CLEARER * zero, -np.inf)))
+    lost = square[pick] - square
+    return pick, [int(i) for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +119,7 @@ class Candidates:
         others = np.setdiff1d(np.flatnonzero(links & watched.names.links), zeros)
         kinds = [kind[rows.share(kind, watched.open) > APART] for kind in (zeros, others)]
         zero = np.repeat([True, False], [len(kind) for kind in kinds])
-        shares = np.where(
-            zero, ZEROS / max(len(kinds[0]), 1), (1.0 - ZEROS) / max(len(kinds[1]), 1)
-        )
-        return Candidates(np.concatenate(kinds), zero, LEVEL * shares, np.ones(len(zero)))
+        return Candidates(np.concatenate(kinds), zero, levels(zero), np.ones(len(zero)))
 
     def without(self, chosen: list[int]) -> Candidates:
         """Fewer."""
@@ -115,22 +156,13 @@ class Candidates:
         return replace(self, wider=np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
 
     def clearest(self, rows: Rows) -> tuple[int, float, tuple[int, ...]] | None:
-        """The one that explains most, its p-value and its rivals; None where all may be chance.
-
-        A zero position goes before links that are not clearly better.
-        """
+        """The one that explains most, its p-value and its rivals; None where all may be chance."""
         size, dof = self.sizes(rows)
         p_value = np.asarray(2.0 * stats.t.sf(size, dof))
         passed = p_value <= self.level
         if not passed.any():
             return None
-        zero, link = (
-            int(np.argmax(np.where(passed & kind, size, -1.0))) for kind in (self.zero, ~self.zero)
-        )
-        clearer = size[link] ** 2 > size[zero] ** 2 + CLEARER
-        pick = link if not passed[zero] or (passed[link] and clearer) else zero
-        lost = size[pick] ** 2 - size**2
-        near = [i for i in np.argsort(lost) if lost[i] < LIKEWISE and i != pick]
+        pick, near = picked(size**2, passed, self.zero)
         return int(self.column[pick]), float(p_value[pick]), tuple(self.column[near].tolist())
 
 
@@ -190,6 +222,6 @@ def sized(watched: Watched, rows: Rows, found: list[Moved]) -> tuple[Moved, ...]
     out = []
     for each in found:
         i = names.index(each.parameter)
-        unit = "m" if names.linear[i] else "rad"
-        out.append(replace(each, by=float(change[i]), sigma=float(sigma[i]), unit=unit))
+        by, size = float(change[i]), float(sigma[i])
+        out.append(replace(each, by=by, sigma=size, unit=names.units[i]))
     return tuple(out)

@@ -16,10 +16,8 @@ from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels
-from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 
-# effects of the session in which the calibration was measured; they end with it
-PAST = frozenset({"frame_drift", "session_jump", "target_shift"})
 LEAST_FOOT = 3  # reflectors on the foot tell where it stands
 LEAST_OWN = 12  # poses of the calibration, half of which tell how scores spread
 LEAST_NOISE = 1e-9  # of a coordinate: data that were computed, not measured [m]
@@ -50,7 +48,7 @@ def watched_of(
     kept = [
         (term, value)
         for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if term.effect not in PAST
+        if not EFFECTS[term.effect].of_session
         and (term.place not in cell.target_names or term.place in data.target_names)
     ]
     terms, values = tuple(term for term, _ in kept), tuple(value for _, value in kept)

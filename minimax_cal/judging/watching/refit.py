@@ -6,21 +6,18 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.fit import Fit, Parameter, Parameters, Provenance
+from minimax_cal.fitting.fit import Fit, Parameters, Provenance, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
-from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
-from minimax_cal.judging.watching.watched import Watched
+from minimax_cal.judging.watching.watched import Rows, Watched
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import links_of
 from minimax_cal.solvers.status import Status
 
 
@@ -30,13 +27,15 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     state = rows.state.step(rows.step)
     names, data = watched.names, watched.data
     sure = spread_of(fit, watched, found)
-    known = sure.active
+    known = identified(fit, rows, sure)
     cell = Cell.of(
         watched.cell.robot, state, names.target_names, watched.cell.effects, watched.cell.sessions
     )
     drawn = fit.before.robot
     nominal = Cell.of(drawn, fit_base(model_of(drawn, data), drawn.mdh).state, names.target_names)
-    parameters = Parameters(told_parameters(fit, cell, nominal, sure, known), fit.known.dof)
+    axes, blank = nominal.base[:3, :3], np.zeros(names.count - names.geometric)
+    drawn_at = replace(nominal.state, effects=blank).along(axes)
+    every = link_by_link(names, sure.units, drawn_at, cell.state.along(axes), sure.sigma, known)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
     links = [names.all[i] for i in range(5 * fit.robot.joints) if not rows.active[i]]
@@ -52,19 +51,14 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         objective="sum",
         status=Status.CONVERGED,
         iterations=1,
-        parameters=parameters,
+        parameters=Parameters(every, fit.known.dof),
         accuracy={
             "nominal": accuracy(before[:, nobody]),
             "train": accuracy(after),
             "holdout": accuracy(after[:, nobody]),
             "nominal_train": accuracy(before),
         },
-        identification=Identification(
-            known,
-            {p.name: p.reason for p in parameters if p.reason},
-            fit.identification.singular,
-            np.linalg.norm(rows.jacobian, axis=0),
-        ),
+        identification=known,
         uncertainty=sure,
         minimax=None,
         certificate=None,
@@ -87,35 +81,15 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     )
 
 
-def told_parameters(
-    fit: Fit, cell: Cell, nominal: Cell, sure: Uncertainty, known: Array
-) -> tuple[Parameter, ...]:
-    """Every parameter, link by link; the base along the nominal base's axes."""
-    axes = nominal.base[:3, :3]
-
-    def values(one: Cell) -> Array:
-        turn = Rotation.from_matrix(axes.T @ one.base[:3, :3]).as_rotvec()
-        effects = np.concatenate([np.zeros(0), *cell.effects.values])
-        spots = one.target_positions.reshape(-1)
-        return np.concatenate(
-            [links_of(one.robot.mdh), axes.T @ one.base[:3, 3], turn, spots, effects]
-        )
-
-    now, drawn, n = values(cell), values(nominal), cell.robot.joints
-    names, sigma = sure.names.all, sure.sigma
-    reasons = {p.name: p.reason for p in fit.parameters}
-    order = [kind * n + joint for joint in range(n) for kind in range(5)]
-    return tuple(
-        Parameter(
-            names[i],
-            float(now[i]),
-            float(drawn[i]) if i < 5 * n + 6 + 3 * len(cell.target_names) else 0.0,
-            float(sigma[i]),
-            sure.units[i],
-            bool(known[i]),
-            "" if known[i] else reasons.get(names[i], "not identified"),
-        )
-        for i in (*order, *range(5 * n, len(names)))
+def identified(fit: Fit, rows: Rows, sure: Uncertainty) -> Identification:
+    """What is known then, and why the rest is not."""
+    before = {p.name: p.reason for p in fit.parameters if p.reason}
+    lost = [name for name, known in zip(sure.names.all, sure.active, strict=True) if not known]
+    return Identification(
+        sure.active,
+        {name: before.get(name, "not identified") for name in lost},
+        fit.identification.singular,
+        np.linalg.norm(rows.jacobian, axis=0),
     )
 
 
@@ -128,8 +102,6 @@ def spread_of(fit: Fit, watched: Watched, found: Search) -> Uncertainty:
     covariance[~known] = np.nan
     covariance[:, ~known] = np.nan
     old = dict(zip(fit.known.names.all, fit.known.units, strict=True))
-    own = {
-        name: "m" if length else "rad" for name, length in zip(names.all, names.linear, strict=True)
-    }
-    units = tuple(old.get(name, own[name]) for name in names.all)
+    own = zip(names.all, names.units, strict=True)
+    units = tuple(old.get(name, unit) for name, unit in own)
     return replace(fit.known, names=names, units=units, covariance=covariance)

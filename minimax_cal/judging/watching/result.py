@@ -11,7 +11,7 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import KINDS, Limit
-from minimax_cal.judging.watching.moved import Moved
+from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.solvers.status import Status
 
@@ -117,16 +117,7 @@ class Health:
             ),
             ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
         )  # fmt: skip
-        moved = Table(
-            "moved since the calibration",
-            ("parameter", "joint", "unit", "by", "sigma", "p-value", "or as well"),
-            tuple(
-                (m.parameter, m.joint, "mm" if m.unit == "m" else "mrad", 1e3 * m.by,
-                 1e3 * m.sigma, m.p_value, ", ".join(m.others))
-                for m in self.moved
-            ),
-            ("", "", "", "+.4f", ".2g", ".2g", ""),
-        )  # fmt: skip
+        moved = moved_table("moved since the calibration", self.moved)
         found = Table(
             "smallest shift that these poses find in 95 of 100 cases",
             ("zero position", "unit", "shift"),
@@ -155,14 +146,6 @@ class Health:
             unit = "mm" if slides else "rad"
             return {"parameter": name, "size": 1e3 * size if slides else size, "unit": unit}
 
-        def moved(m: Moved) -> dict[str, Any]:
-            scale, unit = (1e3, "mm") if m.unit == "m" else (1.0, m.unit)
-            return {
-                "parameter": m.parameter, "joint": m.joint, "by": scale * m.by,
-                "sigma": scale * m.sigma, "unit": unit, "p_value": m.p_value,
-                "alternatives": list(m.others),
-            }  # fmt: skip
-
         return dict(
             plain(
                 {
@@ -170,7 +153,7 @@ class Health:
                     "kind": "check",
                     "valid": self.valid,
                     "confidence": self.confidence,
-                    "moved": [moved(m) for m in self.moved],
+                    "moved": [m.to_dict() for m in self.moved],
                     "required": [
                         {"kind": v.limit.kind, "limit_mm": v.limit.size_mm, "seen_mm": v.value_mm,
                          "ci95_mm": [v.low_mm, v.high_mm], "valid": v.valid,

@@ -20,9 +20,9 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import Model, SumOfSquares, model_of
-from minimax_cal.modelling.parameters import Names, State
-from minimax_cal.solvers import least_squares
+from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.near import nearby
+from minimax_cal.modelling.parameters import Names, State, zero_positions
 
 PLENTY = 500  # poses that tell what more would
 PLACINGS = 3  # passes that place an arm with effects
@@ -76,8 +76,7 @@ class Watched:
     @property
     def zeros(self) -> Array:
         """(n,) the parameters that say where each joint's zero is."""
-        n = self.cell.robot.joints
-        return np.arange(n) + np.where(self.cell.robot.prismatic, n, 2 * n)
+        return zero_positions(self.cell.robot.prismatic)
 
     @cached_property
     def start(self) -> tuple[Model, State]:
@@ -99,13 +98,8 @@ class Watched:
             if terms:
                 model, state = extended(plain, robot, self.data, state, terms)
             model = model.only(active)
-            points = float(model.counts.sum())
             if active.any():
-                found = least_squares.solve(
-                    SumOfSquares(model), state.batch(), 1, points,
-                    least_squares.METHODS["snllm"], least_squares.NEAR, trace=False,
-                )  # fmt: skip
-                state = found.x.take(np.array(0))
+                state = nearby(model, state).x.take(np.array(0))
         return model, state
 
     def rows(self, active: Array, state: State) -> Rows:

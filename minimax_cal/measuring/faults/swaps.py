@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.checks import transpositions
+from minimax_cal.measuring.checks import orders_of
 from minimax_cal.measuring.faults.distances import Between, between
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
 from minimax_cal.measuring.faults.limits import outlier_limit
 from minimax_cal.measuring.measurements import Measurements
-
-MOST_ORDERED = 5  # targets of which all orders are tried
 
 
 def swapped_rows(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...]:
@@ -61,9 +57,8 @@ def best_order(point: Array, apart: Between, predicted: Array) -> tuple[Array, f
     count = len(seen)
     if count < 3:
         return np.arange(k), np.inf
-    tried = permutations(range(count)) if count <= MOST_ORDERED else transpositions(count)
     found: list[tuple[float, float, Array]] = []
-    for some in tried:
+    for some in orders_of(count):
         order = np.arange(k)
         order[seen] = seen[list(some)]
         moved = point[order]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.effects.scene import (
     PLAIN,
     Choice,
@@ -20,6 +22,7 @@ from minimax_cal.modelling.effects.scene import (
     unmasked,
 )
 
+WITHIN = (0.25, 0.5, 2.0)  # least, usual and largest move after which a lag grows no more [rad]
 LEAST_SWEEP = 0.5  # a joint must turn so far to show a gain or a slow wave [rad]
 
 
@@ -51,15 +54,18 @@ def wave(scene: Scene, joint: int, turns: float) -> Array:
 
 
 def waves(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = a cos(k q_j) + b sin(k q_j), k = turns."""
-    turns = choice["turns"]
+    """dq_j = a cos(k q_j) + b sin(k q_j), k = turns; or the sum of that for k = 1 ... orders."""
+    each = [choice["turns"]] if "turns" in choice else range(1, int(choice["orders"]) + 1)
     joints = joints_at(place, choice)
-    parts = [one_joint(scene, j, wave(scene, j, turns)) for j in joints]
-    several = len(joints) > 1
-    names = tuple(f"{part}{j + 1 if several else ''}" for j in joints for part in ("cos", "sin"))
-    return Columns(
-        names, ("rad",) * len(names), np.concatenate(parts), fixed={"waves_per_turn": turns}
-    )
+    parts = [one_joint(scene, j, wave(scene, j, k)) for j in joints for k in each]
+    marks = [
+        f"{j + 1 if len(joints) > 1 else ''}{f' {k}/turn' if len(each) > 1 else ''}"
+        for j in joints
+        for k in each
+    ]
+    names = tuple(f"{part}{mark}" for mark in marks for part in ("cos", "sin"))
+    fixed = {"waves_per_turn": each[0]} if len(each) == 1 else {}
+    return Columns(names, ("rad",) * len(names), np.concatenate(parts), fixed=fixed)
 
 
 GEAR_ERROR = Effect(
@@ -69,7 +75,8 @@ GEAR_ERROR = Effect(
     swept_places,
     waves,
     choices=lambda scene, place: [
-        at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)
+        *(at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)),
+        *([] if place == "all" else [{"orders": 2.0}]),  # a joint may show none of them alone
     ],
     lines=True,
     typical=5e-4,
@@ -85,12 +92,22 @@ def ratios(scene: Scene, place: str) -> Sequence[Choice]:
     return ({"turns": abs(ratio)}, {"turns": 2.0 * abs(ratio)}) if np.isfinite(ratio) else ()
 
 
+def ripple(scene: Scene, place: str, choice: Choice) -> Columns:
+    """`waves`, of as many a turn as a choice says."""
+    if "turns" not in choice:
+        raise OptionError(
+            f"effect gear_ripple:{place}: the robot file gives no ratio; write "
+            f"gear_ripple:{place}:turns=17"
+        )
+    return waves(scene, place, choice)
+
+
 GEAR_RIPPLE = Effect(
     "gear_ripple",
     "ripple of the gear's teeth or wave generator, many times a turn",
     "dq_j = a cos(k q_j) + b sin(k q_j), k = gear ratio, twice that, or found by a periodogram",
     lambda scene: tuple(f"J{j + 1}" for j in sweeping(scene)),
-    waves,
+    ripple,
     choices=ratios,
     lines=True,
     typical=5e-4,
@@ -186,20 +203,37 @@ BACKLASH = Effect(
 
 
 def unsettled(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = e (q_n - q_(n-1))."""
-    return turns_by(scene, joints_at(place, choice), scene.each("move"), "e", "1")
+    """dq_j = e (q_n - q_(n-1)), or a course of it that ends where moves are long."""
+    move, within = scene.each("move"), choice.get("within", np.inf)
+    course = within * np.tanh(move / within) if np.isfinite(within) else move
+    columns = turns_by(scene, joints_at(place, choice), course, "e", "1")
+    return replace(columns, fixed={"within": within} if np.isfinite(within) else {})
+
+
+def settlings(scene: Scene, place: str) -> Sequence[Choice]:
+    """In proportion to the move, and with an end."""
+    return [at_all(place, moved(scene, "move"), choice) for choice in ({}, {"within": WITHIN[1]})]
+
+
+def other_ends(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Ends near one that was chosen; shorter ones are play."""
+    if "within" not in choice:
+        return ()
+    ends = [part * choice["within"] for part in (0.6, 0.8, 1.25, 1.6)]
+    return [{**choice, "within": end} for end in ends if WITHIN[0] <= end <= WITHIN[2]]
 
 
 SETTLING = Effect(
     "settling",
     "the joint had not settled, or was read back before it had",
-    "dq_j = e (q_n - q_(n-1))",
+    "dq_j = e m, m = q_n - q_(n-1), or e s tanh(m / s)",
     lambda scene: moved_places(scene, "move"),
     unsettled,
+    finer=other_ends,
     needs=lambda scene: (
         "" if moved(scene, "move") else "the visit order (column order)" + scene.untold
     ),
-    choices=lambda scene, place: [at_all(place, moved(scene, "move"))],
+    choices=settlings,
     typical=1e-2,
     follows="move",
 )

@@ -13,7 +13,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import stood
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.gravity import G, centres, torques, tubes
+from minimax_cal.robots.gravity import G, centres, masses_of, torques, weighed
 from minimax_cal.robots.kinematics import Chain
 from minimax_cal.robots.robot import Robot
 
@@ -124,20 +124,12 @@ class Scene:
     @cached_property
     def known_masses(self) -> bool:
         """Whether the robot file tells the masses and centres of gravity of the moving links."""
-        mass, com = self.robot.mass, self.robot.com
-        return bool(np.isfinite(mass[1:]).all() and np.isfinite(com[1:]).all())
+        return bool(weighed(self.robot)[1:].all())
 
     @cached_property
     def masses(self) -> tuple[Array, Array]:
-        """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m].
-
-        Where the file does not tell them: a uniform tube along each link.
-        """
-        tube, halfway = tubes(self.robot.mdh)
-        mass, com = self.robot.mass, self.robot.com
-        known = np.isfinite(mass) & np.isfinite(com).all(axis=1)
-        mass = np.where(known, mass, tube)
-        return mass, np.where(known[:, None], com, halfway)
+        """(n,) masses [kg] and (n, 3) centres of gravity in the link frames [m]: `masses_of`."""
+        return masses_of(self.robot)
 
     def torque(self, mass: Array, com: Array) -> Array:
         """(n, m) gravity's torque about each joint, 0 at slides [N m]."""
@@ -221,6 +213,11 @@ class Columns:
     doubt_shift: tuple[Callable[[], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
     ridge: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def only_turns(self) -> bool:
+        """Whether joints turn, and targets do not move besides."""
+        return not self.shift.size
 
     def displacement(self, scene: Scene) -> Array:
         """(d, k, 3, m) motion of every target per unit, to first order [m per unit]."""
@@ -319,6 +316,16 @@ class Effect:
     def of_angle(self) -> bool:
         """Whether it is a function of its joint's own angle."""
         return self.follows in ("angle", "wave")
+
+    @property
+    def of_move(self) -> bool:
+        """Whether it comes from the way to a pose."""
+        return self.follows in ("approach", "move")
+
+    @property
+    def of_session(self) -> bool:
+        """Whether it ends with the session in which it was measured."""
+        return self.follows == "time" and not self.of_flange
 
 
 def joint_of(place: str) -> int:

@@ -108,22 +108,31 @@ class Term:
         return "sessions" in self.choice
 
     @property
+    def by_clock(self) -> bool:
+        """Whether it follows the time, and not the temperature or the sessions."""
+        told = "temperature" in self.choice or self.frees_frames
+        return EFFECTS[self.effect].follows == "time" and not told
+
+    @property
     def text(self) -> str:
         """As gear_error:J2:turns=2.0, with the whole choice."""
         return ":".join([self.label, *(f"{k}={float(v)!r}" for k, v in self.choice.items())])
 
     def columns(self, scene: Scene) -> Columns:
         """How points move per unit of its parameters."""
-        if self.text not in scene.laws:
-            scene.laws[self.text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
-        return scene.laws[self.text]
+        text = self.text
+        if text not in scene.laws:
+            if len(scene.laws) >= LAWS:  # a search looks at thousands, each a few times in a row
+                del scene.laws[next(iter(scene.laws))]
+            scene.laws[text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
+        return scene.laws[text]
 
 
 def of_sessions(frames: Frames) -> tuple[Term, ...]:
     """What frees the frames of all sessions but the first, where there are several."""
     if len(frames) < 2:
         return ()
-    return (Term("session_jump", "frame", {"sessions": float(len(frames))}),)
+    return (Term(SESSION_JUMP.name, "frame", {"sessions": float(len(frames))}),)
 
 
 def parse(text: str) -> tuple[str, str, dict[str, float]]:
@@ -171,10 +180,6 @@ def terms(
             here = ", ".join(places) or "none with these data"
             raise OptionError(f"effect {name}: no place {place!r}; choose {here}")
         choices = variants(text, effect.choices(scene, place), given)
-        if name == "gear_ripple" and "turns" not in choices[0]:
-            raise OptionError(
-                f"effect {text!r}: the robot file gives no ratio; write {name}:{place}:turns=17"
-            )
         several = [Term(name, place, choice) for choice in choices]
         try:
             term = pick(out, several) if len(several) > 1 else several[0]
@@ -188,9 +193,10 @@ def terms(
     return tuple(out)
 
 
-CONSTANTS = frozenset({"constant", "fast", "slow"})  # of time, above 0; infinite is straight
+LAWS = 300  # whose columns a scene keeps
+CONSTANTS = frozenset({"constant", "fast", "slow", "within"})  # above 0; infinite is straight
 FREE = frozenset({  # any number will do
-    "turns", "constant", "fast", "slow", "since", "zero", "eye", "rest",
+    "turns", "constant", "fast", "slow", "within", "since", "zero", "eye", "rest",
     "low", "high", "length", "size",
 })  # fmt: skip
 

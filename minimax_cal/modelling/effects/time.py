@@ -54,6 +54,8 @@ def finer(scene: Scene, choice: Choice) -> Sequence[Choice]:
         step = max(1, len(clock) // STEPS)
         near = clock[max(at - step, 3) : max(min(at + step, len(clock) - 3), 0)]
         return tuple({**choice, "since": float(t)} for t in near)
+    if "fast" in choice:
+        return tuple({**choice, "fast": float(fast)} for fast in choice["fast"] * FINER)
     if "constant" not in choice:
         return ()
     constant = choice["constant"]

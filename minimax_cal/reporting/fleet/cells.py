@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import read_toml
 from minimax_cal.judging.tolerance import limits_of
 
 MOST = 10_000  # cells
@@ -93,11 +92,7 @@ def read_cells(path: Path | str, out: Path | None) -> tuple[Job, ...]:
     Raises OptionError for what is wrong in the file; what is wrong with one cell's own files is
     found when it is done.
     """
-    text = read_text(path, kind=OptionError)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise OptionError(f"{path}: is not TOML ({error})") from error
+    content = read_toml(path)
     strange = sorted(set(content) - {"defaults", "cells"})
     if strange:
         raise OptionError(f"{path}: the key {strange[0]!r} is not known; there are defaults, cells")

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from minimax_cal.fitting.options import silent
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import check_writable, json_text, write_whole
+from minimax_cal.ground.files import check_writable, json_text, made_folder, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
 from minimax_cal.judging.watching.result import NOT_VALID, VALID
 from minimax_cal.reporting.fleet.cells import MOST, read_cells
-from minimax_cal.reporting.fleet.work import FAILED, NEEDED, Row, arriving, checked_folder
-from minimax_cal.reporting.html.page import part, policy
+from minimax_cal.reporting.fleet.work import FAILED, NEEDED, Row, arriving
+from minimax_cal.reporting.html.page import part, policy, template
 
 GOOD, BAD = (PASSED, VALID), (NOT_PASSED, NOT_VALID, FAILED)
 
@@ -74,12 +73,11 @@ class Fleet:
         jinja = optional("jinja2", "an overview page", NEEDED)
         from markupsafe import Markup
 
-        pages = jinja.Environment(
-            autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True
+        table, made = (
+            self.table(),
+            template(jinja, "fleet.html.jinja", "minimax_cal.reporting.fleet"),
         )
-        text = (resources.files("minimax_cal.reporting.fleet") / "fleet.html.jinja").read_text()
-        table = self.table()
-        whole: str = pages.from_string(text).render(
+        whole: str = made.render(
             fleet=self,
             policy=policy().replace("script-src ", "script-src 'none'"),
             style=Markup(part("page.css")),
@@ -117,7 +115,8 @@ def fleet(
         optional("jinja2", "an overview page", NEEDED)
     folder = Path(out).resolve() if out is not None else None
     jobs = read_cells(path, folder)
-    checked_folder(folder)
+    if folder is not None:
+        made_folder(folder)
     rows: dict[str, Row] = {}
     progress(f"cells: 1 of {len(jobs)}")
     for row in arriving(jobs, processes, cluster):

@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.optional import optional
+from minimax_cal.ground.parallel import in_parallel
 from minimax_cal.judging.tolerance import judge, limits_of, overall, within
 from minimax_cal.judging.watching.comparison import compare
 from minimax_cal.judging.watching.health import check
@@ -125,39 +124,10 @@ def arriving(jobs: Sequence[Job], processes: int, cluster: str) -> Iterator[Row]
     processes: on this machine, -1 for one a core; one needs no other package.  cluster: address of
     a Dask scheduler whose workers see the same folders.  Raises OptionError.
     """
-    if cluster:
-        yield from on_cluster(jobs, cluster)
-    elif processes == 1 or len(jobs) == 1:
+    if not cluster and (processes == 1 or len(jobs) == 1):
         yield from map(done, jobs)
-    else:
-        joblib = optional("joblib", "several cells at a time", NEEDED)
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            parallel = joblib.Parallel(
-                n_jobs=min(processes, len(jobs)), return_as="generator_unordered"
-            )
-            yield from parallel(joblib.delayed(done)(job) for job in jobs)
-
-
-def on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Row]:
-    """On the workers of a Dask cluster.  Raises CalibrationError where nobody answers."""
-    distributed = optional("distributed", "a cluster", "minimax-cal[distributed]")
-    try:
-        client = distributed.Client(cluster, timeout="5s", set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise CalibrationError(
-            f"no Dask scheduler at {cluster!r}; start one with python -m dask scheduler and give "
-            "its address as tcp://host:port"
-        ) from error
-    with client:
-        for future in distributed.as_completed(client.map(done, jobs, pure=False)):
-            yield future.result()
-
-
-def checked_folder(path: Path | None) -> Path | None:
-    """The folder of results, made where it is not there.  Raises CalibrationError."""
-    if path is not None:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CalibrationError(f"{path}: cannot be made ({error.strerror})") from error
-    return path
+        return
+    count = min(processes, len(jobs))
+    calls = [(job,) for job in jobs]
+    for _, row in in_parallel(done, calls, processes=count, cluster=cluster):
+        yield row

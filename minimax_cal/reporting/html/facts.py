@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import read_toml
 from minimax_cal.ground.words import visible
 from minimax_cal.measuring.measurements import Measurements
 
@@ -31,11 +30,7 @@ MEASURED = {"payload": ("payload", "kg"), "temperature": ("temperature", "°C")}
 
 def read_facts(path: Path | str) -> dict[str, str]:
     """The facts of a TOML file by their keys.  Raises OptionError."""
-    text = read_text(path, kind=OptionError)
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise OptionError(f"{path}: is not TOML ({error})") from error
+    content = read_toml(path)
     known = (*FACTS, *WORDS)
     for key, value in content.items():
         if key not in known:

@@ -18,6 +18,7 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.content import Block, Figure, Note, Report, View
 
+PACKAGE = "minimax_cal.reporting.html"
 KINDS = {Note: "note", Table: "table", Figure: "figure", View: "view"}
 UNSAFE = {letter: f"\\u{ord(letter):04x}" for letter in "<>&\u2028\u2029"}
 
@@ -27,10 +28,8 @@ def render(report: Report, *, paper: bool = False) -> str:
     jinja, offline = needed()
     from markupsafe import Markup
 
-    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
     own, plotly = part("drawing.js") + part("page.js"), str(offline.get_plotlyjs())
-    template = pages.from_string(part("page.html.jinja"))
-    whole: str = template.render(
+    whole: str = template(jinja, "page.html.jinja").render(
         report=report,
         policy=policy(own, plotly),
         style=Markup(part("page.css")),
@@ -54,9 +53,15 @@ def needed() -> tuple[Any, Any]:
     return jinja, offline
 
 
-def part(name: str, package: str = "minimax_cal.reporting.html") -> str:
+def part(name: str, package: str = PACKAGE) -> str:
     """A file of this package, or of another one of ours."""
     return (resources.files(package) / name).read_text("utf-8")
+
+
+def template(jinja: Any, name: str, package: str = PACKAGE) -> Any:
+    """A template of ours: text is escaped, and nothing that it names may be missing."""
+    pages = jinja.Environment(autoescape=True, undefined=jinja.StrictUndefined, trim_blocks=True)
+    return pages.from_string(part(name, package))
 
 
 def kind_of(block: Block) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -31,6 +32,7 @@ FLAGS = (
     "--no-pdf-header-footer",
 )
 SHEET = "794,1123"  # A4 in CSS pixels
+SCRIPT = re.compile(r"<script\b.*?</script>", re.DOTALL | re.IGNORECASE)
 PATIENCE = 180.0  # seconds that a browser may take
 HINT = "open the HTML file in a browser and print it from there"
 
@@ -53,7 +55,9 @@ def picture(page: str, path: Path, browser: str) -> None:
 
     What holds for print holds for the screen then.
     """
-    sheet = page.replace("@media print {", "@media all {").replace("<html ", "<html data-sheet ", 1)
+    still = SCRIPT.sub("", page)  # charts stand on later pages
+    sheet = still.replace("@media print {", "@media all {")
+    sheet = sheet.replace("<html ", "<html data-sheet ", 1)
     flags = ("--hide-scrollbars", f"--window-size={SHEET}", "--force-device-scale-factor=2")
     made(sheet, path, browser, "page.png", "--screenshot={}", *flags)
 

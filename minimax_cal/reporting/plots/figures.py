@@ -51,14 +51,15 @@ def save(figure: Figure, path: Path) -> None:
     ):
         # labels of huge numbers leave no room for the axes: nothing that a user could mend
         filterwarnings("ignore", "constrained_layout not applied", UserWarning)
-        for words in figure.findobj(Text):
-            words.set_parse_math(False)  # a name may hold a dollar sign
-        figure.draw_without_rendering()  # makes the ticks, which hold powers
-        for axes in figure.axes:
-            for axis in (axes.xaxis, axes.yaxis):
-                for tick in (*axis.majorTicks, *axis.minorTicks):
-                    tick.label1.set_parse_math(True)
-                    tick.label2.set_parse_math(True)
+        powers = {  # the labels of ticks; all else may hold a name, and a name a dollar sign
+            label
+            for axes in figure.axes
+            for axis in (axes.xaxis, axes.yaxis)
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks())
+            for label in (tick.label1, tick.label2)
+        }
+        for words in set(figure.findobj(Text)) - powers:
+            words.set_parse_math(False)
         figure.savefig(stream, format=kind, dpi=150, metadata=stamp)
     write_whole(path, stream.getvalue())
 

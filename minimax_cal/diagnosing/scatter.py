@@ -1,0 +1,142 @@
+"""How much each joint scatters, and the instrument along its line of sight and across it.
+
+Effects are sought with two noises, of the instrument and of all joints alike.  Where joints scatter
+unlike each other, or range and angles of a tracker do, the sizes are estimated by restricted
+maximum likelihood [Patterson and Thompson 1971] from what geometry and effects leave, and the rows
+are weighed by them: motions of joints and of the points, so scaled that one noise stands for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import EXACT, LEAST_DOF, UNLIKE
+from minimax_cal.evidence.noise import linearised, orthonormal, restricted
+from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.kinematics import cross
+
+LEAST = 1e-7  # standard deviation that is none [m, rad]
+STEADY = 0.05  # least part of the instrument's variance that all directions have
+ROOM = 9.0  # of a logarithm of a variance, on both sides of where it starts
+
+
+def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
+    """The study, its rows weighed by the noises that the data tell, or itself if those are alike.
+
+    known: (N, q) columns of effects.  each: whether every joint may scatter by itself: not where
+    structure is left, which would pass for scatter of its joint.
+    """
+    whole = np.asarray((study.rows.weight > 0.0).all(axis=1))
+    dof = int(whole.sum()) * study.rows.weight.shape[1] - study.rows.basis.shape[1] - known.shape[1]
+    noise = restricted(study.rows, known)
+    if dof < LEAST_DOF or noise.variance < EXACT**2:
+        return study
+    joints, sight = motions(study)
+    rest = Rest.of(study, known, whole)
+    turned, (along, across) = rest.products(joints), rest.products(sight)
+    size, alike = (noise.jitter**2, noise.variance), turned.sum(axis=0)
+    least, _ = rest.likeliest([alike, along + across], np.array(size))
+    parts = [*(turned if each else alike[None]), along, across]
+    most, found = rest.likeliest(parts, np.repeat(size, (len(parts) - 2, 2)))
+    if chi2.sf(least - most, len(parts) - 2) > UNLIKE:
+        return study
+    scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
+    return weighed(study, scatter, found[-2], found[-1])
+
+
+def motions(study: Study) -> tuple[list[Array], list[Array]]:
+    """Fields (d, k, 3, m) by which each joint moves the points; along and across the sight."""
+    scene, k = study.scene, study.scene.targets
+    seen = scene.points - scene.instruments
+    along = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    helper = np.zeros_like(along)
+    helper[:, 2] = 1.0
+    side = cross(along, helper)
+    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
+    own = np.eye(k)[:, :, None, None]  # each point errs by itself
+    root = np.where(study.model.weight > 0.0, np.sqrt(study.model.weight), 1.0)[None, :, None]
+    parts = [own * part / root for part in (along, side, cross(along, side))]
+    return list(scene.jacobian[:, None]), [parts[0], np.concatenate(parts[1:])]
+
+
+def weighed(study: Study, joints: Array, along: float, across: float) -> Study:
+    """The study, its rows weighed by given noises.
+
+    joints: (n,) standard deviations.  along, across: variances of a coordinate [m^2].
+    """
+    _, sight = motions(study)
+    usual = max(float(np.sqrt(np.mean(joints**2))), LEAST)
+    mean = (along + 2.0 * across) / 3.0
+    both = max(min(along, across), STEADY * mean)
+    more = sight[0] if along > across else sight[1]
+    parts = np.concatenate([
+        study.scene.jacobian * (joints / usual)[:, None, None, None],
+        more * np.sqrt(max(along, across) - both) / usual,
+    ])  # fmt: skip
+    rows = linearised(study.model, study.fit.state, parts)
+    return replace(study, rows=replace(rows, poses=study.rows.poses), uneven=mean / both)
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Poses at which every point was measured.
+
+    study: whose rows they are.  whole: (m,) which poses.  y: (w, r).  fitted: (w, r, p).
+    """
+
+    study: Study
+    whole: Array
+    y: Array
+    fitted: Array
+
+    @staticmethod
+    def of(study: Study, known: Array, whole: Array) -> Rest:
+        """The rows of some poses, with geometry and known columns (N, q) to be fitted."""
+        m, r = study.rows.weight.shape
+        columns = orthonormal(np.concatenate([study.rows.basis, known], axis=1))
+        y = study.rows.error.reshape(m, r)[whole]
+        return Rest(study, whole, y, columns.reshape(m, r, -1)[whole])
+
+    def products(self, fields: Sequence[Array]) -> Array:
+        """(g, w, r, r) covariance that fields (d, k, 3, m) of unit variance give."""
+        m, r = self.study.rows.weight.shape
+        out = []
+        for field in fields:
+            part = self.study.rows.of(field).reshape(m, r, -1)[self.whole]
+            out.append(part @ np.swapaxes(part, 1, 2))
+        return np.array(out)
+
+    def likeliest(self, parts: Sequence[Array], start: Array) -> tuple[float, Array]:
+        """-2 log restricted likelihood at its least, and the variance (g,) of each part.
+
+        start: (g,) variances near by.
+        """
+        begin = np.log(np.maximum(start, LEAST**2))
+        whole = np.array(parts)
+        room = [(x - ROOM, x + ROOM) for x in begin]
+        found = minimize(self.cost, begin, (whole,), jac=True, method="L-BFGS-B", bounds=room)
+        return float(found.fun), np.asarray(np.exp(found.x))
+
+    def cost(self, logs: Array, parts: Array) -> tuple[float, Array]:
+        """-2 log restricted likelihood and its gradient by the logarithms of the variances (g,)."""
+        v = np.exp(logs)
+        covariance = np.tensordot(v, parts, 1)
+        inverse = np.linalg.inv(covariance)
+        pressed = inverse @ self.fitted
+        gram = np.einsum("mrp,mrq->pq", self.fitted, pressed, optimize=True)
+        gram += 1e-11 * np.trace(gram) / max(len(gram), 1) * np.eye(len(gram))
+        factor = np.linalg.cholesky(gram)
+        pull = np.einsum("mrp,mr->p", pressed, self.y)
+        value = np.linalg.solve(gram, pull)
+        rest = (inverse @ self.y[..., None])[..., 0] - pressed @ value
+        taken = np.linalg.solve(factor, pressed.reshape(-1, len(gram)).T).T.reshape(pressed.shape)
+        spread = inverse - taken @ np.swapaxes(taken, 1, 2) - rest[:, :, None] * rest[:, None]
+        cost = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diag(factor)).sum()
+        slope = v * np.einsum("gmrs,mrs->g", parts, spread, optimize=True)
+        return float(cost + np.sum(self.y * rest)), np.asarray(slope)

@@ -1,0 +1,161 @@
+"""Independent calls on all cores of this machine, or on the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import closing, contextmanager, suppress
+from importlib import import_module
+from typing import Any
+
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.optional import optional
+
+PATIENCE = 5.0  # for a scheduler, and for its first worker, to answer [s]
+DESERTED = 30.0  # a cluster without workers, which a nanny may yet start again [s]
+WATCH = 1.0  # how often that is looked at [s]
+JOBLIB = "minimax-cal[experiments]"
+DISTRIBUTED = "minimax-cal[distributed]"
+
+Numbered = Generator[tuple[int, Any], None, None]
+Work = Sequence[tuple[Callable[..., Any], int, tuple[Any, ...]]]  # what `numbered` takes
+
+
+class WorkersLost(CalibrationError):
+    """The processes that were at work are gone."""
+
+
+def in_parallel(
+    function: Callable[..., Any],
+    calls: Sequence[tuple[Any, ...]],
+    modules: Iterable[str] = (),
+    *,
+    processes: int = -1,
+    cluster: str = "",
+) -> Numbered:
+    """The number of each call and its result, in the order they finish.
+
+    function: at the top of a module.  calls: the arguments of each.  processes: on this machine,
+    -1 for one a core.  cluster: address of a Dask scheduler, instead, whose workers need modules,
+    too.  Raises OptionError for what a user can mend, WorkersLost, and what a call raises.
+    """
+    if not calls:
+        return
+    work = [(function, number, call) for number, call in enumerate(calls)]
+    needed = {__name__, function.__module__, *modules}
+    arriving = on_cluster(work, cluster, needed) if cluster else here(work, processes)
+    with closing(arriving):
+        yield from arriving
+
+
+def numbered(function: Callable[..., Any], number: int, call: tuple[Any, ...]) -> tuple[int, Any]:
+    """One call where it runs."""
+    return number, function(*call)
+
+
+def here(work: Work, processes: int) -> Numbered:
+    """By joblib in processes of one thread each on this machine."""
+    if processes == 0:
+        raise OptionError("0 processes: give their number, or -1 for one a core")
+    joblib = optional("joblib", "work in several processes", JOBLIB)
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
+        arriving = pool(joblib.delayed(numbered)(*each) for each in work)
+        loky = import_module("joblib.externals.loky.process_executor")
+        try:
+            yield from arriving
+        except loky.BrokenProcessPool as error:
+            raise WorkersLost(
+                "a process died: too little memory, or it was killed; give fewer --jobs "
+                f"({type(error).__name__})"
+            ) from error
+        finally:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
+                arriving.close()
+
+
+def on_cluster(work: Work, cluster: str, modules: set[str]) -> Numbered:
+    """On a Dask cluster, which deals with workers that come and go.
+
+    Not by joblib's Dask backend (1.6): it waits for ever when Dask itself fails, as where a job
+    kills its worker, and it runs on this machine alone while the cluster has one worker.
+    """
+    distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
+    with connected(cluster) as client:
+        need_modules(client, cluster, modules)
+        futures = client.map(numbered, *zip(*work, strict=True), pure=False)
+        try:
+            for future in finished(client, futures):
+                yield future.result()
+        except (distributed.KilledWorker, CancelledError, OSError) as error:
+            raise WorkersLost(f"{cluster}: {' '.join(str(error).split())}") from error
+
+
+def finished(client: Any, futures: Sequence[Any]) -> Iterator[Any]:
+    """Futures as they finish.  Raises OSError when nobody has been at work on them for long."""
+    distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
+    waiting, seen = set(futures), time.monotonic()
+    while waiting:
+        with suppress(distributed.TimeoutError), client.as_current():
+            done = distributed.wait(waiting, timeout=WATCH, return_when="FIRST_COMPLETED").done
+            waiting -= done
+            yield from done
+        if client.status == "running" and client.scheduler_info()["workers"]:
+            seen = time.monotonic()
+        elif time.monotonic() - seen > DESERTED:
+            raise OSError(
+                f"no scheduler or no workers for {DESERTED:g} s; start them again, and then this"
+            )
+
+
+def need_modules(client: Any, cluster: str, modules: set[str]) -> None:
+    """Raises OptionError unless scheduler and workers have modules; Dask would lose its workers."""
+    try:
+        for module in modules:
+            client.run_on_scheduler(import_module, module)
+            client.run(import_module, module)
+    except ModuleNotFoundError as error:
+        raise OptionError(
+            f"{cluster} has no module {error.name!r}; start scheduler and workers in the project's "
+            f"folder, with the same packages: python -m dask worker {cluster} --nthreads 1"
+        ) from error
+
+
+@contextmanager
+def connected(cluster: str) -> Iterator[Any]:
+    """A client of the Dask scheduler, which has at least one worker.  Raises OptionError."""
+    distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
+    look_for(cluster)
+    with distributed.Client(cluster, timeout=PATIENCE, set_as_default=False) as client:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError as error:
+            raise OptionError(
+                f"{cluster}: the scheduler has no workers; start some in the project's folder: "
+                f"python -m dask worker {cluster} --nworkers N --nthreads 1"
+            ) from error
+        yield client
+
+
+def look_for(cluster: str) -> None:
+    """Raises OptionError unless a Dask scheduler answers soon; a client might wait for ever."""
+    distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
+
+    async def identity() -> Any:
+        async with distributed.rpc(cluster, timeout=PATIENCE) as scheduler:
+            return await scheduler.identity()
+
+    try:
+        found = asyncio.run(asyncio.wait_for(identity(), PATIENCE))["type"]
+    except Exception as error:  # no such host, no answer, or an answer of something else
+        what = " ".join(str(error).split()) or f"no answer in {PATIENCE:g} s"
+        raise OptionError(
+            f"no Dask scheduler at {cluster!r} ({what}); start one with python -m dask scheduler "
+            "and give its address as tcp://host:port"
+        ) from error
+    if found != "Scheduler":
+        raise OptionError(f"{cluster} is a Dask {found.lower()}; give the scheduler's address")

@@ -1,0 +1,87 @@
+"""Noises that are not alike are told from those that are, and found in size."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import study
+
+from minimax_cal.diagnosing.scatter import Rest, motions, weighed_anew
+from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.evidence.noise import restricted
+from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
+
+QUIET, LOUD = 1e-5, 1e-4  # joints [rad]
+POINT = 2e-5  # of a coordinate [m]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Study:
+    return study(0.0, 0.01, 0, poses=100)
+
+
+def drawn(made: Study, joints: Array, along: float, across: float, seed: int) -> Study:
+    """The study with errors of given noises: joints (n,) [rad], of a coordinate [m]."""
+    rng = np.random.default_rng(seed)
+    moved, sight = motions(made)
+    sizes = (*joints, along, across)
+    fields = [(part, size) for part, size in zip((*moved, *sight), sizes, strict=True)]
+    y = sum(size * np.einsum("dkcm,dm->kcm", part, rng.normal(size=(len(part), made.scene.poses)))
+            for part, size in fields)  # fmt: skip
+    moved = np.moveaxis(np.asarray(y), -1, 0) @ made.fit.state.rotation.T
+    data = made.data.with_y(made.data.y + moved)
+    return studied(made.robot, data, fit_cell(made.robot, data, SUM, silent))
+
+
+def nothing(made: Study) -> Array:
+    return np.zeros((len(made.rows.error), 0))
+
+
+def test_noises_that_are_alike_stay_so(plain: Study) -> None:
+    for seed in range(4):
+        made = drawn(plain, np.full(6, QUIET), POINT, POINT, seed)
+        assert weighed_anew(made, nothing(made)) is made
+
+
+def test_a_wrist_that_scatters_hides_the_shoulder_no_more(plain: Study) -> None:
+    """A turn of joint 1 is seen by so much more as its own scatter is smaller than the mean."""
+    joints = np.full(6, QUIET)
+    joints[4:] = 3.0 * LOUD
+    made = drawn(plain, joints, POINT, POINT, 1)
+    found = weighed_anew(made, nothing(made))
+    seen = []
+    for one in (made, found):
+        arm = one.rows.of(plain.scene.jacobian[:1])[:, 0]
+        seen.append(float(restricted(one.rows, nothing(one)).weights(one.rows) @ arm**2))
+    assert seen[1] > 3.0 * seen[0]
+    assert seen[1] < 1.5 * plain.scene.poses / QUIET**2  # by its scatter alone, which is estimated
+
+
+def test_an_instrument_whose_directions_differ(plain: Study) -> None:
+    still = 0.2 * QUIET
+    made = drawn(plain, np.full(6, still), 0.4 * POINT, 1.5 * POINT, 2)
+    found = weighed_anew(made, nothing(made))
+    _, sight = motions(made)
+    variance = 1.0 / restricted(found.rows, nothing(found)).weights(found.rows)
+    m, r = found.rows.weight.shape
+    arm = found.rows.of(plain.scene.jacobian).reshape(m, r, -1)
+    for part, size in zip(sight, (0.4 * POINT, 1.5 * POINT), strict=True):
+        rows = found.rows.of(part).reshape(m, r, -1)
+        told = np.einsum("mrd,mr->md", rows**2, variance.reshape(m, r)).mean()
+        of_joints = still**2 * (np.einsum("mrd,mrj->mdj", rows, arm) ** 2).sum(axis=2).mean()
+        assert abs(told - of_joints - size**2) < 0.2 * POINT**2
+    mean = (0.4**2 + 2.0 * 1.5**2) / 3.0 * POINT**2
+    assert abs(found.uneven * restricted(found.rows, nothing(found)).variance / mean - 1.0) < 0.2
+
+
+def test_the_slope_is_that_of_the_likelihood(plain: Study) -> None:
+    made = drawn(plain, np.full(6, QUIET), POINT, POINT, 3)
+    joints, sight = motions(made)
+    rest = Rest.of(made, nothing(made), np.ones(made.scene.poses, dtype=bool))
+    parts = np.concatenate([rest.products(joints), rest.products(sight)])
+    at = np.log(np.array([*np.linspace(0.5, 2.0, 6) * QUIET, POINT, 2.0 * POINT]) ** 2)
+    _, slope = rest.cost(at, parts)
+    step = 1e-4 * np.eye(len(at))
+    steps = [rest.cost(at + d, parts)[0] - rest.cost(at - d, parts)[0] for d in step]
+    assert_allclose(slope, np.array(steps) / 2e-4, rtol=1e-5, atol=1e-4)

@@ -1,0 +1,111 @@
+"""Lines of gears: few near a told ratio, many elsewhere, and none that a curve imitates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from experiments.gap_cases import Cause
+from experiments.machines import Asked, make
+from minimax_cal.diagnosing.causes import chosen
+from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.evidence.bench import bench
+from minimax_cal.evidence.limits import LINES
+from minimax_cal.evidence.noise import restricted
+from minimax_cal.evidence.periodogram import Line, bands, strongest_lines
+from minimax_cal.evidence.selection import select
+from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.history import with_history
+
+NODES = np.arange(-3.0, 3.1, 0.12)
+
+
+def opened(robot: str, *causes: Cause, seed: int = 0, told: bool = True, poses: int = 100) -> Study:
+    """The training poses of an arm.  told: whether the file knows its gears."""
+    made = make(Asked(robot, "single", causes, poses=poses, seed=seed))
+    train, _, _ = split(with_history(made.data), 0.2, 0)
+    arm = made.robot if told else replace(made.robot, ratio=np.full(made.robot.joints, np.nan))
+    return studied(arm, train, fit_cell(arm, train, SUM, silent))
+
+
+def line(rng: np.random.Generator, curve: Array, q: Array) -> Line:
+    """What poses tell whose errors, of variance 1, follow a curve of the angle."""
+    return Line(q, curve + rng.normal(size=len(q)), np.ones(len(q)))
+
+
+def test_a_wave_stays_when_its_sweep_is_cut_and_a_curve_does_not() -> None:
+    stay, move = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(-2.5, 2.5, 800)
+        wave = line(rng, np.sin(rng.uniform(8.0, 60.0) * q + seed), q)
+        bumps = line(rng, np.interp(q, NODES, rng.normal(size=len(NODES))), q)
+        stay.append(wave.stays(wave.strongest(8.0, 60.0)[0]))
+        move.append(bumps.stays(bumps.strongest(8.0, 60.0)[0]))
+    assert np.mean(stay) >= 0.95
+    assert np.mean(move) <= 0.25  # a curve may hold a wave by chance
+
+
+def test_the_strongest_wave_is_the_one_that_is_there() -> None:
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2.5, 2.5, 400)
+    turns, tries = line(rng, 3.0 * np.cos(33.3 * q), q).strongest(8.0, 260.0)
+    assert abs(turns - 33.3) < 0.05
+    assert_allclose(tries, 2.0 * 252.0 * 5.0 / (2.0 * np.pi), rtol=0.02)
+
+
+def test_lines_near_a_ratio_are_few() -> None:
+    assert bands(np.nan) == []
+    assert bands(120.0) == [(119.0, 121.0), (238.0, 242.0)]
+    made = opened("irb120")
+    none = np.zeros((len(made.rows.error), 0))
+    found = strongest_lines(made.scene, made.rows, restricted(made.rows, none), none)
+    tries = sorted({tries for _, tries in found})
+    assert len(tries) == 2
+    assert 20.0 * tries[0] < tries[1]
+    near = [term for term, count in found if count == tries[0]]
+    assert [term.place for term in near] == ["J1", "J1", "J2", "J2", "J3", "J3"]  # of these told
+
+
+def test_the_level_is_shared_once() -> None:
+    """Chances of all that is looked at, each at its own gate, add up to the level."""
+    _, choice = chosen(opened("irb120"), ())
+    table = bench(choice.library, ())
+    laws = [c for c in choice.library.candidates if not c.is_line]
+    lines = {c.tries: c for c in choice.library.lines.candidates}  # type: ignore[union-attr]
+    assert_allclose(sum(1.0 / table.looked_at(c) for c in laws), 1.0 - 2.0 * LINES)
+    assert_allclose([c.tries / table.looked_at(c) for c in lines.values()], LINES)
+
+
+@pytest.mark.parametrize(("told", "named"), [(True, True), (False, False)])
+def test_a_faint_line_is_found_where_its_gear_is_known(told: bool, named: bool) -> None:
+    made = opened("irb120", Cause("gear_ripple", "J1", 20.0, 1), seed=5, told=told)
+    _, choice = chosen(made, ())
+    assert (("gear_ripple", "J1") in {c.key for c in choice.chosen}) == named
+
+
+@pytest.mark.parametrize(
+    ("law", "place", "key"),
+    [
+        ("settling/saturating", "J2", ("settling", "J2")),
+        ("thermal_growth/two", "all", ("thermal_growth", "all")),
+        ("gear_error/orders", "J6", ("gear_error", "J6")),
+    ],
+)
+def test_one_law_of_another_course_is_one_name(law: str, place: str, key: tuple[str, str]) -> None:
+    """Motors and casting that warm up apart, a lag that ends, two orders of one gear."""
+    _, choice = chosen(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
+    assert {c.key for c in choice.chosen} == {key}
+
+
+def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
+    made = opened("irb120", Cause("backlash", "J2", 500.0))
+    lib, choice = chosen(made, ())
+    (right,) = choice.chosen
+    idle = next(c for c in lib.candidates if c.key == ("gear_error", "J4"))
+    again = select(lib, first=(idle, right))
+    assert [c.key for c in again.chosen] == [("backlash", "J2")]
