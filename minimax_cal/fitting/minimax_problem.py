@@ -70,7 +70,6 @@ class MinimaxProblem:
 
     per: "target" for f_i = F_i / m_i, "point" for the squared distance of every measured point.
     start, first: where the scaling was found, and the derivatives there.
-    mean: (free, free) mean of the curvatures there.
     scale: (free,) divides a step's entries.  size: divides the f_i [m^2].
     form: "two-sided" |e| <= tol, or the paper's "squared" e^2 <= tol^2, whose gradient vanishes
     at e = 0, or "off".
@@ -81,7 +80,6 @@ class MinimaxProblem:
     distances: Distances
     start: State
     first: Sensitivity
-    mean: Array
     scale: Array
     size: float
     form: str
@@ -137,11 +135,7 @@ class MinimaxProblem:
         c, normal = self.deviation(x)
 
         def curvature(weights: Array) -> Array:
-            if self.per == "point":  # few have more than the least; of that any place will do
-                least = float(weights.min())
-                both = at.curvature(weights - least) + least * len(weights) * self.mean
-            else:
-                both = at.curvature(weights)
+            both = at.curvature(weights)
             if known:
                 both = both + 2.0 * weights.sum() * np.diag(weight) / total
             return np.asarray(both / self.squared_scale)
@@ -231,4 +225,4 @@ def minimax_problem(
     mean = first.curvature(np.full(len(first.f), 1.0 / len(first.f)))
     known = model.prior.weight[model.active] / model.counts.sum()
     scale = np.sqrt(np.maximum((np.diag(mean) + 2.0 * known) / size, 1e-30))
-    return MinimaxProblem(per, model, distances, start, first, mean, scale, size, form)
+    return MinimaxProblem(per, model, distances, start, first, scale, size, form)

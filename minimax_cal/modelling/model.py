@@ -236,13 +236,8 @@ class Model:
     def gram(self, state: State, weight: Array) -> Array:
         """J'WJ (p, p) of the free parameters, with other weights (k, m); of one state, no mix."""
         q, prismatic, y, _, fields, moved = self.sight
-        rows = np.flatnonzero(weight.any(axis=0))
-        if 2 * len(rows) < len(q):
-            q, y, weight = q[rows], y[..., rows], weight[:, rows]
-            fields = fields[..., rows] if len(fields) else fields
-            moved = moved[..., rows] if len(moved) else moved
-        given = ready(q, prismatic, y, weight, fields, moved)
-        found = kernels().normal(*arrays_of(state), *given, np.flatnonzero(self.active))
+        given = q, prismatic, y, *ready(weight), fields, moved, np.flatnonzero(self.active)
+        found = kernels().normal(*arrays_of(state), *given)
         return np.asarray(found[2][0].sum(axis=0))
 
     def squares(self, state: State) -> tuple[Array, Array]:
