@@ -40,10 +40,9 @@ from minimax_cal.ground.tables import Cell, Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CREEPING = ("nlgn", "nllm")  # all parameters together: thousands of iterations a start
 VARIANTS = (  # parameters and unit, and the methods that run on them
     *(("all, mm", method) for method in PAPER),
-    *(("all, m", method) for method in CREEPING),
+    *(("all, m", method) for method in ("nlgn", "nllm")),
     *(("identifiable", method) for method in ("snlgn", "snllm")),
 )
 PAPERS_TABLE = {  # iterations, RMS mm, seconds, converged %, to the minimum %
@@ -279,7 +278,7 @@ def study_of(study: Study, base_angle: float = 0.3) -> Found:
     by = {(row.parameters, row.method): row for row in rows}
     again = [
         moved_of(by["all, mm", m], row("all, mm", m, 15 if study.quick else 3, moved=True))
-        for m in CREEPING
+        for m in PAPER
     ]
     return Found(rows, again, setting)
 

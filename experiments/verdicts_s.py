@@ -145,19 +145,20 @@ def table_2(found: Table2) -> list[Verdict]:
 def rounding(found: Sequence[Moved]) -> Verdict:
     """How much of Table 2 is chance."""
     both = [pair for moved in found for pair in (moved.converged, moved.minimum)]
-    words = [
-        f"{m.method.upper()} {listed(m.converged)}, {listed(m.minimum)}, {m.otherwise:.2f}"
-        for m in found
-    ]
+    before, after = (
+        f"converged {listed(m.converged[i] for m in found)}, to the minimum "
+        f"{listed(m.minimum[i] for m in found)}"
+        for i in (0, 1)
+    )
     return Verdict(
-        "S Table 2: the same, were each start moved by a unit of rounding",
+        "S Table 2: % of starts, each moved by a unit of rounding",
         "convergence",
         "one run",
-        "; ".join(words),
+        f"{after}, end otherwise {listed(m.otherwise for m in found)}",
         told(all(abs(a - b) < ALIKE for a, b in both), all(m.otherwise == 0.0 for m in found)),
-        f"converged %, to the minimum %, each as it is / moved; % that end otherwise; "
-        f"{found[0].starts} starts. In part: shares within {ALIKE:g} points",
-    )  # fmt: skip
+        f"{NAMES}; {found[0].starts} starts; not moved: {before}. In part: shares within "
+        f"{ALIKE:g} points, but not each start",
+    )
 
 
 def courses(found: Found) -> list[Verdict]:

@@ -57,6 +57,11 @@ def test_type_checkers_see_the_same_names() -> None:
     assert found == mc.MODULES
 
 
+def test_a_calibration_imports_no_statistics_and_no_pictures() -> None:
+    heavy = ("scipy.stats", "pandas", "matplotlib", "cvxpy", "plotly", "jinja2")
+    assert not any(after("from minimax_cal.fitting.calibrate import calibrate", *heavy).values())
+
+
 def test_importing_is_quick_work() -> None:
     code = "import minimax_cal"
     assert not any(after(code, "numpy", "scipy", "pydantic", "click").values())

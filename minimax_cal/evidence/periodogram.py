@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from minimax_cal.evidence.limits import APART, UNSTEADY
 from minimax_cal.evidence.noise import Noise, Rows, remaining
@@ -90,7 +90,7 @@ class Line:
             own = Line(self.q[half], self.score[half], self.size[half])
             near = turns + np.linspace(-1.0, 1.0, 41) / own.sweep
             more += float(own.gain(near).max())
-        return bool(chi2.sf(more, 4) > UNSTEADY or more < APART * whole)
+        return bool(chdtrc(4, more) > UNSTEADY or more < APART * whole)
 
 
 def sums(turns: Array, q: Array, score: Array, size: Array) -> tuple[Array, Array, float]:

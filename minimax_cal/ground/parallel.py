@@ -69,7 +69,7 @@ def here(work: Work, processes: int) -> Numbered:
             yield from arriving
         except loky.BrokenProcessPool as error:
             raise WorkersLost(
-                "a process died: too little memory, or it was killed; give fewer --jobs "
+                "a process died: too little memory, or it was killed; start fewer at once "
                 f"({type(error).__name__})"
             ) from error
         finally:

@@ -15,7 +15,7 @@ from minimax_cal.evidence.noise import Noise, restricted
 def test_probabilities_are_right_on_noise() -> None:
     """White rows of the assumed covariance: each question's p below 0.1 in a tenth of all runs.
 
-    Bands are of 99.9 % for all questions of 60 drawings together; the lack of fit and the wave are
+    Bands are of 99.9 % for all questions of 40 drawings together; the lack of fit and the wave are
     bounds on a maximum, which may only be rarer.
     """
     made = study(6e-6, 1.0, 0)
@@ -23,12 +23,12 @@ def test_probabilities_are_right_on_noise() -> None:
     noise = Noise(0.5, 1e-10, 0.0)
     spread = np.sqrt(1e-10 * (1.0 + 0.5 * rows.variance_ratio))
     hits = []
-    for _ in range(60):
+    for _ in range(40):
         drawn = replace(rows, error=spread * rng.normal(size=len(rows.error)))
         found = structure(made.scene, drawn, noise, np.zeros((len(rows.error), 0)))
         hits.append([trace.p < 0.1 for trace in found if "wave" not in trace.name])
     count = np.array(hits)
-    low, high = stats.binom.ppf((0.0005, 0.9995), 60, 0.1)
+    low, high = stats.binom.ppf((0.0005, 0.9995), 40, 0.1)
     each = count.sum(axis=0)
     assert np.mean((each >= low) & (each <= high)) > 0.95
     assert abs(count.mean() - 0.1) < 0.03

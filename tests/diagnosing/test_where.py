@@ -29,7 +29,7 @@ from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots import kinematics
 
 SIGMA = 15e-6
-SEEDS = 300
+SEEDS = 200
 EXACT = Truth(compliance=0, noise=0, noise_per_metre=0)
 
 
