@@ -12,7 +12,7 @@ from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import CURVE, Alternative, Diagnosis, Finding, Step
+from minimax_cal.diagnosing.result import CURVE, SCHEMA, Alternative, Diagnosis, Finding, Step
 from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
@@ -25,13 +25,21 @@ from minimax_cal.fitting.fit_file import (
 )
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import numbers
-from minimax_cal.ground.records import AGAIN, UNKNOWN, Ends, Number, Part, Recorded, checked
+from minimax_cal.ground.records import (
+    AGAIN,
+    UNKNOWN,
+    Ends,
+    Number,
+    Part,
+    Recorded,
+    check_schema,
+    checked,
+)
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
-SCHEMA = 1
 BELOW = math.nextafter(FIRM, 0.0)  # what was tentative when it was written stays so
 
 
@@ -197,11 +205,7 @@ class DiagnosisPart(Part):
 
 def read(content: Mapping[str, Any], source: str) -> Diagnosis:
     """A diagnosis from its JSON.  Raises CalibrationError."""
-    if content.get("schema", 1) != SCHEMA:
-        raise CalibrationError(
-            f"{source}: is of schema {content['schema']!r}, this version knows {SCHEMA}; update "
-            "minimax-cal"
-        )
+    check_schema(content, source, SCHEMA)
     if content.get("kind") != "diagnosis":
         raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose")
     part = checked(DiagnosisPart, content, source)

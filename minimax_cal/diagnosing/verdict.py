@@ -16,6 +16,8 @@ from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+ORDERS = 2  # waves a turn that one gear shows at once
+
 Structure = tuple[str, float]
 
 
@@ -50,9 +52,13 @@ def patched(findings: Sequence[Finding], scene: Scene) -> bool:
     """Whether the weightiest effect needs another law of its joint's angle: likely one unknown."""
     if not findings:
         return False
-    first = max(findings, key=lambda found: found.size).term
+    largest = max(findings, key=lambda found: found.size)
+    first = largest.term
     if not turns_by_angle(first, scene):
         return False
+    several = EFFECTS[first.effect].lines and first.place != "all"
+    if several and len(largest.names) > 2 * ORDERS:
+        return True  # a series, as good for any curve
     others = [f.term for f in findings if f.term is not first and turns_by_angle(f.term, scene)]
     return any("all" in (first.place, t.place) or t.place == first.place for t in others)
 

@@ -39,6 +39,7 @@ from minimax_cal.ground.records import (
     Part,
     Recorded,
     Square,
+    check_schema,
     checked,
     packed,
     restored,
@@ -324,11 +325,7 @@ def cell_arrays(cell: Cell, name: str) -> dict[str, Array]:
 
 def read(content: Mapping[str, Any], source: str) -> Fit:
     """A fit from its JSON.  Raises CalibrationError."""
-    if content.get("schema", 1) != SCHEMA:
-        raise CalibrationError(
-            f"{source}: is of schema {content['schema']!r}, this version knows {SCHEMA}; update "
-            "minimax-cal"
-        )
+    check_schema(content, source, SCHEMA)
     cell = cell_from_dict(content, source)
     part = checked(FitPart, content, source)
     try:

@@ -47,6 +47,15 @@ Square = Annotated[float, Field(ge=0.0)]
 UNKNOWN = (math.nan, math.nan)
 
 
+def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
+    """Raise CalibrationError for a file of another version."""
+    if content.get("schema", 1) != known:
+        raise CalibrationError(
+            f"{source}: is of schema {content['schema']!r}, this version knows {known}; update "
+            "minimax-cal"
+        )
+
+
 class Part(BaseModel):
     """A part of a file, as it was written; what later versions add is left alone."""
 

@@ -66,6 +66,10 @@ def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
     assert not unknown(("gear_error", "J2", 300.0), ("axis_wobble", "J2", 100.0))  # no turn
     assert not unknown(("gear_ripple", "J2", 300.0), gain)  # a fine wave is another thing
     assert not unknown(("link_bending", "L2", 900.0), ("gear_error", "J2", 100.0), gain)
+    orders = finding("gear_error", "J2")
+    orders = replace(orders, terms=(replace(orders.term, choice={"turns": 1.0}),))
+    assert not patched([replace(orders, names=("a",) * 4)], scene)
+    assert patched([replace(orders, names=("a",) * 6)], scene)  # three are a series for any curve
 
 
 @pytest.fixture(scope="module")
