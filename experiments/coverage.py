@@ -183,7 +183,7 @@ def known_by_noise(fit: Solved) -> Uncertainty:
         Poses.of(fit.estimator, fit.state), fit.uncertainty.noise
     )
     told = fit.uncertainty
-    return Uncertainty(told.names, told.units, out, told.noise, told.dof, "noise")
+    return Uncertainty(told.names, told.units, out, told.listen, told.dof, "noise")
 
 
 def in_base(cell: Cell) -> Cell:

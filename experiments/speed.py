@@ -1,6 +1,7 @@
 """How fast the fits are, as ratios to peers on the same problem in the same run.
 
-    python -m experiments.speed [--quick] [--repeats N] [--out FOLDER] [--json FILE] [--seed N]
+    python -m experiments.speed [--quick] [--part PART ...] [--repeats N] [--out FOLDER]
+                                [--json FILE] [--seed N]
 
 Peers (`speed_peers`) share no line with the package and start where it starts; that all reach the
 same optimum is checked.  Times are of the processor, on one thread, medians of runs taken in turn,
@@ -45,9 +46,12 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.robots.kernels import choice, plain
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.solvers import least_squares, minimax
 
+PARTS = ("races", "points", "bootstrap", "command", "growth", "diagnosis")
 SAME = 1e-6  # relative difference of two optima that are called the same
+NOISE = 2e-5  # of a coordinate, where very many poses are made [m]
 Run = Callable[[], object]
 
 
@@ -195,20 +199,23 @@ def there(package: str) -> bool:
 
 
 def points(seed: int, counts: tuple[int, ...]) -> dict[str, float]:
-    """Seconds of the worst point by the number of points, ours and by cones."""
+    """Seconds of the worst point by the number of points, ours and by cones (of many, one run)."""
     out: dict[str, float] = {}
     for count in counts:
         case, data = case_of(count // 3, seed), simulated(count // 3, seed)
         begin = squares(case)
         runs: dict[str, Run] = {f"point_{count}": lambda: worst_point(case, begin, data)}  # noqa: B023
         raw = raw_of(case, data)
-        if count <= 300 and there("cvxpy"):
+        if there("cvxpy"):
             first = speed_peers.gauss_newton(raw)
-            runs["point_cvxpy"] = lambda: speed_peers.cones(raw, first)  # noqa: B023
+            began = time.process_time()
             end = raw.rows(speed_peers.cones(raw, first))[0]
+            out[f"point_{count}_cvxpy"] = time.process_time() - began
             largest = float(np.sqrt((end**2).sum(axis=0)).max())
             alike("worst point", {"ours": worst_point(case, begin, data), "cvxpy": largest})
-        out |= race(runs, 3 if count <= 300 else 1)
+            if count <= 300:
+                runs[f"point_{count}_cvxpy"] = lambda: speed_peers.cones(raw, first)  # noqa: B023
+        out |= race(runs, 3)
     return out
 
 
@@ -233,37 +240,64 @@ def command(seed: int) -> float:
     return min(times)
 
 
-def calibrated_in(poses: int, seed: int, answer: Any) -> None:
+def plenty(poses: int, targets: int, seed: int) -> Measurements:
+    """Poses all over the joints' range, made part by part, for their making to take no memory."""
+    robot, rng = load_robot("irb2600"), np.random.default_rng(seed)
+    arm = simulate(robot, 100, targets, seed).cell
+    q = random_joints(robot, (poses,), rng)
+    y = np.empty((poses, targets, 3))
+    for first in range(0, poses, 10000):
+        part = slice(first, first + 10000)
+        y[part] = arm.predict(q[part])
+        y[part] += NOISE * rng.normal(size=y[part].shape)
+    return mc.measurements(q, y)
+
+
+def calibrated_in(poses: int, targets: int, seed: int, answer: Any) -> None:
     """Put seconds and peak memory [GB] of one calibration; for a process of its own."""
-    data = simulated(poses, seed)
+    data = plenty(poses, targets, seed)
+    mc.calibrate("irb2600", plenty(100, targets, seed))
     began = time.process_time()
     mc.calibrate("irb2600", data)
     spent = time.process_time() - began
     answer.put((spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2))
 
 
-def growth(seed: int, counts: tuple[int, ...]) -> dict[str, tuple[float, float]]:
-    """Seconds and peak memory [GB] of a whole calibration by the number of poses."""
+def growth(
+    seed: int, sizes: tuple[tuple[int, int], ...]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds and peak memory [GB] of a whole calibration by the number of poses and targets."""
     fresh = multiprocessing.get_context("spawn")
-    out: dict[str, tuple[float, float]] = {}
-    for poses in counts:
+    seconds, memory = {}, {}
+    for poses, targets in sizes:
         answer = fresh.SimpleQueue()
-        job = fresh.Process(target=calibrated_in, args=(poses, seed, answer))
+        job = fresh.Process(target=calibrated_in, args=(poses, targets, seed, answer))
         job.start()
         job.join()
         if job.exitcode:
             raise click.ClickException(f"{poses} poses: the process ended with {job.exitcode}")
-        out[str(poses)] = answer.get()
-    return out
+        name = f"{poses}x{targets}"
+        seconds[f"calibrate_{name}"], memory[name] = answer.get()
+    return seconds, memory
 
 
-def others(seed: int, *, quick: bool) -> dict[str, float]:
-    """Seconds of the bootstrap, the command and the diagnosis."""
+def bootstraps(seed: int) -> dict[str, float]:
+    """Seconds of 500 replicates."""
     robot, data = load_robot("irb2600"), simulated(100, seed)
-    fit, count = mc.calibrate(robot, data), 20 if quick else 500
-    out = race({f"bootstrap_{count}": lambda: mc.bootstrap(fit, count)}, 1)
-    out["command"] = command(seed)
-    sizes = ((100, 3),) if quick else ((100, 3), (600, 3), (1200, 1), (2000, 3))
+    return race(
+        {
+            f"bootstrap_500_{objective}": partial(
+                mc.bootstrap, mc.calibrate(robot, data, objective)
+            )
+            for objective in ("minimax", "sum")
+        },
+        1,
+    )
+
+
+def diagnoses(seed: int, sizes: tuple[tuple[int, int], ...]) -> dict[str, float]:
+    """Seconds of a diagnosis by the number of poses and targets."""
+    robot, out = load_robot("irb2600"), {}
     for poses, targets in sizes:
         more = simulate(robot, poses, targets, seed).data
         began = time.process_time()
@@ -279,7 +313,9 @@ def ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
         "minimax_over_slsqp": ("minimax_slsqp", "minimax"),
         "minimax_over_ipopt": ("minimax_ipopt", "minimax"),
         "squares_over_numpy_gn": ("squares_numpy_gn", "squares"),
-        "point_over_cvxpy": ("point_cvxpy", "point_300"),
+        "point_over_cvxpy": ("point_300_cvxpy", "point_300"),
+        "point_3000_over_cvxpy": ("point_3000_cvxpy", "point_3000"),
+        "point_30000_over_cvxpy": ("point_30000_cvxpy", "point_30000"),
         "squares_over_scipy": ("squares_scipy", "squares"),
         "squares_without_numba_over_with": ("squares_without_numba", "squares"),
         "whole_without_numba_over_with": ("whole_without_numba", "whole"),
@@ -287,25 +323,45 @@ def ratios(seconds: Mapping[str, float]) -> dict[str, float | None]:
     return {
         name: seconds[peer] / seconds[ours] if peer in seconds else None
         for name, (peer, ours) in pairs.items()
+        if ours in seconds
     }
+
+
+def timed(
+    seed: int, repeats: int, parts: tuple[str, ...], *, quick: bool
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds of everything by name, and peak memory [GB] by poses x targets."""
+    seconds: dict[str, float] = {}
+    memory: dict[str, float] = {}
+    sizes = ((1000, 3), (100000, 1), (1000000, 1))[: 2 if quick else 3]
+    cases = ((100, 3),) if quick else ((100, 3), (600, 3), (1200, 1), (2000, 3))
+    if "races" in parts:
+        seconds |= races(seed, 3 if quick else repeats, quick=quick)
+    if "points" in parts:
+        seconds |= points(seed, (300, 3000) if quick else (300, 3000, 30000))
+    if "bootstrap" in parts:
+        seconds |= bootstraps(seed)
+    if "command" in parts:
+        seconds["command"] = command(seed)
+    if "growth" in parts:
+        grown, memory = growth(seed, sizes)
+        seconds |= grown
+    if "diagnosis" in parts:
+        seconds |= diagnoses(seed, cases)
+    return seconds, memory
 
 
 @click.command()
 @study_options("speed")
 @click.option("--repeats", type=int, default=9, show_default=True)
-def main(study: Study, repeats: int) -> None:
+@click.option("--part", multiple=True, type=click.Choice(PARTS), help="These alone  [default: all]")
+def main(study: Study, repeats: int, part: tuple[str, ...]) -> None:
     """Ratios of our fits to their peers.
 
     Times are compared, so the runs go one after the other: --jobs and --cluster do not apply.
     """
-    quick = study.quick
     with threadpool_limits(1):
-        seconds = races(study.seed, 3 if quick else repeats, quick=quick)
-        seconds |= points(study.seed, (300,) if quick else (300, 3000, 30000))
-        seconds |= others(study.seed, quick=quick)
-        grown = growth(study.seed, (1000,) if quick else (1000, 10000, 100000))
-    seconds |= {f"calibrate_{poses}": spent for poses, (spent, _) in grown.items()}
-    memory = {poses: held for poses, (_, held) in grown.items()}
+        seconds, memory = timed(study.seed, repeats, part or PARTS, quick=study.quick)
     over = ratios(seconds)
     machine = f"{platform.processor() or platform.machine()}, kernels: {choice.kernels().__name__}"
     numba = choice.kernels() is not plain
@@ -314,8 +370,8 @@ def main(study: Study, repeats: int) -> None:
     tables = [
         Table("the peer's time over ours", ("ratio", "times"), shown),
         Table(f"processor time ({machine})", ("what", "ms"), spent, ("", ".2f")),
-        Table("peak memory of a whole calibration", ("poses", "GB"), tuple(memory.items()),
-              ("", ".2f")),
+        Table("peak memory of a whole calibration", ("poses x targets", "GB"),
+              tuple(memory.items()), ("", ".2f")),
     ]  # fmt: skip
     content = {"ratios": over, "seconds": seconds, "memory_gb": memory, "numba": numba}
     study.save(tables, content, packages=("numba", "casadi", "cvxpy", "daqp"))

@@ -42,9 +42,21 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
     metavar="N",
     help="Calibrate N times more, on poses drawn anew, for intervals by percentiles (500 serve).",
 )
+@click.option(
+    "--no-poses",
+    "without",
+    is_flag=True,
+    help="Leave the poses out of the JSON, which of very many poses are nearly all of it.",
+)
 @result_options("the result (JSON)", figure="the errors before and after")
 def calibrate_command(
-    robot: str, data: Path, replicates: int | None, in_rows: bool, to: Output, **chosen: Any
+    robot: str,
+    data: Path,
+    replicates: int | None,
+    in_rows: bool,
+    without: bool,
+    to: Output,
+    **chosen: Any,
 ) -> int:
     """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
     measured = options.measured(data, in_rows)
@@ -53,16 +65,16 @@ def calibrate_command(
         fit = calibrate(robot, measured, progress=progress, **chosen)
         more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
-    if to.deliver(lambda: text_of(fit, *more), fit.status):
+    if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
         tables = (*fit.tables(), *(found.table() for found in more))
         options.show(*tables, headline=fit.headline())
     to.draw(save_errors, fit)
     return options.exit_code(fit.status)
 
 
-def text_of(fit: Fit, *more: Bootstrap) -> str:
-    """The JSON of a calibration, with its bootstrap where there was one."""
-    content = fit.to_dict()
+def text_of(fit: Fit, *more: Bootstrap, poses: bool = True) -> str:
+    """The JSON of a calibration, with its bootstrap where there was one.  poses: as `to_dict`."""
+    content = fit.to_dict(poses=poses)
     for found in more:
         content["bootstrap"] = found.to_dict()
     return json_text(content)

@@ -273,7 +273,7 @@ class Fixed:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
         s, d = len(self.weights), len(columns)
         weighed = (columns[None] * self.weights[:, None]).reshape(s * d, self.weights.shape[1])
-        shared = (self.rows @ weighed.T).reshape(-1, s, d)
+        shared = (self.rows @ weighed.T).reshape(len(self.rows), s, d)
         part = np.stack([
             solve_triangular(factor, shared[:, i], lower=True, check_finite=False).T
             for i, factor in enumerate(self.factors)

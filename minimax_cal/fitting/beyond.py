@@ -172,8 +172,9 @@ def needed(poses: Poses, part: Array) -> bool:
 
 def step_without(poses: Poses, part: Array) -> Array:
     """(p,) the step of the free parameters once some poses are left out.  part: mask (m,)."""
-    pull = poses.score[~part].sum(axis=0) + poses.prior * poses.off
-    return solve_normal(poses.bread - poses.gram_of(part), pull[:, None])[:, 0]
+    gram, pull = poses.sums_of(part)
+    left = poses.pull - pull + poses.prior * poses.off
+    return solve_normal(poses.bread - gram, left[:, None])[:, 0]
 
 
 def without(estimator: Estimator, state: State, parts: Sequence[Array]) -> list[State | None]:

@@ -22,7 +22,7 @@ from minimax_cal.fitting.claims import (
     is_crossed,
     unseen_suspects,
 )
-from minimax_cal.fitting.crossed import few_poses
+from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
 from minimax_cal.fitting.fit import (
     Fit,
     KeptDistance,
@@ -164,8 +164,8 @@ def calibrate(
     progress("start")
     options = with_jump(robot, poses, options, progress)
     solved = fit_cell(robot, poses.train, options, progress, poses.near)
-    fit = judged(robot, options, poses, solved, began)
-    for doubt in alarms(robot, poses, solved, fit.errors["nominal_train"]):
+    fit, doubts = judged(robot, options, poses, solved, began)
+    for doubt in doubts:
         warnings.warn(doubt, CalibrationWarning, stacklevel=2)
     return fit
 
@@ -192,7 +192,7 @@ def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
     check(fit.before.robot, fit.data, options)
     poses = Parts(fit.data, fit.train, fit.data.take(fit.held), fit.data.notices)
     solved = fit_cell(fit.before.robot, poses.train, options, progress)
-    return judged(fit.before.robot, options, poses, solved, began)
+    return judged(fit.before.robot, options, poses, solved, began)[0]
 
 
 def check(robot: Robot, data: Measurements, options: Options) -> None:
@@ -246,25 +246,29 @@ def with_jump(robot: Robot, poses: Parts, options: Options, progress: Progress) 
     return replace(options, effects=[found if e in JUMP else e for e in options.effects])
 
 
-def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: float) -> Fit:
-    """The fit with its accuracy on training and on held-out poses."""
+def judged(
+    robot: Robot, options: Options, poses: Parts, solved: Solved, began: float
+) -> tuple[Fit, tuple[str, ...]]:
+    """The fit with its accuracy on training and on held-out poses, and what is alarming."""
     held = np.isin(poses.data.line, poses.held.line)
     cell, nominal = solved.cell(robot, poses.data), solved.nominal_cell(robot, poses.data)
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
+    cross = is_crossed(options, poses.held)
     wrong = contradiction(robot, data, after, held, suspects)
+    alarming = tuple(alarms(robot, poses, solved, before[:, ~held]))
     notices = (
         *poses.notices,
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *(fault.text for fault in faults.session_jumps(data, after)),
-        *alarms(robot, poses, solved, before[:, ~held]),
+        *alarming,
         *bad_rows(suspects, data.source),
         *([wrong] if wrong else []),
     )
-    return Fit(
+    fit = Fit(
         cell=cell,
         nominal=nominal,
         objective=options.objective,
@@ -297,8 +301,9 @@ def judged(robot: Robot, options: Options, poses: Parts, solved: Solved, began: 
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
         claim=partial(beyond_of, robot, options, data, held, solved, suspects),
-        error_crossed=crossed_of(robot, options, data, held, solved),
+        error_crossed=crossed_of(robot, options, data, held, solved) if cross else NOT_CROSSED,
     )
+    return fit, alarming
 
 
 def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond, left_out
-from minimax_cal.fitting.crossed import FEW, NOT_CROSSED, crossed
+from minimax_cal.fitting.crossed import FEW, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
@@ -72,7 +72,9 @@ def contradiction(
         limit = FLOORS * max(floor[0], LEAST_FLOOR)
         what = f"{FLOORS:g} times the noise floor ({floor[1]})"
     for name, rows in (("training", ~held), ("held-out", held)):
-        whole, left = accuracy(error[:, rows]), accuracy(rest[:, rows])
+        whole = left = accuracy(error[:, rows])
+        if suspects:
+            left = accuracy(rest[:, rows])
         few = sum(left.counts) < LEFT * sum(whole.counts)
         miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
         if miss > limit:
@@ -106,9 +108,7 @@ def is_crossed(options: Options, held: Measurements) -> bool:
 def crossed_of(
     robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
 ) -> Array:
-    """Errors (k, m, 3) of every pose by a fit without it [m]; empty unless cross-validated."""
-    if not is_crossed(options, data.take(held)):
-        return NOT_CROSSED
+    """Errors (k, m, 3) of every pose by a fit without it [m]."""
     group = grouped(data, options.holdout_by)
     return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
                    options.seed)  # fmt: skip

@@ -565,11 +565,14 @@ class Fit:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON of the contract, and more; `from_dict` reads it back to the last digit."""
+    def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back to the last digit.
+
+        poses: whether with the measurements, which of many poses are nearly all of it.
+        """
         from minimax_cal.fitting.fit_file import written
 
-        return written(self)
+        return written(self, poses=poses)
 
     @staticmethod
     def from_dict(content: Mapping[str, Any], source: str = "fit") -> Fit:
@@ -580,13 +583,13 @@ class Fit:
         with reading(source):
             return read(content, source)
 
-    def json(self) -> str:
+    def json(self, *, poses: bool = True) -> str:
         """`to_dict` as text."""
-        return json_text(self.to_dict())
+        return json_text(self.to_dict(poses=poses))
 
-    def save(self, path: Path | str) -> None:
-        """Write the JSON; never a half-written file."""
-        write_whole(path, self.json())
+    def save(self, path: Path | str, *, poses: bool = True) -> None:
+        """Write the JSON; never a half-written file.  poses: as `to_dict`."""
+        write_whole(path, self.json(poses=poses))
 
 
 def load_fit(path: Path | str) -> Fit:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -57,6 +58,7 @@ from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
 NO_KKT = Kkt(math.nan, math.nan, math.nan)
+POSE_BY_POSE = ("weights", "share", "measured", "crossed")
 EARLIER = "an earlier version wrote this file"
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
@@ -194,8 +196,8 @@ class FitPart(Part):
 # ---- writing -----------------------------------------------------------------------------------
 
 
-def written(fit: Fit) -> dict[str, Any]:
-    """The JSON of the contract, and more."""
+def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
+    """The JSON of the contract, and more.  poses: whether with what was measured."""
     out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", "robot": fit.robot.to_dict()}
     if fit.nominal:
         out["nominal_robot"] = fit.nominal.robot.to_dict()
@@ -225,14 +227,14 @@ def written(fit: Fit) -> dict[str, Any]:
     }
     if fit.uncertainty:
         out["covariance"] = fit.uncertainty.to_dict()
-    if fit.data.poses:
+    if fit.data.poses and poses:
         errors = {"nominal": fit.error_nominal, "final": fit.error}
         out["poses"] = pose_rows(fit.data, fit.held, errors)
     if fit.minimax:
         out["minimax"] = minimax_to_dict(fit.minimax)
     if fit.certificate:
         out["certificate"] = fit.certificate.to_dict()
-    return out | {"widening": fit.widening, "arrays": arrays_of(fit)}
+    return out | {"widening": fit.widening, "arrays": arrays_of(fit, poses=poses)}
 
 
 def ends(fit: Fit, key: str) -> dict[str, list[float | None]]:
@@ -275,8 +277,8 @@ def minimax_to_dict(worst: WorstCase) -> dict[str, Any]:
     }
 
 
-def arrays_of(fit: Fit) -> dict[str, Any]:
-    """What is kept to the last digit, by name."""
+def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
+    """What is kept to the last digit, by name.  poses: whether with what is told pose by pose."""
     out = {
         "value": fit.parameters.value,
         "nominal": fit.parameters.nominal,
@@ -300,6 +302,9 @@ def arrays_of(fit: Fit) -> dict[str, Any]:
         out["measured"] = fit.data.y
     if fit.error_crossed.size:
         out["crossed"] = fit.error_crossed
+    if not poses:
+        out = {name: values for name, values in out.items() if name not in POSE_BY_POSE}
+        out |= {"share": fit.share} if fit.share.ndim == 1 else {}
     return {name: packed(values) for name, values in out.items()}
 
 
@@ -524,7 +529,7 @@ def uncertainty_of(
     return replace(
         known,
         covariance=exactly(known.covariance, arrays.get("covariance")),
-        noise=replace(noise, variance=float(variance[0])),
+        listen=partial(replace, noise, variance=float(variance[0])),
     )
 
 

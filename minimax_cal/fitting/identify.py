@@ -6,8 +6,10 @@ one member is left at its nominal value.  Which one is a matter of taste: predic
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -95,7 +97,8 @@ class Kept:
         share: (kept,) of the motion.
         """
         names, chosen = self.names.all, np.flatnonzero(self.active)
-        shown = [names[chosen[j]] for j in np.argsort(-share) if share[j] > 0.1 * share.max()]
+        clear = chosen[np.argsort(-share)[: np.count_nonzero(share > 0.1 * share.max(initial=0.0))]]
+        shown = [names[i] for i in clear]
         spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
         if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
             shown = [name for name in shown if name not in spots] + [whole]
@@ -161,11 +164,18 @@ def gram_of(model: Model, state: State) -> Array:
 
 def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) -> int:
     """How many of the allowed parameters plenty of poses would determine, for targets anywhere."""
-    k = reference.y.shape[0]
-    spots = 0.1 * robot.reach() * np.random.default_rng(0).normal(size=(k, 3))
-    state = State(robot.mdh, np.eye(3), np.zeros(3), spots)
-    gone = redundant(gram_of(reference, state), allowed, order, RANK)
-    return int(allowed.sum()) - len(gone)
+    known = COUNTED.setdefault(robot, {})
+    asked = len(reference.y), order.tobytes(), allowed.tobytes()
+    if asked not in known:
+        spots = np.random.default_rng(0).normal(size=(len(reference.y), 3))
+        state = State(robot.mdh, np.eye(3), np.zeros(3), 0.1 * robot.reach() * spots)
+        gone = redundant(gram_of(reference, state), allowed, order, RANK)
+        known[asked] = int(allowed.sum()) - len(gone)
+    return known[asked]
+
+
+# the answers of `generic_count`, for which every fit of a robot asks
+COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
 
 
 def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:
@@ -182,18 +192,24 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
     values, vectors = np.linalg.eigh(gram[np.ix_(chosen, chosen)] / np.outer(scale, scale))
     null = vectors[:, values <= (rank**2) * values[-1]]
     gone: list[int] = []
-    place = {int(p): row for row, p in enumerate(chosen)}
+    place = np.full(len(active), -1)
+    place[chosen] = np.arange(len(chosen))
+    rows = place[order][place[order] >= 0]
+    null, waits = null[rows], np.ones(len(rows), dtype=bool)  # in the order of giving up
     for share in (0.05, 1e-3, 0.0):
-        for p in order:
-            if null.shape[1] and int(p) in place and int(p) not in gone:
-                row = null[place[int(p)]]
-                if np.linalg.norm(row) > share:
-                    # turn the null space so that one vector alone holds p; drop that vector
-                    mirror = row.copy()
-                    mirror[0] += np.copysign(np.linalg.norm(row), row[0])
-                    turned = np.outer(null @ mirror, mirror) * (2.0 / (mirror @ mirror))
-                    null = (null - turned)[:, 1:]
-                    gone.append(int(p))
+        at = 0
+        while null.shape[1]:
+            clear = waits[at:] & (np.einsum("ij,ij->i", null[at:], null[at:]) > share**2)
+            if not clear.any():
+                break
+            at += int(clear.argmax())
+            # turn the null space so that one vector alone holds p; drop that vector
+            mirror = null[at].copy()
+            mirror[0] += math.copysign(math.sqrt(mirror @ mirror), mirror[0])
+            turned = (null @ mirror * (2.0 / (mirror @ mirror)))[:, None] * mirror
+            null = (null - turned)[:, 1:]
+            gone.append(int(chosen[rows[at]]))
+            waits[at] = False
     return gone
 
 

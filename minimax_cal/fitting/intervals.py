@@ -19,6 +19,7 @@ FEWEST = 3  # poses; fewer say nothing about their spread
 DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the width
 PIVOTS = 4000  # simulated samples behind the interval of the largest error
 TAIL = 100  # no more than so many of the largest errors tell the tail
+BUNDLES = 2000  # more poses than these are drawn in bundles
 TINY = 1e-9  # of the mean square: an error that is exactly zero has no logarithm
 
 
@@ -48,6 +49,8 @@ def rms_interval(
     total, count = np.where(seen, square, 0.0).sum(axis=0), seen.sum(axis=0)
     total, count = (np.bincount(members(error, group), of) for of in (total, count))
     total, count = total[count > 0], count[count > 0]
+    bundle = np.arange(len(count)) % BUNDLES
+    total, count = np.bincount(bundle, total), np.bincount(bundle, count)
     m = len(count)
     if m < FEWEST:
         return UNKNOWN

@@ -103,6 +103,8 @@ class MinimaxProblem:
     def deviation(self, x: State) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
         pairs, names = self.distances.pairs, self.model.names
+        if not len(pairs):
+            return np.zeros(0), np.zeros((0, len(self.scale)))
         between = x.target_positions[pairs[:, 0]] - x.target_positions[pairs[:, 1]]
         length = np.maximum(np.linalg.norm(between, axis=-1), 1e-12)
         c = (length - self.distances.mean) / self.distances.tolerance
@@ -192,21 +194,12 @@ def point_values(model: Model, x: State) -> Array:
 
 def point_sensitivity(model: Model, x: State) -> Sensitivity:
     """Squared distances and their derivatives."""
-    blocks = model.blocks(x)
-    rows = [model.weighted_rows(x, block, model.active) for block in blocks]
-    f = np.concatenate([(error**2).sum(axis=-2) for error, _ in rows], axis=-1)
-    jacobians = [-2.0 * np.einsum("kpcm,kcm->kmp", turned, error) for error, turned in rows]
-    jacobian = np.concatenate(jacobians, axis=1)
+    f, jacobian = model.squares(x)
 
     def curvature(weights: Array) -> Array:
-        spread = np.zeros(model.seen.shape)
-        spread[model.seen] = np.sqrt(weights)
-        total = np.zeros((jacobian.shape[-1],) * 2)
-        for block, (_, turned) in zip(blocks, rows, strict=True):
-            part = turned * spread[:, None, None, block.rows]
-            flat = np.moveaxis(part, 1, 0).reshape(len(total), -1)
-            total += flat @ flat.T
-        return 2.0 * total
+        share = np.zeros(model.seen.shape)
+        share[model.seen] = weights
+        return 2.0 * model.gram(x, model.weight * share)
 
     return Sensitivity(f[model.seen], jacobian[model.seen], curvature)
 
@@ -229,7 +222,7 @@ def minimax_problem(
     first = PER[per][1](model, start)
     size = float(first.f.max())
     size = size if size > 0.0 else 1e-18
-    mean = 0.5 * np.diag(first.curvature(np.full(len(first.f), 1.0 / len(first.f))))
-    mean = mean + model.prior.weight[model.active] / model.counts.sum()
-    scale = np.sqrt(np.maximum(2.0 * mean / size, 1e-30))
+    mean = first.curvature(np.full(len(first.f), 1.0 / len(first.f)))
+    known = model.prior.weight[model.active] / model.counts.sum()
+    scale = np.sqrt(np.maximum((np.diag(mean) + 2.0 * known) / size, 1e-30))
     return MinimaxProblem(per, model, distances, start, first, scale, size, form)

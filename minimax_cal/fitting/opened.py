@@ -14,7 +14,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.fit_file import measured_poses
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
@@ -178,6 +177,8 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     """A diagnosis: nominal, geometric, then with each effect."""
+    from minimax_cal.fitting.fit_file import measured_poses  # its schemas take long to build
+
     rungs = rungs_of(content, source)
     first = next(rung.cell for rung in rungs if rung.cell)
     data, held, (geometric, final) = measured_poses(content, source, first, "geometric")

@@ -22,11 +22,11 @@ from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
+from qp_backends.registry import backend
 
 OFFSETS = "offsets"  # what `only` may ask for
 FALLBACK = "daqp"  # a required package
 FUNCTION = "function "  # before the name of a QP solver that is none of the backends
-TRIVIAL = Problem(np.eye(1), np.zeros(1), np.zeros((0, 1)), np.zeros(0), np.zeros(0))
 UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.017453292519943295}
 LENGTHS = ("mm", "um", "m")
 
@@ -276,7 +276,7 @@ def usable(qp: str) -> tuple[str, tuple[str, ...]]:
     if qp.startswith(FUNCTION):
         return FALLBACK, (f"QP: the solver was a {qp}; {FALLBACK} is used",)
     try:
-        solve_qp(TRIVIAL, qp)
+        backend(qp)
     except BackendError as error:
         if qp.partition(":")[0] not in qp_backends.names():
             raise OptionError(str(error)) from error

@@ -26,7 +26,7 @@ from minimax_cal.measuring.grouping import clusters, groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, Sessions, seen_from
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import Fitted, Term, names_of, of_sessions
+from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term, names_of, of_sessions
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import (
@@ -234,7 +234,10 @@ def fit_cell(
     distances = measured_distances(data.with_y(believed), options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
     state = optimum.x if optimum else stage.state
-    scene = scene_of(robot, data, model, state)
+    effects, units = NOTHING, tuple[str, ...]()
+    if stage.terms:
+        scene = scene_of(robot, data, model, state)
+        effects, units = fitted(stage.terms, scene, state.effects), names_of(stage.terms, scene)[1]
     plain = replace(stage.base, weight=model.weight / task.share[:, None])
     plain = plain.only(stage.identification.active).with_prior(model.prior)
     rounds = int(stage.squares.iterations[0]) + stage.robust.rounds
@@ -251,8 +254,8 @@ def fit_cell(
         distances=distances,
         trace=tuple(float(value) for value in stage.squares.trace[:, 0]),
         notices=(*stage.notices, *stage.robust.notices, *said),
-        effects=fitted(stage.terms, scene, state.effects),
-        units=names_of(stage.terms, scene)[1],
+        effects=effects,
+        units=units,
         robust=stage.robust,
         start=begun,
         frames=data.frames,

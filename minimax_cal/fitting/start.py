@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
 SCREEN, KEEP, ROUNDS = 15, 6, 8  # steps of the first look, starts that go on, further rounds
 ENOUGH = 60  # poses that tell one basin from another
+CHUNK = 1024  # poses whose rows are kept at a time
 EVERYWHERE: Array = np.zeros((0, 3))  # where to look for a base of which nothing is known
 
 
@@ -43,69 +45,119 @@ class BaseFit:
     """Base and targets that fit a fixed geometry best.
 
     state: the geometry with its base and targets.  mean_square: of the point errors [m^2].
-    mirrored: the same if the measurement frame were left-handed [m^2].
+    turning: what is left to minimise over the base's rotation.  points: how many were measured.
     """
 
     state: State
     mean_square: float
-    mirrored: float
+    turning: Turning
+    points: int
+
+    @cached_property
+    def mirrored(self) -> float:
+        """The mean square if the measurement frame were left-handed [m^2]."""
+        return self.turning.best(-1.0)[1] / self.points
+
+
+@dataclass(frozen=True, eq=False)
+class Turning:
+    """|matrix vec(S) - right|^2 over the rotations S.
+
+    matrix: (r, 9).  right: (r,).
+    """
+
+    matrix: Array
+    right: Array
+
+    def best(self, sign: float) -> tuple[Array, float]:
+        """The best rotation, or with sign -1 the best mirrored one, and what it costs.
+
+        From the unconstrained minimum projected by SVD, and where that may not be the only minimum
+        from the 24 turns of a cube too.
+        """
+        guess = np.linalg.lstsq(self.matrix, self.right, rcond=1e-9)[0].reshape(3, 3)
+        found = self.polished(nearest_rotation(sign * guess[None]), sign)
+        if self.alone(sign * found[0], guess):
+            return found
+        return min(found, self.polished(CUBE, sign), key=lambda one: one[1])
+
+    def polished(self, starts: Array, sign: float) -> tuple[Array, float]:
+        """The best minimum that some starts (s, 3, 3) lead to."""
+        signs = np.full(len(starts), sign)
+        found, cost = kernels().polish(self.matrix, self.right, *ready(starts), signs)
+        winner = int(np.argmin(cost))
+        return found[winner], float(cost[winner])
+
+    def alone(self, turn: Array, guess: Array) -> bool:
+        """Whether no other rotation can be a better minimum.
+
+        guess: (3, 3) the unconstrained minimum G.  One as good as S has |A (S - G)| as small, and
+        so lies within rho = |A (S - G)| / s_9 of G (s the singular values of A), as the geodesic
+        between the two does within 3 rho.  There the second derivative along it, at least
+        2 s_9^2 - 2^(1/2) s_1 |A (S - G)|, is positive where rho (s_1 / s_9)^2 < 2^(1/2) / 3.
+        """
+        size = np.linalg.svd(self.matrix, compute_uv=False)
+        if len(size) < 9 or not size[-1] > 0.0:
+            return False
+        rho = float(np.linalg.norm(self.matrix @ (turn - guess).reshape(9))) / size[-1]
+        return bool(rho * (size[0] / size[-1]) ** 2 < 0.4)
 
 
 def fit_base(model: Model, mdh: Array, near: Array = EVERYWHERE) -> BaseFit:
     """The global best base and targets for a given geometry.
 
     With S = R_b' the residual S y - c - R_n t - o_n is linear in (S, c, t).  Eliminating c and t
-    leaves a quadratic in the nine entries of S; over the rotations it is minimised from its
-    unconstrained minimum projected by SVD, and from the 24 turns of a cube, all at once.
+    leaves a quadratic in the nine entries of S, which is minimised over the rotations.
     near: (3, 3) rotation of a base that is known to be close, from which alone it then is.
     """
     centre = np.swapaxes(model.y, -1, -2)[model.seen].mean(axis=0)
-    plain, turned, known = np.split(linear_rows(model, mdh, centre), (-10, -1), axis=1)
-    # one QR eliminates c and t and condenses the rest to ten columns
-    plain_q, plain_r = np.linalg.qr(plain)
-    rest = np.concatenate([turned, known], axis=1)
-    inside = plain_q.T @ rest
-    condensed = np.asarray(np.linalg.qr(rest - plain_q @ inside, mode="r"))
-    matrix, right = np.ascontiguousarray(condensed[:, :9]), condensed[:, 9].copy()
-    if len(near):
-        starts, signs = near.T[None], np.ones(1)
-    else:
-        guess = np.linalg.lstsq(matrix, right, rcond=1e-9)[0].reshape(3, 3)
-        starts = np.concatenate(
-            [nearest_rotation(g) for g in (guess[None], -guess[None])] + 2 * [CUBE]
-        )
-        signs = np.repeat([1.0, -1.0, 1.0, -1.0], [1, 1, len(CUBE), len(CUBE)])
-    found, cost = kernels().polish(matrix, right, *ready(starts), signs)
-    points = np.count_nonzero(model.seen)
-    winner = int(np.argmin(np.where(signs > 0.0, cost, np.inf)))
-    turn, mean_square = found[winner], float(cost[winner]) / points
-    mirrored = float(cost[signs < 0.0].min(initial=np.inf)) / points
+    whole = condensed(model, mdh, centre)
+    plain, rest = np.split(whole, [whole.shape[1] - 10], axis=1)
+    inside, left = np.split(rest, [plain.shape[1]])
+    turning = Turning(np.ascontiguousarray(left[:, :9]), left[:, 9].copy())
+    turn, cost = turning.polished(near.T[None], 1.0) if len(near) else turning.best(1.0)
     # an ill-conditioned set of poses leaves some of c, t open: the least solution then
     remaining = inside[:, :9] @ turn.reshape(9) - inside[:, 9]
-    lengths = np.linalg.lstsq(plain_r, remaining, rcond=1e-10)[0]
+    lengths = np.linalg.lstsq(plain[: len(inside)], remaining, rcond=1e-10)[0]
     shift, targets = lengths[:3], lengths[3:].reshape(-1, 3)
     state = State(mdh, turn.T, centre + turn.T @ shift, targets)
-    return BaseFit(state, mean_square, mirrored)
+    points = int(np.count_nonzero(model.seen))
+    return BaseFit(state, cost / points, turning, points)
 
 
-def linear_rows(model: Model, mdh: Array, centre: Array) -> Array:
+def condensed(model: Model, mdh: Array, centre: Array) -> Array:
+    """R of the QR decomposition of what the residual of `fit_base` is linear in, block by block.
+
+    Its columns are c, t, S, and what is known.  centre: (3,) that is taken off the points [m].
+    """
+    out = np.zeros((0, 13 + 3 * len(model.y)))
+    for first in range(0, len(model.q), CHUNK):
+        rows = linear_rows(model, mdh, centre, slice(first, first + CHUNK))
+        out = np.asarray(np.linalg.qr(np.concatenate([out, rows]), mode="r"))
+    return out
+
+
+def linear_rows(model: Model, mdh: Array, centre: Array, poses: slice) -> Array:
     """What the residual of `fit_base` is linear in, times the root of each weight.
 
     centre: (3,) that is taken off the points [m].  Returns (3 points, 3 + 3k + 9 + 1): columns of
     c, t and S, and what is known.
     """
-    links = kinematics.chain(mdh, model.q, model.prismatic)
-    k, _, m = model.y.shape
-    plain = np.zeros((k, m, 3, 3 + 3 * k))
-    plain[..., :3] = np.eye(3)
-    for i in range(k):
-        plain[i, ..., 3 + 3 * i : 6 + 3 * i] = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
-    y = np.swapaxes(model.y, -1, -2) - centre
-    turned = np.einsum("ij,kmc->kmijc", np.eye(3), y).reshape(k, m, 3, 9)
-    known = np.broadcast_to(links.origin.T[None, :, :, None], (k, m, 3, 1))
-    root = np.sqrt(model.weight)[..., None, None]
-    rows = root * np.concatenate([plain, turned, known], axis=-1)
-    return np.asarray(rows[model.seen].reshape(-1, rows.shape[-1]))
+    links = kinematics.chain(mdh, model.q[poses], model.prismatic)
+    y, weight = model.y[..., poses], model.weight[:, poses]
+    k, _, m = y.shape
+    rows = np.zeros((k, m, 3, 13 + 3 * k))
+    turned = rows[..., 3 + 3 * k : 12 + 3 * k].reshape(k, m, 3, 3, 3)
+    moved = np.moveaxis(y, 1, 2) - centre
+    for i in range(3):
+        rows[:, :, i, i] = 1.0
+        turned[:, :, i, i] = moved
+    for target in range(k):
+        own = rows[target, :, :, 3 + 3 * target : 6 + 3 * target]
+        own[:] = np.moveaxis(links.axes, -1, 0).swapaxes(-1, -2)
+    rows[..., -1] = links.origin.T
+    rows *= np.sqrt(weight)[..., None, None]
+    return np.asarray(rows[weight > 0.0].reshape(-1, rows.shape[-1]))
 
 
 def search(

@@ -7,6 +7,7 @@ left to the reader.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -59,27 +60,41 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     I - H for a point of the fit, I + H for another.  Either way the result is that of the point
     judged by all others [Cook and Weisberg 1982, "Residuals and Influence in Regression", ch. 2].
     """
-    active = model.active
-    prior = np.diag(model.prior.weight[active])
+    prior = np.diag(model.prior.weight[model.active])
 
     def gram(share: Array) -> Array:
         some = replace(model, weight=model.weight * share)
-        return np.asarray(some.normal(state, active).gram.sum(axis=0))
+        return np.asarray(some.normal(state, model.active).gram.sum(axis=0))
 
-    ridge = RIDGE * np.diag(np.diag(gram(np.ones_like(weights))))
-    cover = solve_normal(gram(weights) + prior + ridge, np.eye(len(prior)))
-    spread = cover @ (gram(weights**2) + prior) @ cover
+    every = gram(np.ones_like(weights))
+    once = every if (weights == model.seen).all() else gram(weights)
+    twice = once if ((weights == 0.0) | (weights == 1.0)).all() else gram(weights**2)
+    ridge = RIDGE * np.diag(np.diag(every))
+    cover = solve_normal(once + prior + ridge, np.eye(len(prior)))
+    spread = cover @ (twice + prior) @ cover
     square, directions = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
-    for block in model.blocks(state):
-        error, rows = model.weighted_rows(state, block, active)
-        own = weights[:, block.rows, None, None]
+    for part, error, rows in model.rows(state):
+        own = weights[:, part, None, None]
         left = np.eye(3) - 2.0 * own * hat_blocks(rows, cover) + hat_blocks(rows, spread)
-        share, axes = np.linalg.eigh(left)
-        along = np.einsum("kcab,kac->kcb", axes, error)
-        told = share > FOLLOWED
-        square[:, block.rows] = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
-        directions[:, block.rows] = told.sum(axis=-1)
+        square[:, part], directions[:, part] = standardised(left, np.swapaxes(error, 1, 2))
     return Scores(square, np.where(model.seen, directions, 0))
+
+
+def standardised(covariance: Array, error: Array) -> tuple[Array, Array]:
+    """Squares of errors (k, c, 3) over their covariance (k, c, 3, 3), and in how many directions.
+
+    Those of less variance than FOLLOWED are left out.
+    """
+    try:
+        np.linalg.cholesky(covariance - FOLLOWED * np.eye(3))
+    except np.linalg.LinAlgError:
+        share, axes = np.linalg.eigh(covariance)
+        along = np.einsum("kcab,kca->kcb", axes, error)
+        told = share > FOLLOWED
+        square = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
+        return square, told.sum(axis=-1)
+    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    return (error * solved).sum(axis=-1), np.full(error.shape[:2], 3)
 
 
 def hat_blocks(rows: Array, matrix: Array) -> Array:
@@ -148,19 +163,26 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
     """
     known = np.maximum(mean_square, LEAST_SCALE**2)
     kinds, times = np.unique(directions, return_counts=True)
+    count, half, size = len(known), 0.5 * directions, directions * known
+    constant, degrees = float((half - 1.0) @ np.log(known)), float((half - 1.0).sum())
+    below = np.isfinite(edge)
 
     def loss(log_scale: float, tail: float) -> float:
-        variance = np.exp(2.0 * log_scale)
-        size = np.log(known / variance)
-        wide = 0.5 * (directions + tail) * np.log1p(directions * known / variance / tail)
-        shape = 0.5 * kinds * np.log(kinds / tail) - betaln(0.5 * kinds, 0.5 * tail)
-        inside = np.log(fdtr(kinds, tail, edge / variance))
-        density = ((0.5 * directions - 1.0) * size - wide).sum() + times @ (shape - inside)
-        return float(len(known) * 2.0 * log_scale - density)
+        variance = math.exp(2.0 * log_scale)
+        wide = float((half + 0.5 * tail) @ np.log1p(size / (variance * tail)))
+        inside = float(times @ np.log(fdtr(kinds, tail, edge / variance))) if below else 0.0
+        log_ratio = constant - degrees * 2.0 * log_scale
+        return count * 2.0 * log_scale - log_ratio + wide - shapes[tail] + inside
 
+    def shape(tail: float) -> float:
+        own = 0.5 * kinds * np.log(kinds / tail) - betaln(0.5 * kinds, 0.5 * tail)
+        return float(times @ own)
+
+    tails = (dof, *(tail for tail in TAILS if tail < dof))
+    shapes = {tail: shape(tail) for tail in tails}
     middle = np.log(usual)
     best: list[tuple[float, Spread]] = []
-    for tail in (dof, *(tail for tail in TAILS if tail < dof)):
+    for tail in tails:
         at, value = least_between(partial(loss, tail=tail), middle - 2.0, middle + 2.0)
         doubt = CLEARLY if tail < dof else 0.0
         spread = Spread(max(float(np.exp(at)), LEAST_SCALE), float(tail))

@@ -9,15 +9,22 @@ all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv, stdtrit
 
-from minimax_cal.evidence.noise import Noise, Rows, orthonormal, restricted, rows_of
+from minimax_cal.evidence.noise import (
+    Noise,
+    Rows,
+    identified,
+    orthonormal,
+    restricted,
+    rows_of,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
 from minimax_cal.ground.units import in_files
@@ -25,7 +32,7 @@ from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
-from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior
+from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior, with_poses
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
@@ -53,6 +60,14 @@ class Estimator:
     model: Model
     share: Array
     mix: Array = field(default_factory=lambda: NO_MIX)
+
+    @cached_property
+    def whole(self) -> Model:
+        """The model with all weights in it: its sum of squares is what the fit made least."""
+        if len(self.mix):
+            return with_poses(self.model, self.mix)
+        share = self.share.reshape(len(self.share), -1)
+        return replace(self.model, weight=self.model.weight * share)
 
     def at(self, rows: Array) -> Estimator:
         """The same on some poses.  rows: indices, possibly repeated."""
@@ -90,75 +105,121 @@ def point_share(mu: Array, seen: Array) -> Array:
 class Poses:
     """A linearised fit pose by pose, points in units of the instrument's noise.
 
-    error: (m, r) errors, r = 3k.  jacobian: (m, r, p) derivative by the free parameters.
-    arm: (m, r, n) motion of the points per unit of each joint.
-    weighted: (m, r, p) A times `jacobian`.
-    off, prior: (p,) how far the parameters are from the prior's mean, and its weights.
-    beside: (p,) variance beside which a prior was weighed, 0 for a typical coordinate [m^2].
-    seen: (k, m) which points were measured.
+    With r = 3k coordinates a pose, of m poses.
     """
 
-    error: Array
-    jacobian: Array
-    arm: Array
-    weighted: Array
-    off: Array
-    prior: Array
-    beside: Array
-    seen: Array
+    estimator: Estimator
+    state: State
 
     @staticmethod
     def of(estimator: Estimator, state: State) -> Poses:
         """All poses of an estimator at its solution."""
-        model, m = estimator.model, len(estimator.model.q)
+        return Poses(estimator, state)
+
+    @cached_property
+    def every(self) -> tuple[Array, Array]:
+        """Errors (m, r) and their slopes by all parameters (m, r, all).
+
+        In axes of the base, or of the instrument where poses are weighed.
+        """
+        model, (m, _) = self.estimator.model, self.estimator.model.q.shape
+        state, everything = self.state, np.ones(self.estimator.model.names.count, dtype=bool)
         block = Block(slice(0, m), kinematics.chain(state.mdh, model.q, model.prismatic))
-        error, turned = model.weighted_rows(state, block, np.ones(model.names.count, dtype=bool))
-        k, p = turned.shape[:2]
-        if len(estimator.mix):  # weighs along the axes of the instrument
+        error, turned = model.weighted_rows(state, block, everything)
+        if len(self.estimator.mix):
             error, turned = state.rotation @ error, state.rotation @ turned
-        every = np.moveaxis(turned, (3, 0, 2, 1), (0, 1, 2, 3)).reshape(m, 3 * k, p)
-        jacobian = every[..., model.active]
-        if len(estimator.mix):
-            weighted = estimator.mix @ jacobian
-        else:
-            weighted = np.repeat(estimator.share.reshape(k, -1).T, 3, axis=1)[..., None] * jacobian
-        off = (model.prior.mean - model.values(state))[model.active]
-        geometric = model.names.geometric
-        return Poses(
-            error=np.moveaxis(error, 2, 0).reshape(m, 3 * k),
-            jacobian=jacobian,
-            arm=every[..., zero_positions(model.prismatic)],
-            weighted=weighted,
-            off=off,
-            prior=model.prior.weight[model.active],
-            beside=np.repeat([0.0, BESIDE**2], [geometric, model.names.count - geometric])[
-                model.active
-            ],
-            seen=model.seen,
-        )
+        return by_pose(error, turned)
+
+    @property
+    def error(self) -> Array:
+        """(m, r) errors."""
+        return self.every[0]
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(m, r, p) derivative by the free parameters."""
+        return self.every[1][..., self.estimator.model.active]
+
+    @cached_property
+    def arm(self) -> Array:
+        """(m, r, n) motion of the points per unit of each joint."""
+        return self.every[1][..., zero_positions(self.estimator.model.prismatic)]
+
+    @cached_property
+    def weighted(self) -> Array:
+        """(m, r, p) A times `jacobian`."""
+        share = self.estimator.share
+        if len(self.estimator.mix):
+            return np.asarray(self.estimator.mix @ self.jacobian)
+        shares = share.reshape(len(share), -1).T
+        return np.asarray(np.repeat(shares, 3, axis=1)[..., None] * self.jacobian)
+
+    @cached_property
+    def halves(self) -> tuple[Array, Array]:
+        """A^(1/2) times the errors (m, r) and slopes (m, r, p), in axes of each pose's own."""
+        parts = [by_pose(error, rows) for _, error, rows in self.estimator.whole.rows(self.state)]
+        return np.concatenate([e for e, _ in parts]), np.concatenate([j for _, j in parts])
+
+    @property
+    def seen(self) -> Array:
+        """(k, m) which points were measured."""
+        return self.estimator.model.seen
+
+    @cached_property
+    def off(self) -> Array:
+        """(p,) how far the parameters are from the prior's mean."""
+        model = self.estimator.model
+        return (model.prior.mean - model.values(self.state))[model.active]
+
+    @cached_property
+    def prior(self) -> Array:
+        """(p,) its weights."""
+        return self.estimator.model.prior.weight[self.estimator.model.active]
+
+    @property
+    def beside(self) -> Array:
+        """(p,) variance beside which a prior was weighed, 0 for a typical coordinate [m^2]."""
+        names, active = self.estimator.model.names, self.estimator.model.active
+        return np.where(np.arange(names.count) < names.geometric, 0.0, BESIDE**2)[active]
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """`sums_of` all poses."""
+        return self.sums_of(np.ones(self.seen.shape[1], dtype=bool))
 
     @cached_property
     def bread(self) -> Array:
         """(p, p) H."""
-        flat = [a.reshape(-1, a.shape[-1]) for a in (self.jacobian, self.weighted)]
-        return np.asarray(flat[0].T @ flat[1] + np.diag(self.prior))
+        return np.asarray(self.sums[0] + np.diag(self.prior))
+
+    @property
+    def pull(self) -> Array:
+        """(p,) J'A e of all poses."""
+        return self.sums[1]
 
     @property
     def mean_square(self) -> float:
         """Of a coordinate's error, as a prior was weighed against it in the fit [m^2]."""
         paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
         count = 3.0 * np.count_nonzero(self.seen)
-        return float((self.error**2).sum()) / max(count - paid, 1.0)
+        square = float(self.estimator.model.cost(self.state).sum())
+        return square / max(count - paid, 1.0)
+
+    def sums_of(self, part: Array) -> tuple[Array, Array]:
+        """J'A J (p, p) and J'A e (p,) of some poses.  part: mask (m,)."""
+        whole = self.estimator.whole
+        found = (whole if part.all() else whole.take(part)).normal(self.state, whole.active)
+        return found.gram.sum(axis=0), found.gradient.sum(axis=0)
 
     def gram_of(self, part: Array) -> Array:
         """(p, p) J'A J of some poses.  part: mask (m,)."""
-        p = self.jacobian.shape[-1]
-        return np.asarray(self.jacobian[part].reshape(-1, p).T @ self.weighted[part].reshape(-1, p))
+        return self.sums_of(part)[0]
 
     @cached_property
     def score(self) -> Array:
         """(m, p) J'A e of each pose."""
-        return np.asarray(np.einsum("mrp,mr->mp", self.weighted, self.error))
+        error, jacobian = self.halves
+        return np.asarray(np.einsum("mrp,mr->mp", jacobian, error))
 
     def rows(self) -> Rows:
         """For the estimate of the noises; a prior is some more rows, as noisy as a typical one."""
@@ -181,21 +242,33 @@ class Poses:
         )
 
 
+def by_pose(error: Array, rows: Array) -> tuple[Array, Array]:
+    """Errors (m, 3k) and Jacobian (m, 3k, p), from errors (k, 3, m) and rows (k, p, 3, m)."""
+    k, p, _, m = rows.shape
+    jacobian = np.moveaxis(rows, (3, 0, 2, 1), (0, 1, 2, 3)).reshape(m, 3 * k, p)
+    return np.moveaxis(error, 2, 0).reshape(m, 3 * k), jacobian
+
+
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """What is known about the parameters of a fit.
 
     names: of all p parameters.  units: of each, SI.  covariance: (p, p), the base's in its own
-    axes, NaN where a parameter is not identified.  noise: of a typical coordinate and of the
-    joints.  dof: degrees of freedom of the noise.  source: `poses` or `noise`.
+    axes, NaN where a parameter is not identified.  listen: looks for `noise`.  dof: degrees of
+    freedom of the noise.  source: `poses` or `noise`.
     """
 
     names: Names
     units: tuple[str, ...]
     covariance: Array
-    noise: Noise
+    listen: Callable[[], Noise]
     dof: float
     source: str
+
+    @cached_property
+    def noise(self) -> Noise:
+        """Of a typical coordinate and of the joints; looked for when it is first asked for."""
+        return self.listen()
 
     @property
     def active(self) -> Array:
@@ -260,17 +333,26 @@ def scales(units: tuple[str, ...]) -> Array:
     return np.array([in_files(unit)[0] for unit in units])
 
 
-def noise_of(poses: Poses) -> tuple[Noise, float]:
-    """Instrument's noise and joints' jitter by `noise.restricted`, and their degrees of freedom.
+def noise_of(estimator: Estimator, state: State) -> Noise:
+    """Instrument's noise and joints' jitter by `noise.restricted`.
 
-    None are free where the poses do not determine the parameters.
+    The instrument's alone where the poses do not determine the parameters.
     """
-    rows, p = poses.rows(), poses.jacobian.shape[-1]
-    dof = float(rows.count - p) if rows.basis.shape[1] == p else 0.0
+    poses, dof = Poses.of(estimator, state), freedom(estimator, state)
+    rows = poses.rows()
     if dof >= LEAST_DOF:
-        return restricted(rows, np.zeros((len(rows.error), 0))), dof
+        return restricted(rows, np.zeros((len(rows.error), 0)))
     left = rows.error - rows.basis @ (rows.basis.T @ rows.error)
-    return Noise(0.0, float(left @ left) / max(dof, 1.0), 0.0), dof
+    return Noise(0.0, float(left @ left) / max(dof, 1.0), 0.0)
+
+
+def freedom(estimator: Estimator, state: State) -> float:
+    """Degrees of freedom of the noise: none where the poses do not determine the parameters."""
+    model = estimator.model
+    prior = model.prior.weight[model.active]
+    gram = model.normal(state, model.active).gram.sum(axis=0) + np.diag(prior)
+    rows = 3 * np.count_nonzero(model.seen) + np.count_nonzero(prior)
+    return float(rows - len(gram)) if identified(gram).shape[1] == len(gram) else 0.0
 
 
 def by_noise(poses: Poses, noise: Noise) -> Array:
@@ -286,29 +368,27 @@ def by_poses(poses: Poses, group: Array) -> Array:
     """The jackknife over poses: (p, p) of the free parameters [SI].
 
     (M-1)/M sum d d' with d = (H - J'AJ)^-1 J'A e, the change that leaving out one of M poses makes:
-    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  With C = H^-1 and L = J C J'A it is
-    C J'A (1 - L)^-1 e.  group: (m,) rows with the same number are one pose.  NaN where the fit
-    needs one of the poses.
+    the cluster-robust sandwich CR3 [Bell and McCaffrey 2002].  With C = H^-1, K = A^(1/2) J and
+    L = K C K' it is C K' (1 - L)^-1 A^(1/2) e.  group: (m,) rows with the same number are one pose.
+    NaN where the fit needs one of the poses.
     """
     member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
-    order, count, p = (
-        np.argsort(member.reshape(-1), kind="stable"),
-        len(sizes),
-        poses.bread.shape[0],
-    )
+    order, count, p = np.argsort(member.reshape(-1), kind="stable"), len(sizes), len(poses.bread)
     cover, ends = solve_normal(poses.bread, np.eye(p)), np.cumsum(sizes)
     total = np.zeros((p, p))
     for size in np.unique(sizes):  # groups of as many rows at once
         rows = order[(ends[sizes == size] - size)[:, None] + np.arange(size)]
-        jacobian, weighted = (
-            part[rows].reshape(len(rows), -1, p) for part in (poses.jacobian, poses.weighted)
-        )
-        back = cover @ np.swapaxes(weighted, 1, 2)
-        lever = jacobian @ back
-        if not (np.linalg.eigvals(lever).real < 1.0 - ALONE).all():
+        error, jacobian = (part[rows] for part in poses.halves)
+        jacobian = jacobian.reshape(len(rows), -1, p)
+        back = jacobian @ cover
+        lever = back @ np.swapaxes(jacobian, 1, 2)
+        eye = np.eye(lever.shape[1])
+        try:  # no eigenvalue is as large as 1 - ALONE
+            np.linalg.cholesky((1.0 - ALONE) * eye - lever)
+        except np.linalg.LinAlgError:
             return np.full((p, p), np.nan)
-        error = poses.error[rows].reshape(len(rows), -1, 1)
-        change = (back @ np.linalg.solve(np.eye(lever.shape[1]) - lever, error))[..., 0]
+        left = np.linalg.solve(eye - lever, error.reshape(len(rows), -1, 1))
+        change = (np.swapaxes(back, 1, 2) @ left)[..., 0]
         total += change.T @ change
     prior = sandwich(poses, np.zeros((p, p)))
     return np.asarray((count - 1) / count * total + prior)
@@ -333,18 +413,18 @@ def uncertainty_of(
     the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
     """
     few, rows = estimator.thinned(group, PLENTY)
-    poses = Poses.of(few, state)
-    noise, dof = noise_of(poses)
+    poses, dof = Poses.of(few, state), freedom(few, state)
     found, source = np.full(poses.bread.shape, np.nan), "poses"
     if dof >= 1.0 and estimator.share.ndim == 1:
         found = by_poses(poses, group[rows])
     if dof >= 1.0 and np.isnan(found).any():
-        found, source = by_noise(poses, noise), "noise"
+        found, source = by_noise(poses, noise_of(few, state)), "noise"
     names, active = few.model.names, few.model.active
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[np.ix_(active, active)] = 0.5 * (found + found.T) * len(rows) / len(group)
     own = names.units[: names.geometric]
-    return Uncertainty(names, (*own, *units), covariance, noise, dof, source)
+    listen = partial(noise_of, few, state)
+    return Uncertainty(names, (*own, *units), covariance, listen, dof, source)
 
 
 # ---- positions -------------------------------------------------------------------------------
@@ -431,7 +511,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         place = np.array([names.index(str(name)) for name in part["names"]], dtype=int)
         rows = np.array(part["rows"], dtype=float).reshape(len(place), len(place))
         ratio, jitter = float(part["jitter_ratio"]), float(part["jitter_rad"])
-        noise = Noise(ratio, (1e-3 * float(part["noise_mm"])) ** 2, jitter)
+        noise = partial(Noise, ratio, (1e-3 * float(part["noise_mm"])) ** 2, jitter)
         dof, kind = float(part["degrees_of_freedom"]), str(part["source"])
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(

@@ -129,9 +129,9 @@ def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
     that of the names as given, (m,) each [m^2].
     """
     k = len(error_of)
-    squared = error_of**2
+    squared = np.nan_to_num(error_of) ** 2
     orders = list(orders_of(k))
-    cost = np.stack([np.nansum(squared[range(k), order, :], axis=0) for order in orders])
+    cost = np.stack([squared[range(k), order, :].sum(axis=0) for order in orders])
     best = cost.argmin(axis=0)
     return np.array(orders)[best], cost.min(axis=0), cost[0]
 

@@ -113,7 +113,10 @@ def least_scatter(data: Measurements, error: Array) -> tuple[Array, Array] | Non
 
 def visited(data: Measurements, error: Array) -> tuple[Array, Array] | None:
     """As `deviations`, None where too few poses were visited again.  error: or points [m]."""
-    square, group = deviations(error, groups(data))
+    group = groups(data)
+    if np.count_nonzero(np.bincount(group) > 1) < FEWEST:
+        return None
+    square, group = deviations(error, group)
     return None if len(np.unique(group)) < FEWEST else (square, group)
 
 

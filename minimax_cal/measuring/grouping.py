@@ -7,9 +7,10 @@ whole part is left out)?  Poses that repeat each other, or stand in one cluster,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from weakref import WeakKeyDictionary
+from functools import wraps
+from weakref import finalize
 
 import numpy as np
 import scipy
@@ -24,29 +25,44 @@ from minimax_cal.measuring.measurements import Measurements
 REPEAT = 5e-4
 APART = 3.0  # the distance between clusters over those inside them
 FEWEST_CLUSTERS = 8  # fewer are regions of the workspace: `parts` leaves each out in its turn
+LABELS = ("pose", "group")  # columns that tell which poses belong together
 SORTED = 2000  # poses among which pairs are found by sorting, without a tree
 MOST = 3000  # poses among which clusters are looked for
 MOVES = 0.01  # a joint with less range does not move [rad, m]
 REGIONS = 5  # clusters of joint values that are left out in their turn
+LLOYD = 10  # rounds that find them
 QUARTER = 0.25  # of the poses at each end of a joint
 LATE = 0.2  # share of a session that its last part is
 MOST_OF = 0.5  # share of the poses that a part may have
 FEWEST = 3  # poses of a part
 
 
+def remembered(find: Callable[[Measurements], Array]) -> Callable[[Measurements], Array]:
+    """The function, whose answers are kept as long as the joint values of the poses.
+
+    One calibration asks a dozen times, and arrays of measurements are never changed in place.  The
+    answer must rest on joints and labels alone.
+    """
+    known: dict[int, tuple[Mapping[str, Array], Array]] = {}
+
+    @wraps(find)
+    def asked(data: Measurements) -> Array:
+        labels = {name: data.columns[name] for name in LABELS if name in data.columns}
+        here = known.get(id(data.q))
+        if here is None:
+            finalize(data.q, known.pop, id(data.q), None)
+        if here is None or labels.keys() != here[0].keys() or any(
+            here[0][name] is not label for name, label in labels.items()
+        ):  # fmt: skip
+            here = known[id(data.q)] = labels, find(data)
+        return here[1].copy()
+
+    return asked
+
+
+@remembered
 def groups(data: Measurements) -> Array:
     """(m,) a number for each pose: rows at the same joints, or of the same `pose`, share it."""
-    if data not in FOUND:
-        FOUND[data] = repeats(data)
-    return FOUND[data].copy()
-
-
-# one calibration asks a dozen times; measurements are never changed in place
-FOUND: WeakKeyDictionary[Measurements, Array] = WeakKeyDictionary()
-
-
-def repeats(data: Measurements) -> Array:
-    """`groups`, looked for."""
     near = close_pairs(data.q, REPEAT)
     group = joined(near, data.poses) if len(near) else np.arange(data.poses)
     for label in np.unique(group[near[:, 0]]) if len(near) else ():
@@ -124,6 +140,7 @@ def leaders(q: Array) -> Array:
     return lead
 
 
+@remembered
 def clusters(data: Measurements) -> Array:
     """(m,) a number for each pose; poses of a cluster share it, repeats always do.
 
@@ -303,10 +320,30 @@ def candidates(data: Measurements, by: str | None) -> Iterator[Region]:
 def regions(data: Measurements) -> Array:
     """(m,) number of the cluster of joint values that a pose is in, out of about `REGIONS`."""
     count = min(REGIONS, len(np.unique(groups(data))))
-    seeded = np.random.default_rng(0)
-    return np.asarray(
-        scipy.cluster.vq.kmeans2(data.q, count, minit="++", seed=seeded, missing="warn")[1]
-    )
+    return nearest_means(data.q, count, np.random.default_rng(0))
+
+
+def nearest_means(q: Array, count: int, rng: np.random.Generator) -> Array:
+    """(m,) the nearest of some means of q (m, n) [Lloyd 1982; Arthur and Vassilvitskii 2007].
+
+    Ten rounds from a start that is drawn apart, as `scipy.cluster.vq.kmeans2` takes them, which is
+    slow to import.
+    """
+
+    def squares() -> Array:
+        return np.stack([((q - mean) ** 2).sum(axis=1) for mean in means])
+
+    means = q[[rng.integers(len(q))]]
+    while len(means) < count:
+        square = squares().min(axis=0)
+        chosen = np.searchsorted((square / square.sum()).cumsum(), rng.uniform())
+        means = np.concatenate([means, q[[chosen]]])
+    for _ in range(LLOYD):
+        label = squares().argmin(axis=0)
+        size = np.bincount(label, minlength=count)
+        total = np.stack([np.bincount(label, column, count) for column in q.T], axis=1)
+        means = np.where(size[:, None] > 0, total / np.maximum(size, 1)[:, None], means)
+    return np.asarray(label)
 
 
 def region_name(data: Measurements, rows: Array) -> str:

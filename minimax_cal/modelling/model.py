@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -150,13 +151,16 @@ class Model:
 
     def blocks(self, state: State) -> list[Block]:
         """The poses cut into blocks that fit the cache, each with its chain."""
-        robots = int(np.prod(state.mdh.shape[:-2]))
-        m = len(self.q)
-        parts = -(-m * robots * len(self.y) // BLOCK)
-        edges = np.linspace(0, m, min(parts, m) + 1).astype(int)
-        rows = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
         q, flat = self.q, self.prismatic
-        return [Block(part, kinematics.chain(state.mdh, q[part], flat)) for part in rows]
+        parts = self.parts(int(np.prod(state.mdh.shape[:-2])))
+        return [Block(part, kinematics.chain(state.mdh, q[part], flat)) for part in parts]
+
+    def parts(self, robots: int) -> list[slice]:
+        """The poses cut into parts whose Jacobian, of so many robots, fits the cache."""
+        m = len(self.q)
+        count = -(-m * robots * len(self.y) // BLOCK)
+        edges = np.linspace(0, m, min(count, m) + 1).astype(int).tolist()
+        return [slice(start, stop) for start, stop in itertools.pairwise(edges)]
 
     def error_of(self, state: State, block: Block) -> tuple[Array, Array]:
         """Weighted errors and predicted points of one block: (..., k, 3, c) each [m]."""
@@ -229,9 +233,38 @@ class Model:
             gram = gram + flat @ np.swapaxes(flat, -1, -2)
         return Normal(np.asarray(cost), np.asarray(gradient), np.asarray(gram))
 
+    def gram(self, state: State, weight: Array) -> Array:
+        """J'WJ (p, p) of the free parameters, with other weights (k, m); of one state, no mix."""
+        q, prismatic, y, _, fields, moved = self.sight
+        given = q, prismatic, y, *ready(weight), fields, moved, np.flatnonzero(self.active)
+        found = kernels().normal(*arrays_of(state), *given)
+        return np.asarray(found[2][0].sum(axis=0))
+
+    def squares(self, state: State) -> tuple[Array, Array]:
+        """Weighted squared distance of every point: (k, m) [m^2], and its derivative (k, m, p).
+
+        Of one state, by the free parameters; without a mix.
+        """
+        which = np.flatnonzero(self.active)
+        f, slope = kernels().squares(*arrays_of(state), *self.sight, which)
+        return f, slope
+
     def weighted_rows(self, state: State, block: Block, active: Array) -> tuple[Array, Array]:
         """Weighted errors (..., k, 3, c) and transposed Jacobian (..., k, p, 3, c) of one block."""
         return self.rows_of(state, block, Columns.of(self.names, active))
+
+    def rows(self, state: State) -> Iterator[tuple[slice, Array, Array]]:
+        """Block by block, poses, weighted errors (k, 3, c) and Jacobian (k, p, 3, c), of one state.
+
+        By the free parameters, in axes of each pose's own, so that they are for sums over axes.
+        """
+        if len(self.mix):
+            for block in self.blocks(state):
+                yield block.rows, *self.weighted_rows(state, block, self.active)
+            return
+        given = *arrays_of(state), *self.sight, np.flatnonzero(self.active)
+        for part in self.parts(1):
+            yield part, *kernels().rows(*given, part.start, part.stop)
 
     def rows_of(self, state: State, block: Block, select: Columns) -> tuple[Array, Array]:
         """`weighted_rows` with the choice of columns at hand."""

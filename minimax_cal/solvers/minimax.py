@@ -31,6 +31,7 @@ EVEN: Array = np.zeros(0)
 
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
 ROUNDING = 1e-12
+SHARE = 2  # times the unknowns: of more functions than twice that, so many make a first QP
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
@@ -55,6 +56,10 @@ class Linear:
     c: Array
     normal: Array
     curvature: Callable[[Array], Array]
+
+    def of(self, rows: Array) -> Linear:
+        """Some of the functions; their curvature is that of all."""
+        return replace(self, f=self.f[rows], jacobian=self.jacobian[rows])
 
 
 class Minimax(Protocol[X]):
@@ -176,19 +181,17 @@ def solve(
         if not plan.usable:
             status = Status.FAILED
             break
-        at = at.judged(plan.mu, plan.lam)
         penalty = priced(at, plan, tolerance)
+        at = at.after(plan, at.penalty if penalty is None else penalty)
         if penalty is None:
             status = Status.INFEASIBLE
             break
-        at = replace(at, penalty=penalty)
         length, move, end, there = 0.0, np.zeros_like(plan.d), at.x, at.here
         if at.kkt.residual > tolerance:
             length, move, end, there = search(at, plan, partial(at.subproblem, hessian, qp))
         value, kkt = float(at.here.f.max()), at.kkt
         trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, plan.backend))
         progress(trace[-1])
-        at = at.counted()
         ended = at.patience(tolerance)
         if ended is None:
             at = at.moved(move, end, there) if length else at.damped()
@@ -209,7 +212,7 @@ class Iterate(Generic[X]):
     here: the problem at x.  mu, lam: multipliers of the latest QP, kkt: how far from optimal x is
     with them.  quasi: the Hessian where the problem has none of its own.  penalty: price of a
     violation.  damping: of the Hessian's diagonal.  best, lowest: least residual and value so far.
-    idle: iterations since either fell.
+    idle: iterations since either fell.  step: QPs so far.
     """
 
     problem: Minimax[X]
@@ -224,6 +227,7 @@ class Iterate(Generic[X]):
     best: float = np.inf
     lowest: float = np.inf
     idle: int = 0
+    step: int = 0
 
     @staticmethod
     def begin(problem: Minimax[X], x: X, settings: Sqp, mu: Array) -> Iterate[X]:
@@ -253,26 +257,38 @@ class Iterate(Generic[X]):
         If its constraints contradict each other, of their elastic relaxation.
         """
         here = self.here if f is None or c is None else replace(self.here, f=f, c=c)
-        plain = epigraph(here, hessian, self.problem.lower, self.problem.upper)
-        solution = qp(plain)
+        missed = rows = self.likely(here)
+        while len(missed):
+            some = here if len(rows) == len(here.f) else here.of(rows)
+            plain = epigraph(some, here.f.max(), hessian, self.problem.lower, self.problem.upper)
+            solution = qp(plain)
+            missed = forgotten(here, rows, solution)
+            rows = np.concatenate([rows, missed])
         if solution.solved or not len(here.c):
-            return read(solution, here, relaxed=False, penalty=0.0)
+            return read(solution, here, rows, relaxed=False, penalty=0.0)
         weight = max(self.penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
-        relaxed = qp(elastic(plain, len(here.f), weight))
-        return read(relaxed, here, relaxed=True, penalty=weight)
+        relaxed = qp(elastic(plain, len(rows), weight))
+        return read(relaxed, here, rows, relaxed=True, penalty=weight)
 
-    def judged(self, mu: Array, lam: Array) -> Iterate[X]:
-        """The same point with other multipliers."""
-        kkt = optimality(self.here, mu, lam, self.problem.lower, self.problem.upper)
-        return replace(self, mu=mu, lam=lam, kkt=kkt)
+    def likely(self, here: Linear) -> Array:
+        """The functions that may be the largest after a step: all, or of many the largest now."""
+        k, p = here.jacobian.shape
+        most = SHARE * p
+        if k <= 2 * most:
+            return np.arange(k)
+        large = here.f >= np.partition(here.f, k - most)[k - most]
+        return np.flatnonzero(large | (self.mu > 0.0) if self.step else large)
 
-    def counted(self) -> Iterate[X]:
-        """With one more iteration that made progress or not."""
-        value = float(self.here.f.max())
-        fell = value < self.lowest - ROUNDING * abs(self.lowest)
-        if self.kkt.residual < 0.9 * self.best or fell:
-            return replace(self, best=min(self.best, self.kkt.residual), lowest=value, idle=0)
-        return replace(self, idle=self.idle + 1)
+    def after(self, plan: Plan, penalty: float) -> Iterate[X]:
+        """The same point with the multipliers of a QP, one more iteration counted."""
+        kkt = optimality(self.here, plan.mu, plan.lam, self.problem.lower, self.problem.upper)
+        value, best, lowest, idle = float(self.here.f.max()), self.best, self.lowest, self.idle + 1
+        if kkt.residual < 0.9 * best or value < lowest - ROUNDING * abs(lowest):
+            best, lowest, idle = min(best, kkt.residual), value, 0
+        return replace(
+            self, mu=plan.mu, lam=plan.lam, kkt=kkt, penalty=penalty, best=best, lowest=lowest,
+            idle=idle, step=self.step + 1,
+        )  # fmt: skip
 
     def patience(self, tolerance: float) -> Status | None:
         """How it ends here, if it is optimal or nothing has become better for long."""
@@ -287,8 +303,8 @@ class Iterate(Generic[X]):
         """At the end of a step, less damped."""
         quasi = self.quasi and self.quasi.update(move, self.here, there, self.mu, self.lam)
         damping = self.damping / 10.0 if self.damping > 1e-6 else 0.0
-        end = replace(self, x=x, here=there, quasi=quasi, damping=damping)
-        return end.judged(self.mu, self.lam)
+        kkt = optimality(there, self.mu, self.lam, self.problem.lower, self.problem.upper)
+        return replace(self, x=x, here=there, kkt=kkt, quasi=quasi, damping=damping)
 
     def damped(self) -> Iterate[X]:
         """The same point, more damped, since no step led on."""
@@ -307,7 +323,7 @@ class Iterate(Generic[X]):
 def priced(at: Iterate[X], plan: Plan, tolerance: float) -> float | None:
     """The next price of a violation; None where no price makes the constraints agree."""
     if not plan.relaxed:
-        return max(at.penalty, 1.5 * float(np.abs(at.lam).max(initial=0.0)))
+        return max(at.penalty, 1.5 * float(np.abs(plan.lam).max(initial=0.0)))
     penalty = max(at.penalty, plan.penalty)
     if not hopeless(at.here, plan, at.problem.lower, at.problem.upper, tolerance):
         return penalty
@@ -332,8 +348,24 @@ class Plan:
 Resolve = Callable[[Array, Array], Plan]
 
 
-def epigraph(here: Linear, hessian: Array, lower: Array, upper: Array) -> Problem:
-    """min 1/2 d'Hd + v with rows f - max f + f'd <= v and lower - c <= c'd <= upper - c."""
+def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
+    """Functions beyond the chosen rows that an answer of the epigraph QP makes larger than v.
+
+    All, where there is no answer.
+    """
+    k, p = here.jacobian.shape
+    if len(rows) == k:
+        return rows[:0]
+    if not solution.solved:
+        return np.setdiff1d(np.arange(k), rows)
+    over = here.f - here.f.max() + here.jacobian @ solution.x[:p] - solution.x[p]
+    over[rows] = -np.inf
+    found = np.flatnonzero(over > 0.0)
+    return found[np.argsort(-over[found])[:p]]
+
+
+def epigraph(here: Linear, largest: float, hessian: Array, lower: Array, upper: Array) -> Problem:
+    """min 1/2 d'Hd + v with rows f - largest + f'd <= v and lower - c <= c'd <= upper - c."""
     k, p = here.jacobian.shape
     rows = np.zeros((k + len(here.c), p + 1))
     rows[:k, :p], rows[:k, p], rows[k:, :p] = here.jacobian, -1.0, here.normal
@@ -343,7 +375,7 @@ def epigraph(here: Linear, hessian: Array, lower: Array, upper: Array) -> Proble
     linear = np.zeros(p + 1)
     linear[p] = 1.0
     low = np.concatenate([np.full(k, -np.inf), lower - here.c])
-    high = np.concatenate([here.f.max() - here.f, upper - here.c])
+    high = np.concatenate([largest - here.f, upper - here.c])
     return Problem(quadratic, linear, rows, low, high)
 
 
@@ -362,13 +394,18 @@ def elastic(problem: Problem, k: int, weight: float) -> Problem:
     return Problem(quadratic, linear, rows, low, high)
 
 
-def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
-    """Step and multipliers of a QP answer; mu is brought back to sum one exactly."""
+def read(answer: Solution, here: Linear, rows: Array, relaxed: bool, penalty: float) -> Plan:
+    """Step and multipliers of a QP answer; mu is brought back to sum one exactly.
+
+    rows: the functions that the QP knew.
+    """
     k, p = here.jacobian.shape
-    usable = answer.solved
-    mu = np.maximum(answer.y[:k], 0.0) if usable else np.full(k, 1.0 / k)
+    usable, few = answer.solved, len(rows)
+    mu = np.zeros(k) if usable else np.full(k, 1.0 / k)
+    if usable:
+        mu[rows] = np.maximum(answer.y[:few], 0.0)
     total = mu.sum()
-    lam = answer.y[k : k + len(here.c)] if usable else np.zeros(len(here.c))
+    lam = answer.y[few : few + len(here.c)] if usable else np.zeros(len(here.c))
     return Plan(
         d=answer.x[:p] if usable else np.zeros(p),
         mu=mu / total if total > 0.0 else np.full(k, 1.0 / k),
@@ -383,13 +420,17 @@ def read(answer: Solution, here: Linear, relaxed: bool, penalty: float) -> Plan:
 
 def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
     """The KKT residuals at a point."""
-    stationarity = here.jacobian.T @ mu + here.normal.T @ lam
+    stationarity = mu @ here.jacobian
+    complementarity = float(mu @ (here.f.max() - here.f))
+    if not len(lam):
+        return Kkt(float(np.abs(stationarity).max(initial=0.0)), complementarity, 0.0)
+    stationarity = stationarity + lam @ here.normal
     held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
     room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
     slack = np.abs(lam[held] * room)
     return Kkt(
         float(np.abs(stationarity).max(initial=0.0)),
-        float(mu @ (here.f.max() - here.f) + slack.sum()),
+        complementarity + float(slack.sum()),
         float(excess(here.c, lower, upper).max(initial=0.0)),
     )
 
@@ -415,7 +456,9 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
     problem, x, here = at.problem, at.x, at.here
 
     def merit(f: Array, c: Array) -> float:
-        value = float(f.max() + at.penalty * excess(c, problem.lower, problem.upper).sum())
+        value = float(f.max())
+        if len(c):
+            value += at.penalty * float(excess(c, problem.lower, problem.upper).sum())
         return value if np.isfinite(value) else float("inf")
 
     start = merit(here.f, here.c)

@@ -266,7 +266,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
     names = Names(6, found.cell.target_names)
     units = tuple("m" if length else "rad" for length in names.linear)
     even = 0.5 * (found.covariance + found.covariance.T)
-    known = Uncertainty(names, units, even, Noise(0.0, 1e-10, 0.0), 100.0, "noise")
+    known = Uncertainty(names, units, even, lambda: Noise(0.0, 1e-10, 0.0), 100.0, "noise")
     file = without(fit, folder, covariance=known.to_dict())
     maps = []
     for frame in ("measurement", "base"):

@@ -139,6 +139,12 @@ def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
     assert_allclose([loose.gain, loose.evidence], [held.gain, held.evidence], rtol=1e-8)
 
 
+def test_where_no_line_is_sought_none_is_compared(lib: Library) -> None:
+    """No joint moves enough for a line: nothing aside, with and without effects chosen."""
+    for chosen in ([], list(lib.candidates[:1])):
+        assert bench(lib, chosen).beside(lib.aside(())).ranked(()) == []
+
+
 def test_a_selection_from_some_poses_looks_at_no_other(
     lib: Library, rough: Study, poses: Array, rng: np.random.Generator
 ) -> None:

@@ -92,6 +92,21 @@ def test_the_estimator_gives_the_sigma_of_the_fit(fit: mc.Fit) -> None:
     assert_allclose(ratio, 1.0, rtol=0, atol=rtol)
 
 
+def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
+    """What is told pose by pose is not in it; all else comes back."""
+    path = tmp_path / "fit.json"
+    fit.save(path, poses=False)
+    content = json.loads(path.read_text())
+    assert "poses" not in content
+    assert not {"measured", "weights", "crossed"} & content["arrays"].keys()
+    back = mc.load_fit(path)
+    assert [p.to_dict() for p in back.parameters] == [p.to_dict() for p in fit.parameters]
+    assert back.accuracy["train"].sse_mm2 == fit.accuracy["train"].sse_mm2
+    assert back.beyond.to_dict() == fit.beyond.to_dict()
+    assert not back.data.poses
+    assert_array_equal(back.predict(fit.data.q[:3]), fit.predict(fit.data.q[:3]))
+
+
 def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
     content = fit.to_dict()
     first = next(iter(content["targets_mm"].values()))

@@ -229,7 +229,7 @@ def test_a_prior_is_knowledge(robot: mc.Robot, noisy: Simulation, fit: Solved) -
     bayes = np.linalg.inv(flat.T @ flat / s**2 + np.diag(1.0 / sigma[model.active] ** 2))
     alike(by_noise(poses, Noise(0.0, s**2, 0.0)), bayes, SLOPES)
     group = np.arange(len(poses.error))
-    wide = by_poses(replace(poses, prior=0.0 * poses.prior), group)
+    wide = by_poses(Poses.of(Estimator(model, np.ones(3)), fit.state), group)
     held = by_poses(poses, group)
     place = [list(np.flatnonzero(model.active)).index(i) for i in at]
     assert np.all(np.diag(held)[place] < 0.5 * np.diag(wide)[place])

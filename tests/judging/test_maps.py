@@ -68,7 +68,9 @@ def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
     fit = mc.calibrate(robot, noisy.data, "sum")
     names, draws = Names(6, fit.cell.target_names), 20_000
     units = tuple("m" if length else "rad" for length in names.linear)
-    known = Uncertainty(names, units, fit.covariance, Noise(0.0, 1e-10, 0.0), 100.0, "noise")
+    known = Uncertainty(
+        names, units, fit.covariance, lambda: Noise(0.0, 1e-10, 0.0), 100.0, "noise"
+    )
     with pytest.raises(OptionError, match="no frame 'table'"):
         predictor(fit.cell, known, "table")
     q = noisy.data.q[:4]

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
@@ -11,6 +12,7 @@ from minimax_cal.measuring.grouping import (
     clusters,
     grouped,
     groups,
+    nearest_means,
     parts,
     split,
     with_groups,
@@ -25,6 +27,21 @@ def made(q: Array, **columns: Array) -> Measurements:
 def spread(rng: np.random.Generator, places: int, each: int, size: float) -> Array:
     centre = rng.uniform(-2.0, 2.0, (places, 6))
     return np.repeat(centre, each, axis=0) + size * rng.normal(size=(places * each, 6))
+
+
+@pytest.mark.parametrize("m", [7, 40, 400])
+def test_regions_are_those_of_scipy(m: int, rng: np.random.Generator) -> None:
+    q = rng.normal(size=(m, 6))
+    found = scipy.cluster.vq.kmeans2(q, 5, minit="++", seed=np.random.default_rng(0))[1]
+    assert_array_equal(nearest_means(q, 5, np.random.default_rng(0)), found)
+
+
+def test_groups_are_asked_again_where_labels_differ(rng: np.random.Generator) -> None:
+    """Poses whose joints are the same array, with labels and without."""
+    q = rng.uniform(-2.0, 2.0, (20, 6))
+    plain = made(q)
+    named = replace(plain, columns={"pose": np.repeat([f"p{i}" for i in range(10)], 2)})
+    assert [len(np.unique(groups(data))) for data in (plain, named, plain)] == [20, 10, 20]
 
 
 def test_visits_that_differ_by_less_than_the_arm_repeats_are_one_pose(

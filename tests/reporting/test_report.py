@@ -381,7 +381,7 @@ def test_correlations_of_a_known_covariance() -> None:
     covariance = np.full((names.count,) * 2, np.nan)
     covariance[:3, :3] = [[4, 3, 0], [3, 9, 0], [0, 0, 0]]
     noise = Noise(0.0, 1.0, 0.0)
-    known = Uncertainty(names, ("m",) * names.count, covariance, noise, 9.0, "poses")
+    known = Uncertainty(names, ("m",) * names.count, covariance, lambda: noise, 9.0, "poses")
     told, found = correlations(known)
     assert told == names.all[:3]
     assert_allclose(found[:2, :2], [[1.0, 0.5], [0.5, 1.0]])

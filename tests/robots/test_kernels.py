@@ -69,6 +69,28 @@ def test_pairs(
     for share in (1.0, 0.6):
         which = np.flatnonzero(rng.random(model.names.count) < share)
         near(fast.normal(*at, *model.sight, which), plain.normal(*at, *model.sight, which))
+        some = (*(part[:1] for part in at), *model.sight, which)
+        near(fast.rows(*some, 20, 90), plain.rows(*some, 20, 90))
+        near(fast.squares(*some), plain.squares(*some))
+
+
+@pytest.mark.parametrize(("name", "robots", "effects"), CELLS)
+def test_rows_make_the_normal_equations(
+    name: str, robots: int, effects: int, rng: np.random.Generator
+) -> None:
+    model, state = cell(name, 1, effects, rng)
+    which = np.flatnonzero(rng.random(model.names.count) < 0.8)
+    given = *arrays_of(state), *model.sight, which
+    error, J = plain.rows(*given, 0, POSES)
+    cost, gradient, gram = plain.normal(*given)
+    sums = (
+        (error**2).sum(axis=(1, 2)),
+        np.einsum("kpic,kic->kp", J, error),
+        np.einsum("kpic,kqic->kpq", J, J),
+    )
+    near(sums, (cost[0], gradient[0], gram[0]))
+    f, slope = plain.squares(*given)
+    near((f.sum(axis=1), slope.sum(axis=1)), (cost[0], -2.0 * gradient[0]))
 
 
 @pytest.mark.parametrize(("name", "robots", "effects"), CELLS)

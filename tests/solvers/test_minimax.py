@@ -249,3 +249,21 @@ def test_a_qp_solver_that_fails_ends_in_a_status(robot: mc.Robot, noisy: Simulat
     found = minimax.solve(problem, x, broken)
     assert found.status is Status.FAILED
     assert found.x is x
+
+
+def test_qps_of_some_functions_are_those_of_all(
+    robot: mc.Robot, noisy: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The worst of many points: the QPs that begin with a few take the same steps."""
+    model, x = warm(robot, noisy.data)
+    problem = minimax_problem(model, x, measured_distances(noisy.data), "two-sided", "point")
+    qp = partial(solve_qp, name="daqp", tolerance=1e-10)
+    few = minimax.solve(problem, x, qp)
+    asked = []
+    monkeypatch.setattr(minimax, "SHARE", len(few.f))
+    whole = minimax.solve(problem, x, lambda one: (asked.append(len(one.l)), qp(one))[1])
+    assert len(few.f) > 4 * int(model.active.sum())
+    assert min(asked) == len(few.f) + len(few.c)
+    assert few.iterations == whole.iterations
+    assert_allclose(few.x.mdh, whole.x.mdh, rtol=0, atol=1e-11)
+    assert_allclose(few.mu, whole.mu, rtol=0, atol=1e-8)

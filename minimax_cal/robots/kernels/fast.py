@@ -280,6 +280,59 @@ def normal(
 
 
 @compiled
+def rows(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array, lo: int,
+    hi: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """See `plain.rows`."""
+    n, k, p, c = mdh.shape[1], len(y), len(which), hi - lo
+    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
+    slot = np.full(first, -1)
+    s, end = int(np.searchsorted(which, first)), int(np.searchsorted(which, last))
+    slot[which[:s]] = np.arange(s)
+    chosen = which[end:] - last
+    V, W = np.zeros((s, 3, c)), np.zeros((s, 3, c))
+    axes, o = unwound(mdh[0], q[lo:hi], prismatic, slot, V, W)
+    error, out = np.empty((k, 3, c)), np.zeros((k, p, 3, c))
+    J, swung = np.empty((s + p - end, 3, c)), np.empty((3, c))
+    for t in range(k):
+        spot, root = targets[0, t], np.sqrt(weight[t, lo:hi])
+        shift = shifted(effects[0], fields, moved, t, lo, hi)
+        sighted(axes, o, rotation[0], origin[0], spot, y[t, :, lo:hi], root, shift, error[t],
+                swung)  # fmt: skip
+        sensed(J, V, W, spot, root, slot[5 * n + 3 :], swung, axes, fields, chosen, t, lo)
+        out[t, :s], out[t, end:] = J[:s], J[s:]
+        for row in range(s, end):
+            axis = which[row] - first - 3 * t
+            if 0 <= axis < 3:
+                out[t, row, axis] = root
+    return error, out
+
+
+@compiled
+def squares(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """See `plain.squares`."""
+    k, m, p = len(y), len(q), len(which)
+    f, slope = np.zeros((k, m)), np.zeros((k, m, p))
+    for lo in range(0, m, BLOCK):
+        hi = min(lo + BLOCK, m)
+        error, J = rows(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
+                        moved, which, lo, hi)  # fmt: skip
+        for t in range(k):
+            for i in range(3):
+                for r in range(hi - lo):
+                    f[t, lo + r] += error[t, i, r] ** 2
+                for row in range(p):
+                    for r in range(hi - lo):
+                        slope[t, lo + r, row] -= 2.0 * J[t, row, i, r] * error[t, i, r]
+    return f, slope
+
+
+@compiled
 def solved(matrix: Array, right: Array) -> tuple[Array, bool]:
     """x (p,) of matrix x = right by Cholesky, and whether the matrix (p, p) was definite enough."""
     p = len(right)

@@ -119,15 +119,16 @@ def unwound(mdh: Array, q: Array, prismatic: Array) -> tuple[Array, Array, Array
     ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     bent, slides = beta.any(axis=(0, 2, 3)), prismatic.any()
     for j in range(n - 1, -1, -1):
-        axis[:, 4 * n + j], through[:, 3 * n + j], through[:, 4 * n + j] = y, o, o
+        axis[:, 4 * n + j], through[:, 3 * n + j] = y, o
         if bent[j]:
             x, z = turn_pair(cb[:, j], sb[:, j], x, z)
-        axis[:, j] = axis[:, 3 * n + j] = x
-        z, y = turn_pair(ca[:, j], sa[:, j], z, y)
-        axis[:, n + j] = axis[:, 2 * n + j] = z
+        axis[:, j] = x
+        z, y = turn_pair(ca[:, j], sa[:, j], z, y, axis[:, n + j])
         o = o - a[:, j] * x - (d[:, j] + q[:, j] * prismatic[j] if slides else d[:, j]) * z
         through[:, 2 * n + j] = o
         y, x = turn_pair(cos[:, j], sin[:, j], y, x)
+    axis[:, 2 * n : 3 * n], axis[:, 3 * n : 4 * n] = axis[:, n : 2 * n], axis[:, :n]
+    through[:, 4 * n : 5 * n] = through[:, 3 * n : 4 * n]
     axes = axis[:, 5 * n : 5 * n + 3]
     axes[:, 0], axes[:, 1], axes[:, 2] = x, y, z
     axis[:, 5 * n + 3 :], through[:, 5 * n + 3 :] = axes, o[:, None]
@@ -214,16 +215,8 @@ def normal(
     total, pull, both = np.zeros((B, k)), np.zeros((B, k, h)), np.zeros((B, k, h, h))
     side, own = np.zeros((B, k, h, 3)), np.zeros((B, k, 3))
     for rows in blocks(len(q), B * k):
-        arm, shift = unwound(mdh, q[rows], prismatic), shifted(effects, fields, moved, rows)
-        error, swung = sighted(*arm[:2], rotation, origin, targets, y[..., rows], shift)
-        J = sensed(arm, targets, swung, which[:s])
-        if end < p:
-            field = np.swapaxes(fields[which[end:] - last][..., rows], 0, 1)
-            more = inside(arm[0], np.broadcast_to(field, (B, *field.shape)))
-            J = np.concatenate([J, more], axis=2)
-        root = np.sqrt(weight[:, rows])
-        J *= root[:, None, None]
-        error *= root[:, None]
+        error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
+                                fields, moved, which, rows)  # fmt: skip
         flat = J.reshape(B, k, h, -1)
         total += np.einsum("bkic,bkic->bk", error, error)
         pull += (flat @ error.reshape(B, k, -1, 1))[..., 0]
@@ -231,20 +224,86 @@ def normal(
         side += (J.reshape(B, k, 3 * h, -1) @ root[..., None]).reshape(side.shape)
         own += (error @ root[..., None])[..., 0]
     gradient, gram = np.zeros((B, k, p)), np.zeros((B, k, p, p))
-    held = ((slice(0, s), slice(0, s)), (slice(end, p), slice(s, h)))  # there, and among `both`
+    held = [(slice(0, s), slice(0, s)), (slice(end, p), slice(s, h))]  # there, and among `both`
+    held = held[: 2 if end < p else 1]
     for to, at in held:
         gradient[..., to] = pull[..., at]
         for to_too, at_too in held:
             gram[..., to, to_too] = both[..., at, at_too]
-    for t in range(k):
-        lo, hi = np.searchsorted(which, (first + 3 * t, first + 3 * t + 3))
+    edges, square = np.searchsorted(which, first + 3 * np.arange(k + 1)).tolist(), weight.sum(1)
+    for t, (lo, hi) in enumerate(itertools.pairwise(edges)):
         axis = which[lo:hi] - first - 3 * t
         gradient[:, t, lo:hi] = own[:, t, axis]
-        gram[:, t, range(lo, hi), range(lo, hi)] = weight[t].sum()
+        gram[:, t, lo:hi, lo:hi] = square[t] * np.eye(hi - lo)
         for to, at in held:
             gram[:, t, to, lo:hi] = part = side[:, t, at][..., axis]
             gram[:, t, lo:hi, to] = np.swapaxes(part, -1, -2)
     return total, gradient, gram
+
+
+def shared(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
+    poses: slice,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Weighted errors (B, k, 3, c), columns that all targets share (B, k, h, 3, c), roots (k, c).
+
+    The roots are those of the weights.  Of some poses, in the axes of the flange; as `normal`.
+    """
+    n, k = mdh.shape[1], len(y)
+    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
+    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
+    arm, shift = unwound(mdh, q[poses], prismatic), shifted(effects, fields, moved, poses)
+    error, swung = sighted(*arm[:2], rotation, origin, targets, y[..., poses], shift)
+    J = sensed(arm, targets, swung, which[:s])
+    if end < len(which):
+        field = np.swapaxes(fields[which[end:] - last][..., poses], 0, 1)
+        more = inside(arm[0], np.broadcast_to(field, (len(mdh), *field.shape)))
+        J = np.concatenate([J, more], axis=2)
+    root = np.sqrt(weight[:, poses])
+    J *= root[:, None, None]
+    error *= root[:, None]
+    return error, J, root
+
+
+def rows(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array, lo: int,
+    hi: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Weighted errors (k, 3, c) of the poses lo to hi, and their Jacobian J (k, p, 3, c).
+
+    In the axes of the flange, of a batch of one; the errors' derivative is -J.  As `normal`.
+    """
+    n, k, p = mdh.shape[1], len(y), len(which)
+    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
+    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
+    error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
+                            fields, moved, which, slice(lo, hi))  # fmt: skip
+    out = np.zeros((k, p, *error.shape[2:]))
+    out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
+    for row in range(s, end):
+        t, axis = divmod(int(which[row]) - first, 3)
+        out[t, row, axis] = root[t]
+    return error[0], out
+
+
+def squares(
+    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
+    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Weighted squared distance of every point (k, m) [m^2] and its derivative (k, m, p).
+
+    Of a batch of one, as `normal`.
+    """
+    k, m = weight.shape
+    f, slope = np.zeros((k, m)), np.zeros((k, m, len(which)))
+    for part in blocks(m, k):
+        error, J = rows(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
+                        moved, which, part.start, part.stop)  # fmt: skip
+        f[:, part] = np.einsum("kic,kic->kc", error, error)
+        slope[:, part] = -2.0 * np.einsum("kpic,kic->kcp", J, error)
+    return f, slope
 
 
 def sensed(
@@ -261,11 +320,12 @@ def sensed(
     out = np.empty((len(axis), targets.shape[1], len(which), *axis.shape[2:]))
     for slide in (slice(0, angles), slice(moves, turns)):
         out[:, :, slide] = axis[:, None, which[slide]]
-    turning = which[np.r_[angles:moves, turns : len(which)]]
+    turning = np.concatenate([which[angles:moves], which[turns:]])
     about = axis[:, turning]
     swing = cross(about[:, None], targets[:, :, None, :, None])
     swing += cross(through[:, turning], about)[:, None]
-    out[:, :, angles:moves], out[:, :, turns:] = np.split(swing, [moves - angles], axis=2)
+    out[:, :, angles:moves] = swing[:, :, : moves - angles]
+    out[:, :, turns:] = swing[:, :, moves - angles :]
     if swung.size:  # the base takes along what effects have moved
         out[:, :, turns:] += cross(axis[:, None, which[turns:]], swung[:, :, None])
     return out
@@ -284,18 +344,20 @@ def descend(
     ended well: each step led down, and the last one was small.
     """
     at, costs = (mdh, rotation, origin, targets, effects), [np.inf]
-    count = max(int(np.count_nonzero(weight)), 1)
+    count, known = max(int(np.count_nonzero(weight)), 1), bool(hold.any())
     for _ in range(most):
         F, g, H = normal(*at, q, prismatic, y, weight, fields, moved, which)
-        off = mean - values(*at, which)
-        slope, matrix = g[0].sum(axis=0) + hold * off, H[0].sum(axis=0) + np.diag(hold)
-        costs.append(F.sum() + (hold * off * off).sum())
+        slope, matrix, paid = g[0].sum(axis=0), H[0].sum(axis=0), 0.0
+        if known:
+            off = mean - values(*at, which)
+            slope, matrix, paid = slope + hold * off, matrix + np.diag(hold), hold @ (off * off)
+        costs.append(F.sum() + paid)
         if not costs[-1] <= costs[-2] * (1.0 + RISE):
             return *at, np.array(costs[1:]), False
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        scaled = matrix * np.outer(scale, scale)
+        scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+        scaled = matrix * scale[:, None] * scale
         try:
-            if np.diag(np.linalg.cholesky(scaled)).min() ** 2 <= PIVOT:
+            if np.linalg.cholesky(scaled).diagonal().min() ** 2 <= PIVOT:
                 return *at, np.array(costs[1:]), False
         except np.linalg.LinAlgError:
             return *at, np.array(costs[1:]), False
@@ -323,13 +385,13 @@ def stepped(
     n, k = mdh.shape[1], targets.shape[1]
     full = np.zeros(5 * n + 6 + 3 * k + effects.shape[1])
     full[which] = dx
-    links, move, turn, spots, more = np.split(full, np.cumsum([5 * n, 3, 3, 3 * k]))
+    base, spots = full[5 * n : 5 * n + 6], full[5 * n + 6 : 5 * n + 6 + 3 * k]
     return (
-        mdh + links.reshape(5, n).T,
-        rotation @ turned(turn),
-        origin + rotation[0] @ move,
+        mdh + full[: 5 * n].reshape(5, n).T,
+        rotation @ turned(base[3:]),
+        origin + rotation[0] @ base[:3],
         targets + spots.reshape(k, 3),
-        effects + more,
+        effects + full[5 * n + 6 + 3 * k :],
     )
 
 
