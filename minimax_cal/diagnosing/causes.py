@@ -9,7 +9,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, explained, heard, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -17,7 +17,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import ENOUGH, EXACT
+from minimax_cal.evidence.limits import CERTAIN, ENOUGH, EXACT
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
@@ -61,8 +61,8 @@ def causes_of(
     progress("effects")
     lib, choice = chosen(study, exclude)
     traces = left_by(study, choice)
-    loud = heard(traces, explained(study.rows, choice), study.rows.count)
-    plain, study = study, weighed_anew(study, choice.known, each=loud is None)
+    left = any(trace.p * len(traces) < CERTAIN for trace in traces)  # each joint would absorb it
+    plain, study = study, weighed_anew(study, choice.known, each=not left)
     if study is not plain:
         progress("effects beside noises that differ")
         lib, choice = chosen(study, exclude, choice.chosen)

@@ -328,7 +328,7 @@ def test_new_data_bring_their_own_columns(many: Many) -> None:
         ("gear_ripple", "choose J1, J2"),
         ("gear_error:J2:turns", "write 'turns' as a name and number, turns=17"),
         ("gear_error:J2:turns=two", "write 'turns=two' as a name and number"),
-        ("gear_error:J2:turn=2", "no choice 'turn'; choose turns"),
+        ("gear_error:J2:turn=2", "no choice 'turn'; choose orders, turns"),
         ("joint_coupling:J5:source=5", "no source 5; choose 3, 4"),
         ("tool_flex:all:lever=3", "no lever 3; choose 0, 1, 2"),
         ("backlash:J2:turns=2", "no choice 'turns'; its law has none"),
