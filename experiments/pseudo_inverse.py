@@ -12,6 +12,7 @@ the same mu to square radians and to square lengths, and a least step is the lea
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -23,10 +24,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 ROUNDING = float(np.finfo(float).eps)
 LIMIT, CONVERGED, FAILED = 0, 1, 2  # how an iteration ended
 MOST_DAMPING = 1e30
+LOOPS = "MINIMAX_CAL_LOOPS"  # plain in the environment: short ways end before they were compiled
 
 
 def compiled(function: F) -> F:
-    """The function compiled by numba where that is installed."""
+    """The function compiled by numba where that is installed, unless the environment forbids it."""
+    if os.environ.get(LOOPS) == "plain":
+        return function
     try:
         from numba import njit
     except ImportError:

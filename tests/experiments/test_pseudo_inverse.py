@@ -1,8 +1,11 @@
 """Paper S to the letter, against the library and against differences."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,12 +67,24 @@ def test_the_least_step_is_that_of_the_pseudo_inverse() -> None:
     assert_allclose(least_step(H, g), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
+COMPARED = """
+import sys; sys.path[:0] = [{root!r}, {here!r}]
+from test_pseudo_inverse import joint_rows, some_arm
+import numpy as np
+arm = some_arm()
+print(np.abs(joint_rows(*arm)[0] - joint_rows.py_func(*arm)[0]).max())
+"""
+
+
+@pytest.mark.slow
 def test_compiled_and_plain_are_the_same() -> None:
-    plain: Any = getattr(joint_rows, "py_func", None)
-    if plain is None:
-        pytest.skip("numba is not installed: pip install 'minimax-cal[fast]'")
-    at, q, y = some_arm()
-    assert_allclose(joint_rows(at, q, y)[0], plain(at, q, y)[0], rtol=0, atol=1e-13)
+    pytest.importorskip("numba", reason="needs numba: pip install 'minimax-cal[fast]'")
+    here = Path(__file__).parent
+    code = COMPARED.format(root=str(here.parent.parent), here=str(here))
+    environment = {**os.environ, pseudo_inverse.LOOPS: "compiled"}
+    made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True,
+                          text=True, check=True)  # fmt: skip
+    assert float(made.stdout) < 1e-13
 
 
 Way = tuple[int, float, int, np.ndarray]
