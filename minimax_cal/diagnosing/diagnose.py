@@ -159,6 +159,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     if not options.quick:
         beyond = beyond_of(study, causes, judges, progress)
     wrong = doubts(robot, study.fit, study.nominal.error(study.data))
+    told = (*asked.data.notices, *notices, *clean.remarks)
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
@@ -176,14 +177,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure_in=structure_left[0],
         where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(
-            *asked.data.notices,
-            *notices,
-            *clean.remarks,
-            *study.fit.notices,
-            *foot_notices(ladder.last, clean.data),
-            *wrong,
-        ),
+        notices=(*told, *study.fit.notices, *foot_notices(ladder.last, clean.data), *wrong),
         provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
