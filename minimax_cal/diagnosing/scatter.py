@@ -38,7 +38,7 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     if dof < LEAST_DOF or noise.variance < EXACT**2:
         return study
     joints, sight = motions(study)
-    rest = Rest.of(study, known, whole)
+    rest = WholePoses.of(study, known, whole)
     turned, (along, across) = rest.products(joints), rest.products(sight)
     size, alike = (noise.jitter**2, noise.variance), turned.sum(axis=0)
     least, _ = rest.likeliest([alike, along + across], np.array(size))
@@ -47,7 +47,7 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     if chi2.sf(least - most, len(parts) - 2) > UNLIKE:
         return study
     scatter = np.broadcast_to(np.sqrt(found[:-2]), len(turned))
-    return weighed(study, scatter, found[-2], found[-1])
+    return weighed(study, scatter, sight, found[-2:])
 
 
 def motions(study: Study) -> tuple[list[Array], list[Array]]:
@@ -65,12 +65,13 @@ def motions(study: Study) -> tuple[list[Array], list[Array]]:
     return list(scene.jacobian[:, None]), [parts[0], np.concatenate(parts[1:])]
 
 
-def weighed(study: Study, joints: Array, along: float, across: float) -> Study:
+def weighed(study: Study, joints: Array, sight: Sequence[Array], size: Array) -> Study:
     """The study, its rows weighed by given noises.
 
-    joints: (n,) standard deviations.  along, across: variances of a coordinate [m^2].
+    joints: (n,) standard deviations.  sight: motions along and across it, as `motions`; size: (2,)
+    the variance of a coordinate of each [m^2].
     """
-    _, sight = motions(study)
+    along, across = size
     usual = max(float(np.sqrt(np.mean(joints**2))), LEAST)
     mean = (along + 2.0 * across) / 3.0
     both = max(min(along, across), STEADY * mean)
@@ -84,7 +85,7 @@ def weighed(study: Study, joints: Array, along: float, across: float) -> Study:
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class WholePoses:
     """Poses at which every point was measured.
 
     study: whose rows they are.  whole: (m,) which poses.  y: (w, r).  fitted: (w, r, p).
@@ -96,12 +97,12 @@ class Rest:
     fitted: Array
 
     @staticmethod
-    def of(study: Study, known: Array, whole: Array) -> Rest:
+    def of(study: Study, known: Array, whole: Array) -> WholePoses:
         """The rows of some poses, with geometry and known columns (N, q) to be fitted."""
         m, r = study.rows.weight.shape
         columns = orthonormal(np.concatenate([study.rows.basis, known], axis=1))
         y = study.rows.error.reshape(m, r)[whole]
-        return Rest(study, whole, y, columns.reshape(m, r, -1)[whole])
+        return WholePoses(study, whole, y, columns.reshape(m, r, -1)[whole])
 
     def products(self, fields: Sequence[Array]) -> Array:
         """(g, w, r, r) covariance that fields (d, k, 3, m) of unit variance give."""

@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
-from minimax_cal.evidence.products import LEAST, within
+from minimax_cal.evidence.products import LEAST, At, within
 from minimax_cal.ground.arrays import Array
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
@@ -306,11 +306,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
     index = np.concatenate([main, loose])
     at = products.at(ratios, index)
-    q, each = len(main), range(len(index))
-    gram = at.lines[:, :, index].copy()
-    gram[:, each, each] += LEAST * at.whole[:, index]
-    gram[:, range(q, len(index)), range(q, len(index))] += ridge * noise.variance  # a prior
-    factor = triangles(gram)
+    factor = triangles(beside_priors(at, index, ridge * noise.variance))
     both = np.concatenate([at.pull[..., None], at.lines], axis=2)
     part = np.stack([
         solve_triangular(lower, lines, lower=True, check_finite=False).T
@@ -318,7 +314,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     ]) if len(index) else np.zeros((len(ratios), both.shape[2], 0))  # fmt: skip
     before, part = part[:, 0], part[:, 1:]
     total = np.maximum(at.error[:, 0] - (before**2).sum(axis=1), ROUNDING * at.square + 1e-300)
-    size = np.einsum("sff->sf", factor)[:, :q]
+    size = np.einsum("sff->sf", factor)[:, : len(main)]
     spread = np.log1p(ratios[:, None] * rows.variance_ratio[products.kept]).sum(axis=1)
     settings = Settings(
         ratios=ratios,
@@ -341,6 +337,18 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     return Bench(lib, tuple(chosen), noise, settings, held, dof, tries)
 
 
+def beside_priors(at: At, index: Array, ridge: Array) -> Array:
+    """(s, q, q) products among columns, those of the doubts, which come last, with their priors.
+
+    index: (q,) columns.  ridge: (r,) that is added for each doubt.
+    """
+    each = range(len(index))
+    gram = at.lines[:, :, index].copy()
+    gram[:, each, each] += LEAST * at.whole[:, index]
+    gram[:, each, each] += np.pad(ridge, (len(index) - len(ridge), 0))
+    return gram
+
+
 def stacked(first: Array, part: Array, second: Array) -> Array:
     """Lower triangles of two sets of columns, (s, r, r) and (s, q, q), and (s, r, q) between."""
     r = first.shape[1]
@@ -360,8 +368,7 @@ def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[A
     if not len(index):
         return ()
     at = lib.products.at(np.array([noise.ratio]), index)
-    gram = at.lines[0][:, index].copy()
-    gram[range(len(main), len(index)), range(len(main), len(index))] += ridge * noise.variance
+    gram = beside_priors(at, index, ridge * noise.variance)[0]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), 1e-12, hermitian=True)
     value = inverse @ (at.pull[0] / scale) / scale

@@ -83,12 +83,7 @@ class Kind:
             np.array([len(c.main) + c.shapes for c in same]),
             np.array([c.tries for c in same]),
             np.array([effect.typical for effect in effects]),
-            np.array(
-                [
-                    effect.positive and len(c.main) == 1
-                    for c, effect in zip(same, effects, strict=True)
-                ]
-            ),
+            np.array([effect.positive for effect in effects]) & (main.shape[1] == 1),
         )
 
 

@@ -133,13 +133,8 @@ def select(
 def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
     """The effects without those that the others made needless, the weakest first."""
     while fits:
-        noise = noise_beside(lib, fits)
-        values = together(lib, fits, noise)
-        signals = [
-            float(((value / np.maximum(sigma, 1e-300)) ** 2).sum()) / len(value)
-            for value, sigma in values
-        ]
-        weakest = int(np.argmin(signals))
+        values = together(lib, fits, noise_beside(lib, fits))
+        weakest = int(np.argmin([np.mean((v / np.maximum(s, 1e-300)) ** 2) for v, s in values]))
         chosen, others = without(fits, weakest)
         table = bench(lib, chosen, others)
         if table.p_value(table.added(fits[weakest].candidate)) <= level:
@@ -242,13 +237,11 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
         return lib, fits
     for _ in range(3):
         changed = False
-        others_than_last = range(min(len(fits) - 1, REFINED))  # it was just chosen beside them
-        for number in others_than_last:
+        for number in range(min(len(fits) - 1, REFINED)):  # the last was just chosen beside them
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
-            others_best = (o for o in table.everyone if not repeated(o.candidate, chosen))
-            top = next(others_best, own)
+            top = next((o for o in table.everyone if not repeated(o.candidate, chosen)), own)
             if top.candidate is not own.candidate and top.evidence > own.evidence + TIE:
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from problems_fit import study
 
-from minimax_cal.diagnosing.scatter import Rest, motions, weighed_anew
+from minimax_cal.diagnosing.scatter import WholePoses, motions, weighed_anew
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.options import silent
@@ -78,7 +78,7 @@ def test_an_instrument_whose_directions_differ(plain: Study) -> None:
 def test_the_slope_is_that_of_the_likelihood(plain: Study) -> None:
     made = drawn(plain, np.full(6, QUIET), POINT, POINT, 3)
     joints, sight = motions(made)
-    rest = Rest.of(made, nothing(made), np.ones(made.scene.poses, dtype=bool))
+    rest = WholePoses.of(made, nothing(made), np.ones(made.scene.poses, dtype=bool))
     parts = np.concatenate([rest.products(joints), rest.products(sight)])
     at = np.log(np.array([*np.linspace(0.5, 2.0, 6) * QUIET, POINT, 2.0 * POINT]) ** 2)
     _, slope = rest.cost(at, parts)
