@@ -234,6 +234,20 @@ def summed(
 
 
 @compiled
+def pulled(error: Array, J: Array) -> tuple[Array, Array]:
+    """See `plain.pulled`."""
+    k, h, _, c = J.shape
+    square, pull = np.empty((k, c)), np.empty((k, c, h))
+    for t in range(k):
+        for r in range(c):
+            u, v, w = error[t, 0, r], error[t, 1, r], error[t, 2, r]
+            square[t, r] = u * u + v * v + w * w
+            for i in range(h):
+                pull[t, r, i] = u * J[t, i, 0, r] + v * J[t, i, 1, r] + w * J[t, i, 2, r]
+    return square, pull
+
+
+@compiled
 def cholesky(matrix: Array, right: Array, x: Array) -> bool:
     """Write x (p,) of matrix x = right; False where the matrix (p, p) is not definite enough."""
     p = len(right)

@@ -233,6 +233,14 @@ def summed(
     gram[:, t, row, row] += square[t]
 
 
+def pulled(error: Array, J: Array) -> tuple[Array, Array]:
+    """Square of every point's error (k, c), and J'e of each (k, c, h).
+
+    error: (k, 3, c), J: (k, h, 3, c) of one robot, as `sighted` and `sensed`.
+    """
+    return np.einsum("kic,kic->kc", error, error), np.einsum("khic,kic->kch", J, error)
+
+
 def solved(
     cost: Array, gradient: Array, gram: Array, off: Array, hold: Array
 ) -> tuple[Array, float, float, bool]:

@@ -75,6 +75,12 @@ class Columns:
         s, end = which.searchsorted((first, first + 3 * at[3].shape[1])).tolist()
         return Columns(which, first, s, end)
 
+    @property
+    def own(self) -> list[tuple[int, int, int]]:
+        """Place, target and axis of those of targets."""
+        told = self.which[self.s : self.end] - self.first
+        return [(row, *divmod(at, 3)) for row, at in enumerate(told.tolist(), self.s)]
+
     def shared(
         self, own: ModuleType, at: At, sight: Sight, lo: int, hi: int
     ) -> tuple[Array, Array, Array]:
@@ -117,8 +123,7 @@ def rows(
     s, end = columns.s, columns.end
     out = np.zeros((len(root), len(which), *error.shape[2:]))
     out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
-    for row in range(s, end):
-        t, axis = divmod(int(which[row]) - columns.first, 3)
+    for row, t, axis in columns.own:
         out[t, row, axis] = root[t]
     return error[0], out
 
@@ -128,12 +133,15 @@ def squares(own: ModuleType, at: At, sight: Sight, which: Array) -> tuple[Array,
 
     Of a batch of one, as `normal`.
     """
-    k, m = sight[3].shape
-    f, slope = np.zeros((k, m)), np.zeros((k, m, len(which)))
+    (k, m), columns = sight[3].shape, Columns.of(at, which)
+    f, slope, s, end = np.empty((k, m)), np.zeros((k, m, len(which))), columns.s, columns.end
     for lo, hi in blocks(m, k, own.BLOCK):
-        error, J = rows(own, at, sight, which, lo, hi)
-        f[:, lo:hi] = np.einsum("kic,kic->kc", error, error)
-        slope[:, lo:hi] = -2.0 * np.einsum("kpic,kic->kcp", J, error)
+        error, J, root = columns.shared(own, at, sight, lo, hi)
+        f[:, lo:hi], pull = own.pulled(error[0], J[0])
+        slope[:, lo:hi, :s], slope[:, lo:hi, end:] = pull[..., :s], pull[..., s:]
+        for row, t, axis in columns.own:
+            slope[t, lo:hi, row] = root[t] * error[0, t, axis]
+    slope *= -2.0
     return f, slope
 
 
