@@ -178,6 +178,10 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
 COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
 
 
+# and those of `plenty_of_poses`
+DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
+
+
 def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:
     """The parameters to give up so that the Gram matrix of the others has full rank.
 
@@ -215,8 +219,10 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
 
 def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
     """A model of the same cell at random poses over the joints' whole range."""
-    k = len(model.y)
-    q = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
+    k, asked = len(model.y), DRAWN.setdefault(robot, {})
+    if poses not in asked:
+        asked[poses] = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
+    q = asked[poses]
     return Model(
         q=q,
         prismatic=model.prismatic,
