@@ -193,7 +193,11 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
         return []
     scale = np.sqrt(np.diag(gram)[chosen])
     scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(gram[np.ix_(chosen, chosen)] / np.outer(scale, scale))
+    alike = gram[np.ix_(chosen, chosen)] / np.outer(scale, scale)
+    values = np.linalg.eigvalsh(alike)  # mostly that is all there is to see
+    if values[0] > rank**2 * values[-1]:
+        return []
+    values, vectors = np.linalg.eigh(alike)
     null = vectors[:, values <= (rank**2) * values[-1]]
     gone: list[int] = []
     place = np.full(len(active), -1)

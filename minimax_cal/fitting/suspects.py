@@ -116,11 +116,15 @@ class Spread:
     dof: float
 
     def p_value(self, found: Scores) -> Array:
-        """(k, m) that an ordinary point is as far off or farther; 1 where it was not judged."""
-        judged = found.directions > 0
-        directions = np.maximum(found.directions, 1)
-        ratio = found.square / directions / self.scale**2
-        return np.where(judged, fdtrc(directions, self.dof, ratio), 1.0)
+        """(k, m) that an ordinary point is as far off or farther.
+
+        1 where it was not judged, and where that is more than LEVEL: no list asks by how much.
+        """
+        edge = np.append(np.inf, fdtri((1, 2, 3), self.dof, 1.0 - LEVEL))[found.directions]
+        ratio = found.square / np.maximum(found.directions, 1) / self.scale**2
+        out, some = np.ones(ratio.shape), ratio >= edge
+        out[some] = fdtrc(found.directions[some], self.dof, ratio[some])
+        return out
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
@@ -141,7 +145,7 @@ def spread_of(found: Scores, dof: float) -> Spread:
     mean_square = found.square[judged] / directions
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
-    middle = np.median(mean_square / fdtri(directions, dof, 0.5))
+    middle = np.median(mean_square / fdtri((1, 2, 3), dof, 0.5)[directions - 1])
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(ROUNDS):

@@ -80,10 +80,11 @@ class Estimator:
 
         group: (m,) rows with the same number are one pose.  Returns the rows too.
         """
-        _, member = np.unique(group, return_inverse=True)
-        count, m = int(member.max()) + 1, len(member)
+        m = len(group)
         if m <= most:
             return self, np.arange(m)
+        _, member = np.unique(group, return_inverse=True)
+        count = int(member.max()) + 1
         chosen = np.random.default_rng(0).permutation(count)[: max(count * most // m, 1)]
         rows = np.flatnonzero(np.isin(member, chosen))
         few, prior = self.at(rows), self.model.prior

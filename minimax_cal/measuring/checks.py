@@ -138,8 +138,10 @@ def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
 
 def swapped(least: Array, own: Array) -> Array:
     """Rows whose targets fit far better under other names.  least, own: as `best_orders`."""
-    usual = float(np.median(least))
-    return np.flatnonzero((least < 0.1 * own) & (own > 25.0 * usual))
+    better = least < 0.1 * own
+    if not better.any():
+        return np.flatnonzero(better)
+    return np.flatnonzero(better & (own > 25.0 * float(np.median(least))))
 
 
 def outliers(data: Measurements, distance: Array) -> list[str]:
@@ -189,5 +191,5 @@ def collinear(data: Measurements) -> bool:
     if whole.shape[1] < 3 or not len(whole):
         return False
     spread = whole - whole.mean(axis=1, keepdims=True)
-    singular = np.linalg.svd(spread, compute_uv=False)
-    return bool(np.median(singular[:, 1] / singular[:, 0]) < 0.02)
+    square = np.linalg.eigvalsh(np.swapaxes(spread, 1, 2) @ spread)
+    return bool(np.median(square[:, 1] / square[:, 2]) < 0.02**2)

@@ -121,9 +121,10 @@ class Rigid:
         """Of poses in their order.  place: (m, 3) mean point, value: (m, 3) mean error [m]."""
         place = place - place.mean(axis=0)
         lever = max(float(np.sqrt((place**2).mean())), FAINT)
-        turn = np.cross(np.eye(3)[None], place[:, None] / lever)
-        shift = np.broadcast_to(np.eye(3), turn.shape)
-        design = np.swapaxes(np.concatenate([shift, turn], axis=1), 1, 2)
+        design = np.zeros((len(place), 3, 6))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            design[:, i, i], design[:, k, 3 + j] = 1.0, -place[:, i] / lever
+            design[:, j, 3 + k] = place[:, i] / lever
         parts = (
             np.swapaxes(design, 1, 2) @ design,
             np.einsum("mij,mi->mj", design, value),
