@@ -82,8 +82,7 @@ def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:
     model, renamed = model_of(robot, data), given
     order = np.tile(np.arange(len(data.target_names)), (data.poses, 1))
     for _ in range(10):
-        errors = cross_errors(model, renamed.state)
-        better, _, _ = best_orders(errors)
+        better, least, own = best_orders(cross_errors(model, renamed.state))
         if np.array_equal(better, order):
             break
         order = better
@@ -91,9 +90,9 @@ def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:
         np.put_along_axis(y, np.repeat(order[..., None], 3, axis=2), data.y, axis=1)
         renamed = fitted(robot, data.with_y(y))
     else:
-        errors = cross_errors(model, renamed.state)
+        _, least, own = best_orders(cross_errors(model, renamed.state))
     good = np.sqrt(renamed.mean_square) <= 4.0 * POOR_FIT * robot.reach()
-    return swapped(errors) if good else NO_ROWS
+    return swapped(least, own) if good else NO_ROWS
 
 
 def cross_errors(model: Model, state: State) -> Array:

@@ -56,24 +56,30 @@ def cost(own: ModuleType, at: At, sight: Sight) -> Array:
     return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Columns:
     """Parameters (p,), ascending as `Names`: of links and base, of targets, of effects.
 
-    first: the first of the targets.  s, end: where targets begin and end in `which`.
+    first: the first of the targets.  s, end: where targets begin and end in `which`.  axis, point:
+    (s,) see `axes`.  effects: (p - end,) which.
     """
 
     which: Array
     first: int
     s: int
     end: int
+    axis: Array
+    point: Array
+    effects: Array
 
     @staticmethod
     def of(at: At, which: Array) -> Columns:
         """The parameters of robots with so many joints and targets."""
-        first = 5 * at[0].shape[1] + 6
-        s, end = which.searchsorted((first, first + 3 * at[3].shape[1])).tolist()
-        return Columns(which, first, s, end)
+        n = at[0].shape[1]
+        first, last = 5 * n + 6, 5 * n + 6 + 3 * at[3].shape[1]
+        s, end = which.searchsorted((first, last)).tolist()
+        axis, point = (rows[which[:s]] for rows in axes(n))
+        return Columns(which, first, s, end, axis, point, which[end:] - last)
 
     @property
     def own(self) -> list[tuple[int, int, int]]:
@@ -88,13 +94,21 @@ class Columns:
 
         The roots are those of the weights.  Of the poses lo to hi, in the axes of the flange.
         """
-        (mdh, *place), (q, prismatic, *seen) = at, sight
+        (mdh, *place), (q, prismatic, *seen), fields = at, sight, sight[4]
         arm = own.unwound(mdh, q, prismatic, lo, hi)
         error, swung, root = own.sighted(arm, *place, *seen, lo)
-        axis, point = (rows[self.which[: self.s]] for rows in axes(mdh.shape[1]))
-        more = self.which[self.end :]
-        fields = sight[4][more - self.first - 3 * len(root)] if len(more) else sight[4][:0]
-        return error, own.sensed(arm, axis, point, at[3], swung, root, fields, lo), root
+        some = fields[self.effects] if len(fields) else fields
+        return error, own.sensed(arm, self.axis, self.point, at[3], swung, root, some, lo), root
+
+    def normal(self, own: ModuleType, at: At, sight: Sight) -> tuple[Array, Array, Array]:
+        """See `sums.normal`."""
+        B, k, p = len(at[0]), len(sight[2]), len(self.which)
+        out = np.zeros((B, k)), np.zeros((B, k, p)), np.zeros((B, k, p, p))
+        for lo, hi in blocks(len(sight[0]), B * k, own.BLOCK):
+            error, J, root = self.shared(own, at, sight, lo, hi)
+            flat = error.reshape(B, k, -1), J.reshape(*J.shape[:3], -1), root
+            own.summed(*flat, self.which, self.s, self.end, self.first, *out)
+        return out
 
 
 def normal(own: ModuleType, at: At, sight: Sight, which: Array) -> tuple[Array, Array, Array]:
@@ -102,13 +116,7 @@ def normal(own: ModuleType, at: At, sight: Sight, which: Array) -> tuple[Array, 
 
     which: (p,) the parameters, ascending, in the order of `Names`.
     """
-    B, k, p, columns = len(at[0]), len(sight[2]), len(which), Columns.of(at, which)
-    out = np.zeros((B, k)), np.zeros((B, k, p)), np.zeros((B, k, p, p))
-    for lo, hi in blocks(len(sight[0]), B * k, own.BLOCK):
-        error, J, root = columns.shared(own, at, sight, lo, hi)
-        flat = error.reshape(B, k, -1), J.reshape(*J.shape[:3], -1), root
-        own.summed(*flat, which, columns.s, columns.end, columns.first, *out)
-    return out
+    return Columns.of(at, which).normal(own, at, sight)
 
 
 def rows(
@@ -157,11 +165,12 @@ def descend(
     down, and the last one was small.
     """
     (mean, hold), costs, off = prior, [np.inf], np.zeros(len(which))
+    columns = Columns.of(at, which)
     count = max(int(np.count_nonzero(sight[3])), 1)
     for _ in range(most):
         if hold.any():
             off = mean - values(at, which)
-        dx, before, gain, told = own.solved(*normal(own, at, sight, which), off, hold)
+        dx, before, gain, told = own.solved(*columns.normal(own, at, sight), off, hold)
         costs.append(before)
         if not before <= costs[-2] * (1.0 + RISE) or not np.isfinite(before) or not told:
             return at, np.array(costs[1:]), False
