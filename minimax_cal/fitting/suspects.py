@@ -116,19 +116,25 @@ class Spread:
     dof: float
 
     def p_value(self, found: Scores) -> Array:
-        """(k, m) that an ordinary point is as far off or farther.
+        """(k, m) that an ordinary point is as far off or farther; 1 where it was not judged."""
+        judged = found.directions > 0
+        return np.where(judged, self.tail(np.maximum(found.directions, 1), found.square), 1.0)
 
-        1 where it was not judged, and where that is more than LEVEL: no list asks by how much.
-        """
-        edge = np.append(np.inf, fdtri((1, 2, 3), self.dof, 1.0 - LEVEL))[found.directions]
-        ratio = found.square / np.maximum(found.directions, 1) / self.scale**2
-        out, some = np.ones(ratio.shape), ratio >= edge
-        out[some] = fdtrc(found.directions[some], self.dof, ratio[some])
-        return out
+    def tail(self, directions: Array, square: Array) -> Array:
+        """Chance of a larger square [m^2] in so many directions."""
+        return np.asarray(fdtrc(directions, self.dof, square / directions / self.scale**2))
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
-        return unlikely_among(self.p_value(found), found.directions > 0)
+        edge = fdtri((1, 2, 3), self.dof, 1.0 - LEVEL) * (1, 2, 3) * self.scale**2
+        judged = found.directions > 0
+        directions, square = found.directions[judged], found.square[judged]
+        near_edge = square > (1.0 - 1e-9) * edge[directions - 1]  # none below is unlikely
+        p_value = np.ones(len(square))
+        p_value[near_edge] = self.tail(directions[near_edge], square[near_edge])
+        out = np.zeros(judged.shape, dtype=bool)
+        out[judged] = unlikely(p_value)
+        return out
 
 
 def spread_of(found: Scores, dof: float) -> Spread:
@@ -229,13 +235,6 @@ def unlikely(p_value: Array, level: float = LEVEL) -> Array:
     return np.asarray(p_value <= limit)
 
 
-def unlikely_among(p_value: Array, judged: Array) -> Array:
-    """The same of the points (k, m) that were judged; False for others."""
-    out = np.zeros(judged.shape, dtype=bool)
-    out[judged] = unlikely(p_value[judged])
-    return out
-
-
 @dataclass(frozen=True)
 class Suspect:
     """A point that stands out from the fit.
@@ -272,10 +271,10 @@ def suspects_of(
     model: Model, state: State, found: Scores, spread: Spread, line: Array
 ) -> tuple[Suspect, ...]:
     """The points that stand out, the least likely first.  line: (m,) of the file."""
-    p_value = spread.p_value(found)
-    far = unlikely_among(p_value, found.directions > 0)
+    far = spread.far(found)
     if not far.any():
         return ()
+    p_value = spread.p_value(found)
     distance = np.linalg.norm(model.error(state), axis=-1)
     score = np.sqrt(found.square) / spread.scale
     together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)
