@@ -20,6 +20,7 @@ from minimax_cal.diagnosing.gap import (
     climbed,
     closed,
     closed_share,
+    drawn,
     folds,
     motions,
     shaky,
@@ -29,7 +30,7 @@ from minimax_cal.diagnosing.gap import (
     valued,
     with_shares,
 )
-from minimax_cal.diagnosing.joint import Joint, joint
+from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
 from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.noise import Noise
@@ -37,6 +38,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
+from minimax_cal.modelling.effects.maps import curve_of, usual
 from minimax_cal.modelling.effects.table import Term
 
 PLAY = Term("backlash", "J2")
@@ -48,6 +50,12 @@ LONG = Term("link_bending", "L2", {"side": 1.0})
 @pytest.fixture(scope="module")
 def play() -> Study:
     return study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 1000.0),), seed=1)))
+
+
+@pytest.fixture(scope="module")
+def mapped(play: Study) -> Term:
+    """Any smooth curve of joint 4's angle."""
+    return Term("joint_error_map", "J4", usual(play.scene, "J4")[0])
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +114,16 @@ def test_a_rung_is_taken_that_meets_groups_left_out_better(play: Study, ladder: 
     assert np.all(np.diff(squares) < -HELPS * np.array(squares[:-1]))
 
 
+def test_a_rung_has_to_help_by_so_much(play: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after = joint(play, ()), joint(play, (PLAY,))
+    parts = [folds(play.data, FOLDS) == number for number in range(FOLDS)]
+    fall = 1.0 - after.cross_validated(parts) / before.cross_validated(parts)
+    assert 0.1 < fall < 0.9
+    for helps, taken in ((0.99 * fall, (0,)), (1.01 * fall, ())):
+        monkeypatch.setattr(gap, "HELPS", helps)
+        assert climbed(play, [(PLAY,)]).taken == taken
+
+
 def test_what_meets_the_training_poses_worse_is_no_rung(
     play: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,8 +141,27 @@ def test_findings_get_the_values_of_the_last_rung(play: Study, ladder: Ladder) -
     assert_allclose([v for f in found for v in f.values], two.state.effects)
     assert_allclose([v for f in found for v in f.sigmas], two.uncertainty.sigma[-3:])
     assert np.all(two.uncertainty.sigma[-3:] > 0.0)
-    assert [(len(f.values), f.curve.size) for f in found] == [(1, 0), (2, 0)]
+    assert [(len(f.values), f.curve.shape) for f in found] == [(1, (3, 0)), (2, (3, 0))]
     assert valued(named, Ladder(ladder.fits[:1], (), ladder.parts)) == []
+
+
+def test_an_error_map_is_drawn_with_its_own_uncertainty(
+    play: Study, ladder: Ladder, mapped: Term
+) -> None:
+    last = joint(play, (PLAY, mapped, TURN))
+    count = len(last.state.effects) - 3
+    named = [finding("backlash", "J2"), finding("joint_error_map", "J4", count),
+             finding("gear_error", "J3", 2)]  # fmt: skip
+    named[1] = replace(named[1], terms=(mapped,))
+    found = valued(named, Ladder((*ladder.fits[:1], last), (0, 1, 2), ladder.parts))
+    assert [f.curve.shape[1] > 0 for f in found] == [False, True, False]
+    covariance = last.uncertainty.covariance[-2 - count : -2, -2 - count : -2]
+    sign = float(play.robot.sign[3])
+    expected = curve_of(mapped.choice, sign, last.state.effects[1:-2], covariance)
+    assert_allclose(found[1].curve, expected, rtol=1e-12)
+    assert found[1].curve[2].max() > 0.0
+    own = Finding((Term("of_mine", "J1"),), (), (), (), (), 1.0, 1e-9)
+    assert drawn(own, last, slice(0, 0)).shape == (3, 0)  # an effect that nobody knows here
 
 
 def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import numpy as np
@@ -124,6 +124,7 @@ def test_an_error_map_is_told_in_two_numbers() -> None:
     assert said["curve"] == {"q_rad": [-1.0, 0.0, 1.0], "turn_rad": [1e-4, -5e-4, 2e-4],
                              "sigma_rad": [1e-5, 2e-5, 3e-5]}  # fmt: skip
     assert "curve" not in FINDINGS[1].to_dict()
+    assert FINDINGS[1].curve.shape == (3, 0)
 
 
 def test_an_alternative_helps_if_a_measurement_tells_it_apart() -> None:
@@ -140,6 +141,16 @@ def test_an_alternative_helps_if_a_measurement_tells_it_apart() -> None:
 )  # fmt: skip
 def test_places_in_words(place: str, words: str) -> None:
     assert in_words(place) == words
+
+
+def test_results_are_themselves_and_stay_so(made: Diagnosis) -> None:
+    """Their arrays would not compare."""
+    other = Alternative("gear_error", "J2", 0.9, 12.0, 3.0)
+    assert len({made, replace(made), *FINDINGS, replace(FINDINGS[0])}) == len(FINDINGS) + 3
+    for one, name in ((made, "verdict"), (FINDINGS[0], "share"), (RUNGS[0], "name"),
+                      (other, "effect")):  # fmt: skip
+        with pytest.raises(FrozenInstanceError):
+            setattr(one, name, "")
 
 
 # ---- the file ----------------------------------------------------------------------------------
@@ -180,7 +191,8 @@ def test_errors_and_curves_are_those_of_the_cells(made: Diagnosis) -> None:
     bare = replace(made, stated_errors=None, stated_curves=None)
     first, last = bare.errors
     assert_allclose(first, made.cells[0].error(made.data), rtol=0, atol=1e-12)
-    assert np.abs(last - first).max() > 1e-5  # play and sag move the arm
+    assert_allclose(last, made.cells[-1].error(made.data), rtol=0, atol=1e-12)
+    assert np.abs(last - made.cells[1].error(made.data)).max() > 1e-5  # what gives way sags
     assert set(bare.curves) == {"residual", "order"}
     assert_array_equal(made.errors[1], 5e-4)
     assert made.curves == {}

@@ -28,6 +28,10 @@ def test_points_are_the_zeros_of_a_chebyshev_polynomial(count: int) -> None:
     assert np.all((at > 0.0) & (at < 1.0))
 
 
+def test_ratios_are_tried_in_decades() -> None:
+    assert_allclose(RATIOS, [0.0, *(10.0**power for power in range(-3, 6))], rtol=1e-12)
+
+
 @pytest.mark.parametrize("decade", [-3, 0, 4])
 def test_nodes_lie_so_in_a_decade(decade: int) -> None:
     assert_allclose(np.log10(nodes(decade)), decade + points(NODES), rtol=0, atol=1e-12)

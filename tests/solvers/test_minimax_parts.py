@@ -27,6 +27,7 @@ from minimax_cal.solvers.minimax import (
     priced,
     read,
     search,
+    solve,
 )
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
@@ -209,7 +210,84 @@ def test_of_many_functions_the_largest_come_first() -> None:
     assert_array_equal(five.likely(four), range(4))
 
 
+def test_contradicting_constraints_are_relaxed_at_a_price() -> None:
+    """x at least 2 and at most 1; a hundred times the slope, or what was paid before."""
+    here = linear([0.0], [[-3.0]], [0.0, 0.0], [[1.0], [1.0]])
+    at = standing(here, np.ones(1), np.array([2.0, -INF]), np.array([INF, 1.0]))
+    qp = partial(solve_qp, name="daqp", tolerance=1e-9)
+    for before, price in ((0.0, 300.0), (1e4, 1e4)):
+        found = replace(at, penalty=before).subproblem(np.eye(1), qp)
+        assert found.usable
+        assert (found.relaxed, found.penalty) == (True, price)
+        assert 1.0 - 1e-6 <= found.d[0] <= 2.0 + 1e-6
+    agreed = standing(here, np.ones(1), np.array([0.5, -INF]), np.array([INF, 1.0]))
+    plain = agreed.subproblem(np.eye(1), qp)
+    assert (plain.relaxed, plain.penalty) == (False, 0.0)
+    assert_allclose(plain.d, 1.0, atol=1e-8)
+    moved = agreed.subproblem(np.eye(1), qp, here.f, here.c + 0.25)
+    assert_allclose(moved.d, 0.75, atol=1e-8)
+
+
 # ---- an iterate --------------------------------------------------------------------------------
+
+
+def test_it_begins_with_even_multipliers_or_those_given() -> None:
+    problem = Plane(np.array([1.0, 2.0, 4.0, 0.0]))
+    at = Iterate.begin(problem, np.zeros(1), Sqp(), np.zeros(0))
+    assert_array_equal(at.mu, 0.25)
+    assert_array_equal(at.lam, [0.0])
+    assert at.quasi is None
+    assert at.kkt.residual == at.kkt.complementarity == 4.0 - 7.0 / 4.0
+    given = np.array([0.0, 0.5, 0.5, 0.0])
+    assert_array_equal(Iterate.begin(problem, np.zeros(1), Sqp(), given).mu, given)
+    assert begun(parabola(), 1.0).quasi is not None
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Functions that do not change, and a constraint that holds."""
+
+    f: Array
+    slope: float = 0.0
+    lower: Array = field(default_factory=lambda: np.array([-1.0]))
+    upper: Array = field(default_factory=lambda: np.array([1.0]))
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        return self.f, x
+
+    def linearise(self, x: Array) -> Linear:
+        slopes = np.full((len(self.f), 1), self.slope)
+        return Linear(self.f, slopes, x, np.ones((1, 1)), lambda mu: np.eye(1))
+
+    def step(self, x: Array, d: Array) -> Array:
+        return x + d
+
+
+@pytest.mark.parametrize(
+    "problem", [Plane(np.array([1.0]), np.nan), Plane(np.array([np.nan]), 1.0)]
+)
+def test_what_is_no_number_ends_in_a_status(problem: Plane) -> None:
+    asked: list[Problem] = []
+    found = solve(problem, np.zeros(1), lambda one: asked.append(one))  # type: ignore[arg-type, func-returns-value]
+    assert found.status is Status.FAILED
+    assert asked == []
+
+
+def test_the_notes_of_backends_are_told_once() -> None:
+    said = iter(["slow", "slow", "lost", "slow"])
+
+    def qp(problem: Problem) -> Solution:
+        answer = solve_qp(problem, name="daqp", tolerance=1e-9)
+        return replace(answer, notes=(next(said, "lost"),))
+
+    told = []
+    hill = Curve(lambda x: x**4, lambda x: 4.0 * x**3)
+    found = solve(hill, np.array([1.0]), qp, Sqp(hessian="bfgs", iterations=4), told.append)
+    assert found.notes == ("slow", "lost")
+    assert found.status is Status.ITERATION_LIMIT
+    assert found.iterations == len(found.trace) == len(told) == 4
+    assert [step.iteration for step in found.trace] == [1, 2, 3, 4]
+    assert np.all(np.diff([step.value for step in found.trace]) < 0.0)
 
 
 def test_the_hessian_has_a_floor_and_is_damped() -> None:
@@ -367,7 +445,7 @@ def test_the_second_order_correction_is_asked_what_the_step_missed() -> None:
     length, move, end, there = search(at, plan([-4.0], [1.0], [0.0]), bent)
     assert_array_equal(asked[0], [[9.0 + 8.0], [-3.0 + 4.0]])
     assert (length, move[0], end[0], there.f[0]) == (1.0, -1.0, 0.0, 0.0)
-    for other in ({"usable": False}, {"d": -8.1}, {"d": 3.0}):
+    for other in ({"usable": False}, {"d": -8.1}, {"d": -2.0}):  # the last is as high as the start
         found = search(at, plan([-4.0], [1.0], [0.0]), partial(bent, **other))
         assert_allclose(found[0], 0.25)  # the vertex
     far = Curve(lambda x: abs(x + 7.0), lambda x: 1.0)  # at -3 it helps, but not a correction
