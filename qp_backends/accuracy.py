@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.blas import idamax
 
 if TYPE_CHECKING:
     from .problem import Array, Problem, Solution
@@ -111,8 +110,8 @@ def _reach(problem: Problem) -> float:
 
 
 def _size(vector: Array) -> float:
-    """Largest absolute entry; by BLAS, because the inner loop of an SQP waits for it."""
-    return abs(float(vector[idamax(vector)])) if vector.size else 0.0
+    """Largest absolute entry; NaN if there is one."""
+    return float(np.abs(vector).max()) if vector.size else 0.0
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,9 +22,11 @@ from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.files import json_text
-from minimax_cal.judging.bootstrap import Bootstrap, bootstrap
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
+
+if TYPE_CHECKING:
+    from minimax_cal.judging.bootstrap import Bootstrap
 
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
@@ -63,7 +65,11 @@ def calibrate_command(
     brief = replicates is None and measured.poses <= BRIEF
     with work(brief=brief), to.stages() as progress:
         fit = calibrate(robot, measured, progress=progress, **chosen)
-        more = () if replicates is None else (bootstrap(fit, replicates, chosen["seed"], progress),)
+        more: tuple[Bootstrap, ...] = ()
+        if replicates is not None:
+            from minimax_cal.judging.bootstrap import bootstrap
+
+            more = (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*fit.notices)
     if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
         tables = (*fit.tables(), *(found.table() for found in more))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import sys
 from collections import UserDict
 from collections.abc import Callable
 from functools import wraps
 from importlib import import_module
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import click
@@ -123,6 +127,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
     },
 }
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write")  # parameters that name outputs
+SPARED = ("numpy.f2py", "numpy.testing")
 LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 
@@ -180,6 +185,34 @@ def leads_with(one: Path, other: Path) -> bool:
     return place == os.path.realpath(other) and (os.path.isfile(place) or not os.path.exists(place))
 
 
+def quickly(name: str) -> ModuleType:
+    """A module, imported without what only takes time.
+
+    SciPy copies every name of NumPy, which would load a compiler's front end and a test framework;
+    pydantic looks for plugins in all that is installed; and imports leave nothing to collect.
+    """
+    for part in SPARED:
+        when_used(part)
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    gc.disable()
+    try:
+        return import_module(name)
+    finally:
+        gc.enable()
+
+
+def when_used(name: str) -> None:
+    """Let a part of a package be loaded when one of its names is asked for."""
+    package, _, part = name.rpartition(".")
+    spec = find_spec(name)
+    if name in sys.modules or spec is None or spec.loader is None:
+        return
+    spec.loader = LazyLoader(spec.loader)
+    module = sys.modules[name] = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    setattr(sys.modules[package], part, module)
+
+
 class Commands(UserDict[str, Any]):
     """Commands by name, each imported when it is asked for."""
 
@@ -188,7 +221,7 @@ class Commands(UserDict[str, Any]):
         found = self.data[name]
         if isinstance(found, click.Command):
             return found
-        module = import_module(f"minimax_cal.cli.{found[0]}")
+        module = quickly(f"minimax_cal.cli.{found[0]}")
         command: click.Command = getattr(module, f"{name}_command")
         command.callback = keeping_inputs(paced(command.callback, brief=name not in LONG))
         self.data[name] = command

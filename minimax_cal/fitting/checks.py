@@ -13,6 +13,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, in_base, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot
 
 FEW = 30  # poses that are enough to test a slip of units or signs
@@ -47,8 +48,9 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
         return given
     trials = [("the measurement frame looks left-handed; reverse one of its axes", given.mirrored)]
     few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
-    for text, mended in suspicions(robot, data.take(few)):
-        trials.append((text, fitted(robot, mended).mean_square))
+    with work(brief=False):
+        for text, mended in suspicions(robot, data.take(few)):
+            trials.append((text, fitted(robot, mended).mean_square))
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
@@ -80,8 +82,7 @@ def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:
     model, renamed = model_of(robot, data), given
     order = np.tile(np.arange(len(data.target_names)), (data.poses, 1))
     for _ in range(10):
-        errors = cross_errors(model, renamed.state)
-        better, _, _ = best_orders(errors)
+        better, least, own = best_orders(cross_errors(model, renamed.state))
         if np.array_equal(better, order):
             break
         order = better
@@ -89,9 +90,9 @@ def misnamed(robot: Robot, data: Measurements, given: BaseFit) -> Array:
         np.put_along_axis(y, np.repeat(order[..., None], 3, axis=2), data.y, axis=1)
         renamed = fitted(robot, data.with_y(y))
     else:
-        errors = cross_errors(model, renamed.state)
+        _, least, own = best_orders(cross_errors(model, renamed.state))
     good = np.sqrt(renamed.mean_square) <= 4.0 * POOR_FIT * robot.reach()
-    return swapped(errors) if good else NO_ROWS
+    return swapped(least, own) if good else NO_ROWS
 
 
 def cross_errors(model: Model, state: State) -> Array:

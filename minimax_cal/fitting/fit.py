@@ -191,17 +191,12 @@ def link_by_link(
 
     units: of each, SI.  before, after, sigma: (p,) as drawn, as found and how sure [SI].
     """
+    order = names.link_by_link
+    numbers = (part[order].tolist() for part in (after, before, sigma, known.active))
     return tuple(
-        Parameter(
-            name=names.all[i],
-            value=float(after[i]),
-            nominal=float(before[i]),
-            sigma=float(sigma[i]),
-            unit=units[i],
-            identifiable=bool(known.active[i]),
-            reason=known.reasons.get(names.all[i], ""),
-        )
-        for i in names.link_by_link
+        Parameter(names.all[i], value, nominal, own, units[i], told, reason)
+        for i, value, nominal, own, told in zip(order.tolist(), *numbers, strict=True)
+        for reason in [known.reasons.get(names.all[i], "")]
     )
 
 

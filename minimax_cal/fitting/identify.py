@@ -178,6 +178,10 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
 COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
 
 
+# and those of `plenty_of_poses`
+DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
+
+
 def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:
     """The parameters to give up so that the Gram matrix of the others has full rank.
 
@@ -189,7 +193,11 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
         return []
     scale = np.sqrt(np.diag(gram)[chosen])
     scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(gram[np.ix_(chosen, chosen)] / np.outer(scale, scale))
+    alike = gram[np.ix_(chosen, chosen)] / np.outer(scale, scale)
+    values = np.linalg.eigvalsh(alike)  # mostly that is all there is to see
+    if values[0] > rank**2 * values[-1]:
+        return []
+    values, vectors = np.linalg.eigh(alike)
     null = vectors[:, values <= (rank**2) * values[-1]]
     gone: list[int] = []
     place = np.full(len(active), -1)
@@ -215,8 +223,10 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
 
 def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
     """A model of the same cell at random poses over the joints' whole range."""
-    k = len(model.y)
-    q = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
+    k, asked = len(model.y), DRAWN.setdefault(robot, {})
+    if poses not in asked:
+        asked[poses] = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
+    q = asked[poses]
     return Model(
         q=q,
         prismatic=model.prismatic,

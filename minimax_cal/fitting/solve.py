@@ -8,7 +8,6 @@ from functools import cached_property, partial
 import numpy as np
 
 from minimax_cal.evidence.noise import linearised
-from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
@@ -362,6 +361,8 @@ def with_effects(task: Task, stage: Stage) -> tuple[Task, Stage]:
     asked = [e for e in task.options.effects if not (isinstance(e, Term) and e.frees_frames)]
     if not asked:
         return task, stage
+    from minimax_cal.evidence.selection import best_variant  # slow to import
+
     robust = stage.robust
     scene = scene_of(task.robot, task.data, robust.plain, stage.state)
     rows = linearised(robust.model, stage.state, scene.jacobian)

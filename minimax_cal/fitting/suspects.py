@@ -31,6 +31,7 @@ LEAST_SCALE = 1e-7  # no instrument tells less [m]
 TAILS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
 CLEARLY = 2.0  # gain in log-likelihood that makes tails heavier than the Gaussian's
 ROUNDS = 30
+SETTLED = 1e-8  # change of a log scale that ends its search
 
 EXPLANATION = (
     "a suspect may be a wrong point or a real effect that the fit lacks (a compliant joint moves a "
@@ -74,8 +75,11 @@ def scores(model: Model, state: State, weights: Array) -> Scores:
     spread = cover @ (twice + prior) @ cover
     square, directions = np.zeros(weights.shape), np.zeros(weights.shape, dtype=int)
     for part, error, rows in model.rows(state):
-        own = weights[:, part, None, None]
-        left = np.eye(3) - 2.0 * own * hat_blocks(rows, cover) + hat_blocks(rows, spread)
+        if every is twice:  # all points count alike
+            left = np.eye(3) - hat_blocks(rows, 2.0 * cover - spread)
+        else:
+            own = weights[:, part, None, None]
+            left = np.eye(3) - 2.0 * own * hat_blocks(rows, cover) + hat_blocks(rows, spread)
         square[:, part], directions[:, part] = standardised(left, np.swapaxes(error, 1, 2))
     return Scores(square, np.where(model.seen, directions, 0))
 
@@ -114,15 +118,22 @@ class Spread:
     def p_value(self, found: Scores) -> Array:
         """(k, m) that an ordinary point is as far off or farther; 1 where it was not judged."""
         judged = found.directions > 0
-        directions = np.maximum(found.directions, 1)
-        ratio = found.square / directions / self.scale**2
-        return np.where(judged, fdtrc(directions, self.dof, ratio), 1.0)
+        return np.where(judged, self.tail(np.maximum(found.directions, 1), found.square), 1.0)
+
+    def tail(self, directions: Array, square: Array) -> Array:
+        """Chance of a larger square [m^2] in so many directions."""
+        return np.asarray(fdtrc(directions, self.dof, square / directions / self.scale**2))
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
+        edge = fdtri((1, 2, 3), self.dof, 1.0 - LEVEL) * (1, 2, 3) * self.scale**2
         judged = found.directions > 0
+        directions, square = found.directions[judged], found.square[judged]
+        near_edge = square > (1.0 - 1e-9) * edge[directions - 1]  # none below is unlikely
+        p_value = np.ones(len(square))
+        p_value[near_edge] = self.tail(directions[near_edge], square[near_edge])
         out = np.zeros(judged.shape, dtype=bool)
-        out[judged] = unlikely(self.p_value(found)[judged])
+        out[judged] = unlikely(p_value)
         return out
 
 
@@ -140,7 +151,7 @@ def spread_of(found: Scores, dof: float) -> Spread:
     mean_square = found.square[judged] / directions
     if not len(mean_square):
         return Spread(LEAST_SCALE, 1.0)
-    middle = np.median(mean_square / fdtri(directions, dof, 0.5))
+    middle = np.median(mean_square / fdtri((1, 2, 3), dof, 0.5)[directions - 1])
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
     for _ in range(ROUNDS):
@@ -180,14 +191,34 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
 
     tails = (dof, *(tail for tail in TAILS if tail < dof))
     shapes = {tail: shape(tail) for tail in tails}
-    middle = np.log(usual)
+    low, high = math.log(usual) - 2.0, math.log(usual) + 2.0
     best: list[tuple[float, Spread]] = []
     for tail in tails:
-        at, value = least_between(partial(loss, tail=tail), middle - 2.0, middle + 2.0)
+        if below:
+            at, value = least_between(partial(loss, tail=tail), low, high)
+        else:
+            at = min(max(likeliest(size, half, tail, math.log(usual)), low), high)
+            value = loss(at, tail)
         doubt = CLEARLY if tail < dof else 0.0
         spread = Spread(max(float(np.exp(at)), LEAST_SCALE), float(tail))
         best.append((value + doubt, spread))
     return min(best, key=lambda trial: trial[0])[1]
+
+
+def likeliest(size: Array, half: Array, tail: float, log_scale: float) -> float:
+    """The log scale of `student` where no edge cuts points off: the loss is convex in it [Newton].
+
+    size: (n,) squares [m^2], half: (n,) half their directions.
+    """
+    weight, target = half + 0.5 * tail, float(half.sum())
+    for _ in range(ROUNDS):
+        ratio = size * (math.exp(-2.0 * log_scale) / tail)
+        share = ratio / (1.0 + ratio)
+        step = 0.5 * (float(weight @ share) - target) / float(weight @ (share / (1.0 + ratio)))
+        log_scale += min(max(step, -1.0), 1.0)
+        if abs(step) <= SETTLED:
+            break
+    return log_scale
 
 
 def unlikely(p_value: Array, level: float = LEVEL) -> Array:
@@ -240,7 +271,10 @@ def suspects_of(
     model: Model, state: State, found: Scores, spread: Spread, line: Array
 ) -> tuple[Suspect, ...]:
     """The points that stand out, the least likely first.  line: (m,) of the file."""
-    p_value, far = spread.p_value(found), spread.far(found)
+    far = spread.far(found)
+    if not far.any():
+        return ()
+    p_value = spread.p_value(found)
     distance = np.linalg.norm(model.error(state), axis=-1)
     score = np.sqrt(found.square) / spread.scale
     together = (far == model.seen).all(axis=0) & (model.seen.sum(axis=0) > 1)

@@ -32,7 +32,7 @@ from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
-from minimax_cal.modelling.model import NO_MIX, Block, Model, Prior, with_poses
+from minimax_cal.modelling.model import NO_MIX, Block, Model, Normal, Prior, with_poses
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
@@ -80,10 +80,11 @@ class Estimator:
 
         group: (m,) rows with the same number are one pose.  Returns the rows too.
         """
-        _, member = np.unique(group, return_inverse=True)
-        count, m = int(member.max()) + 1, len(member)
+        m = len(group)
         if m <= most:
             return self, np.arange(m)
+        _, member = np.unique(group, return_inverse=True)
+        count = int(member.max()) + 1
         chosen = np.random.default_rng(0).permutation(count)[: max(count * most // m, 1)]
         rows = np.flatnonzero(np.isin(member, chosen))
         few, prior = self.at(rows), self.model.prior
@@ -205,8 +206,23 @@ class Poses:
         square = float(self.estimator.model.cost(self.state).sum())
         return square / max(count - paid, 1.0)
 
+    @cached_property
+    def plain(self) -> Normal:
+        """Normal equations of each target, without the shares."""
+        return self.estimator.model.normal(self.state, self.estimator.model.active)
+
+    @cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom of the noise: none where the poses do not tell the parameters."""
+        gram = self.plain.gram.sum(axis=0) + np.diag(self.prior)
+        rows = 3 * np.count_nonzero(self.seen) + np.count_nonzero(self.prior)
+        return float(rows - len(gram)) if identified(gram).shape[1] == len(gram) else 0.0
+
     def sums_of(self, part: Array) -> tuple[Array, Array]:
         """J'A J (p, p) and J'A e (p,) of some poses.  part: mask (m,)."""
+        share = self.estimator.share
+        if part.all() and share.ndim == 1 and not len(self.estimator.mix):
+            return np.tensordot(share, self.plain.gram, 1), share @ self.plain.gradient
         whole = self.estimator.whole
         found = (whole if part.all() else whole.take(part)).normal(self.state, whole.active)
         return found.gram.sum(axis=0), found.gradient.sum(axis=0)
@@ -338,21 +354,12 @@ def noise_of(estimator: Estimator, state: State) -> Noise:
 
     The instrument's alone where the poses do not determine the parameters.
     """
-    poses, dof = Poses.of(estimator, state), freedom(estimator, state)
-    rows = poses.rows()
+    poses = Poses.of(estimator, state)
+    rows, dof = poses.rows(), poses.freedom
     if dof >= LEAST_DOF:
         return restricted(rows, np.zeros((len(rows.error), 0)))
     left = rows.error - rows.basis @ (rows.basis.T @ rows.error)
     return Noise(0.0, float(left @ left) / max(dof, 1.0), 0.0)
-
-
-def freedom(estimator: Estimator, state: State) -> float:
-    """Degrees of freedom of the noise: none where the poses do not determine the parameters."""
-    model = estimator.model
-    prior = model.prior.weight[model.active]
-    gram = model.normal(state, model.active).gram.sum(axis=0) + np.diag(prior)
-    rows = 3 * np.count_nonzero(model.seen) + np.count_nonzero(prior)
-    return float(rows - len(gram)) if identified(gram).shape[1] == len(gram) else 0.0
 
 
 def by_noise(poses: Poses, noise: Noise) -> Array:
@@ -390,7 +397,7 @@ def by_poses(poses: Poses, group: Array) -> Array:
         left = np.linalg.solve(eye - lever, error.reshape(len(rows), -1, 1))
         change = (np.swapaxes(back, 1, 2) @ left)[..., 0]
         total += change.T @ change
-    prior = sandwich(poses, np.zeros((p, p)))
+    prior = sandwich(poses, np.zeros((p, p))) if poses.prior.any() else 0.0
     return np.asarray((count - 1) / count * total + prior)
 
 
@@ -413,7 +420,8 @@ def uncertainty_of(
     the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
     """
     few, rows = estimator.thinned(group, PLENTY)
-    poses, dof = Poses.of(few, state), freedom(few, state)
+    poses = Poses.of(few, state)
+    dof = poses.freedom
     found, source = np.full(poses.bread.shape, np.nan), "poses"
     if dof >= 1.0 and estimator.share.ndim == 1:
         found = by_poses(poses, group[rows])

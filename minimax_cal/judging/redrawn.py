@@ -15,6 +15,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model, arrays_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers.minimax import Sqp
 
@@ -151,10 +152,9 @@ class Redrawn:
         for b, times in enumerate(self.draw.times):
             rows = np.flatnonzero(times)
             some = (part[..., rows] if len(part) else part for part in (fields, moved))
-            out.append(kernels().normal(
-                *(part[b : b + 1] for part in parts), q[rows], prismatic, y[..., rows],
-                weight[:, rows] * times[rows], *some, which,
-            ))  # fmt: skip
+            drawn = q[rows], prismatic, y[..., rows], weight[:, rows] * times[rows], *some
+            at = tuple(part[b : b + 1] for part in parts)
+            out.append(sums.normal(kernels(), at, drawn, which))
         F, g, G = (np.concatenate(part) for part in zip(*out, strict=True))
         return F, g, G
 

@@ -116,9 +116,10 @@ def numbered_by_joints(group: Array, q: Array) -> Array:
     group: (m,).  q: (m, n).
     """
     _, group = np.unique(group, return_inverse=True)
-    _, rank = np.unique(np.round(q, 9), axis=0, return_inverse=True)
+    order, rank = np.lexsort(np.round(q, 9).T[::-1]), np.empty(len(q), dtype=int)
+    rank[order] = np.arange(len(q))
     least = np.full(int(group.max()) + 1, len(q))
-    np.minimum.at(least, group.reshape(-1), rank.reshape(-1))
+    np.minimum.at(least, group.reshape(-1), rank)
     return np.asarray(np.argsort(np.argsort(least))[group.reshape(-1)])
 
 

@@ -189,9 +189,10 @@ class Clock:
     @staticmethod
     def of(data: Measurements) -> Clock | None:
         """The clock of data, or of a part that knows its place (`with_history`); None by row."""
-        name, place = timed_by(data), clock(data)
+        name = timed_by(data)
         if not name:
             return None
+        place = clock(data)
         given = data.columns[name].astype(float)
         known = np.flatnonzero(np.isfinite(given))
         first, last = known[np.argmin(given[known])], known[np.argmax(given[known])]

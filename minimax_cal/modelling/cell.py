@@ -76,7 +76,7 @@ class Cell:
         if self.effects.terms:
             return self.follow(still(q, self.target_names, self.robot))
         pose = self.base @ self.robot.pose(q)
-        turned = np.einsum("mij,kj->mki", pose[:, :3, :3], self.target_positions)
+        turned = self.target_positions @ np.swapaxes(pose[:, :3, :3], 1, 2)
         return np.asarray(turned + pose[:, None, :3, 3])
 
     def inverse(self, pose: Array, near: Array | None = None) -> Array:

@@ -18,7 +18,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import Names, State, links_of
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.kernels.sums import At, Sight
 from minimax_cal.robots.kinematics import Chain, hat
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
@@ -200,15 +202,15 @@ class Model:
         return error
 
     @cached_property
-    def sight(self) -> tuple[Array, ...]:
-        """What the kernels ask of the poses: q ... `moved`, as `kernels.plain.cost`."""
+    def sight(self) -> Sight:
+        """What the kernels ask of the poses, see `kernels.sums`."""
         parts = (self.q, self.prismatic, self.y, self.weight, self.fields, self.moved)
         return ready(*parts)
 
     def cost(self, state: State) -> Array:
         """F_i: (..., k) [m^2], the prior left out."""
         if not len(self.mix):
-            found = kernels().cost(*arrays_of(state), *self.sight)
+            found = sums.cost(kernels(), arrays_of(state), self.sight)
             return np.asarray(found.reshape(*state.mdh.shape[:-2], -1))
         total = np.zeros(1)
         for block in self.blocks(state):
@@ -219,7 +221,7 @@ class Model:
     def normal(self, state: State, active: Array) -> Normal:
         """Normal equations for the parameters that are True in active (p,), at a state."""
         if not len(self.mix):
-            found = kernels().normal(*arrays_of(state), *self.sight, np.flatnonzero(active))
+            found = sums.normal(kernels(), arrays_of(state), self.sight, np.flatnonzero(active))
             outer = state.mdh.shape[:-2]
             return Normal(*(part.reshape(*outer, *part.shape[1:]) for part in found))
         select = Columns.of(self.names, active)
@@ -236,8 +238,8 @@ class Model:
     def gram(self, state: State, weight: Array) -> Array:
         """J'WJ (p, p) of the free parameters, with other weights (k, m); of one state, no mix."""
         q, prismatic, y, _, fields, moved = self.sight
-        given = q, prismatic, y, *ready(weight), fields, moved, np.flatnonzero(self.active)
-        found = kernels().normal(*arrays_of(state), *given)
+        given = q, prismatic, y, *ready(weight), fields, moved
+        found = sums.normal(kernels(), arrays_of(state), given, np.flatnonzero(self.active))
         return np.asarray(found[2][0].sum(axis=0))
 
     def squares(self, state: State) -> tuple[Array, Array]:
@@ -245,9 +247,7 @@ class Model:
 
         Of one state, by the free parameters; without a mix.
         """
-        which = np.flatnonzero(self.active)
-        f, slope = kernels().squares(*arrays_of(state), *self.sight, which)
-        return f, slope
+        return sums.squares(kernels(), arrays_of(state), self.sight, np.flatnonzero(self.active))
 
     def weighted_rows(self, state: State, block: Block, active: Array) -> tuple[Array, Array]:
         """Weighted errors (..., k, 3, c) and transposed Jacobian (..., k, p, 3, c) of one block."""
@@ -262,9 +262,9 @@ class Model:
             for block in self.blocks(state):
                 yield block.rows, *self.weighted_rows(state, block, self.active)
             return
-        given = *arrays_of(state), *self.sight, np.flatnonzero(self.active)
+        given = kernels(), arrays_of(state), self.sight, np.flatnonzero(self.active)
         for part in self.parts(1):
-            yield part, *kernels().rows(*given, part.start, part.stop)
+            yield part, *sums.rows(*given, part.start, part.stop)
 
     def rows_of(self, state: State, block: Block, select: Columns) -> tuple[Array, Array]:
         """`weighted_rows` with the choice of columns at hand."""
@@ -371,7 +371,7 @@ class SumOfSquares:
         return x.step(full)
 
 
-def arrays_of(state: State) -> tuple[Array, ...]:
+def arrays_of(state: State) -> At:
     """A state, or a batch of them flattened, as the kernels ask for it."""
     if state.mdh.ndim == 2:
         return ready(*(part[None] for part in (*state.geometry, state.effects)))

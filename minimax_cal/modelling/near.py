@@ -6,6 +6,7 @@ import numpy as np
 
 from minimax_cal.modelling.model import Model, SumOfSquares, arrays_of
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import AUTO, NEAR, LeastSquares, method_of
@@ -22,14 +23,12 @@ def nearby(model: Model, begin: State, method: str = AUTO) -> LeastSquares[State
     """
     if method == AUTO and not len(model.mix) and model.active.any():
         which = np.flatnonzero(model.active)
-        prior = (part[which] for part in (model.prior.mean, model.prior.weight))
-        *parts, trace, well = kernels().descend(
-            *arrays_of(begin.batch()), *model.sight, which, *prior, NEAR.step, MOST
+        prior = model.prior.mean[which], model.prior.weight[which]
+        at, trace, well = sums.descend(
+            kernels(), arrays_of(begin), model.sight, which, prior, NEAR.step, MOST
         )
         if well:
             steps = np.array([len(trace) - 1])
-            return LeastSquares(
-                State(*parts), trace[-1:], steps, (Status.CONVERGED,), trace[:, None]
-            )
+            return LeastSquares(State(*at), trace[-1:], steps, (Status.CONVERGED,), trace[:, None])
     problem, points = SumOfSquares(model), float(model.counts.sum())
     return least_squares.solve(problem, begin.batch(), 1, points, method_of(method), NEAR)

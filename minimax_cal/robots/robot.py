@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from minimax_cal.ground.arrays import Array
@@ -24,7 +23,6 @@ from minimax_cal.ground.files import json_text, once, read_text, write_whole
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 from minimax_cal.robots.kinematics import MDH_NAMES
-from minimax_cal.robots.urdf import is_urdf, load_urdf
 
 CONVENTION = "Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
 METRES = {"mm": 1e-3, "m": 1.0}
@@ -300,27 +298,18 @@ def builtin_robots() -> tuple[str, ...]:
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
 
 
-class WrittenOut(yaml.SafeLoader):
-    """YAML without aliases, which a few lines can make larger than any memory."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """A node.  Raises YAMLError for an alias."""
-        if self.check_event(yaml.AliasEvent):
-            line = self.line + 1
-            raise yaml.YAMLError(f"line {line}: an alias (*name); write the value out")
-        return super().compose_node(parent, index)
-
-
 def written_out(text: str) -> Any:
-    """A YAML document.  Raises YAMLError."""
-    return yaml.load(text, WrittenOut)
+    """A YAML document without aliases.  Raises ValueError."""
+    from minimax_cal.robots.yaml_text import parsed  # few robots come as one
+
+    return parsed(text)
 
 
 PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
     ".json": (partial(json.loads, object_pairs_hook=once), json.JSONDecodeError),
     ".toml": (tomllib.loads, tomllib.TOMLDecodeError),
-    ".yaml": (written_out, yaml.YAMLError),
-    ".yml": (written_out, yaml.YAMLError),
+    ".yaml": (written_out, ValueError),
+    ".yml": (written_out, ValueError),
 }
 
 
@@ -337,6 +326,8 @@ def load_robot(source: Path | str) -> Robot:
         builtin = resources.files("minimax_cal.robots") / "builtin" / f"{source}.json"
         text = builtin.read_text("utf-8")
         return robot_from_dict(json.loads(text), str(source))
+    from minimax_cal.robots.urdf import is_urdf, load_urdf  # not for a built-in robot
+
     if is_urdf(source):
         return robot_from_dict(load_urdf(source).content, str(source))
     if path.suffix.lower() not in PARSERS:

@@ -420,18 +420,16 @@ def read(answer: Solution, here: Linear, rows: Array, relaxed: bool, penalty: fl
 
 def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) -> Kkt:
     """The KKT residuals at a point."""
-    stationarity = mu @ here.jacobian
+    stationarity = mu @ here.jacobian + lam @ here.normal
     complementarity = float(mu @ (here.f.max() - here.f))
-    if not len(lam):
-        return Kkt(float(np.abs(stationarity).max(initial=0.0)), complementarity, 0.0)
-    stationarity = stationarity + lam @ here.normal
-    held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
-    room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
-    slack = np.abs(lam[held] * room)
+    if lam.any():
+        held = np.flatnonzero(lam)  # elsewhere a bound may be infinitely far
+        room = np.where(lam > 0.0, upper - here.c, here.c - lower)[held]
+        complementarity += float(np.abs(lam[held] * room).sum())
     return Kkt(
         float(np.abs(stationarity).max(initial=0.0)),
-        complementarity + float(slack.sum()),
-        float(excess(here.c, lower, upper).max(initial=0.0)),
+        complementarity,
+        float(excess(here.c, lower, upper).max(initial=0.0)) if len(lam) else 0.0,
     )
 
 

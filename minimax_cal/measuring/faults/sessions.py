@@ -94,6 +94,8 @@ def jumps(data: Measurements, error: Array) -> tuple[Array, Array]:
     place = np.where(known.T[..., None], data.y, 0.0).sum(axis=1)[order] / count
     poses = Rigid.of(place, mean)
     starts = jumps_in(poses, len(order))
+    if not starts:
+        return NONE, np.zeros(0)
     steps = [poses.fitted(a, b) for a, b in pairwise([0, *starts, len(order)])]
     sizes = [poses.size(later - earlier) for earlier, later in pairwise(steps)]
     return order[np.array(starts, dtype=int)], np.array(sizes)
@@ -119,9 +121,10 @@ class Rigid:
         """Of poses in their order.  place: (m, 3) mean point, value: (m, 3) mean error [m]."""
         place = place - place.mean(axis=0)
         lever = max(float(np.sqrt((place**2).mean())), FAINT)
-        turn = np.cross(np.eye(3)[None], place[:, None] / lever)
-        shift = np.broadcast_to(np.eye(3), turn.shape)
-        design = np.swapaxes(np.concatenate([shift, turn], axis=1), 1, 2)
+        design = np.zeros((len(place), 3, 6))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            design[:, i, i], design[:, k, 3 + j] = 1.0, -place[:, i] / lever
+            design[:, j, 3 + k] = place[:, i] / lever
         parts = (
             np.swapaxes(design, 1, 2) @ design,
             np.einsum("mij,mi->mj", design, value),
@@ -177,10 +180,13 @@ def jump_between(poses: Rigid, first: int, last: int) -> int:
     dof = 3 * (last - first) - 12
     if not len(at) or dof < 1:
         return 0
-    apart = poses.left(np.full_like(at, first), at) + poses.left(at, np.full_like(at, last))
+    ends = np.full_like(at, first), np.full_like(at, last), [first, 0], [last, len(poses.value)]
+    left = poses.left(np.concatenate([ends[0], at, ends[2]]), np.concatenate([at, *ends[1::2]]))
+    before, after, (whole, every) = np.split(left, [len(at), 2 * len(at)])
+    apart = before + after
     best = int(np.argmin(apart))
-    whole, two = float(poses.left(np.array(first), np.array(last))), float(apart[best])
+    two = float(apart[best])
     ratio = (whole - two) / 6.0 / max(two / dof, 1e-30)
     chance = fdtrc(6, dof, ratio) * len(at)
-    clear = whole - two > CLEAR * poses.left(np.array(0), np.array(len(poses.value)))
+    clear = whole - two > CLEAR * every
     return int(at[best]) if clear and chance < 0.1 * FALSE_ALARM else 0

@@ -18,7 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.kernels import plain
 
 SWITCH = "MINIMAX_CAL_KERNELS"  # plain or fast, in the environment; unset takes what is there
-NOTICE = "compiling kernels for this machine, once: about half a minute"
+NOTICE = "compiling kernels for this machine, once: about ten seconds"
 BRIEF: ContextVar[bool] = ContextVar("brief", default=False)
 
 
@@ -44,7 +44,7 @@ def best() -> Any:
     if told == "plain" or (told != "fast" and util.find_spec("numba") is None):
         return plain
     fast = import_module("minimax_cal.robots.kernels.fast")
-    if not any(Path(fast.cost.stats.cache_path).glob("fast.*.nbi")):
+    if not any(Path(fast.unwound.stats.cache_path).glob("fast.*.nbi")):
         logging.getLogger("minimax_cal").warning(NOTICE)
     return fast
 

@@ -1,7 +1,7 @@
 """The kernels compiled by numba: the names, arguments and results of `plain`.
 
-A column of the normal equations is a screw (V, W) of the pose, which moves a target t of the flange
-by V + W x t.  Poses go in blocks that fit the cache; inside, loops run along the poses.
+A kernel that calls another one compiles it once more, so `sums` calls one after the other.  Loops
+on single numbers compile several times as fast as what NumPy does to whole arrays.
 """
 
 from __future__ import annotations
@@ -13,17 +13,26 @@ import numpy as np
 from numba import njit
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.robots.kernels.plain import FIRST, PIVOT, RISE, ROUNDS, STILL, STUCK, TRUST
+from minimax_cal.robots.kernels.plain import (
+    FIRST,
+    PIVOT,
+    ROUNDS,
+    STILL,
+    STUCK,
+    TRUST,
+)
 
-BLOCK = 128  # poses: the Jacobian of one target then fits the second-level cache
+BLOCK = 384  # points, in all robots: their Jacobian then fits the second-level cache
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """The function compiled when it is first called, and kept on disk."""
-    quick: Callable[P, R] = njit(cache=True)(function)
+    """The function compiled when it is first called, and kept on disk; sums in any order."""
+    quick: Callable[P, R] = njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})(
+        function
+    )
     return quick
 
 
@@ -61,284 +70,191 @@ def chain(mdh: Array, q: Array, prismatic: Array) -> tuple[Array, Array, Array, 
 
 
 @compiled
-def points(axes: Array, origin: Array, targets: Array) -> Array:
-    """See `plain.points`."""
-    B, k, m = len(axes), targets.shape[1], axes.shape[3]
-    out = np.empty((B, k, 3, m))
+def unwound(mdh: Array, q: Array, prismatic: Array, lo: int, hi: int) -> Array:
+    """See `plain.unwound`."""
+    B, n, c = len(mdh), mdh.shape[1], hi - lo
+    out = np.empty((B, 8 * n + 4, 3, c))
     for b in range(B):
-        for t in range(k):
-            u, v, w = targets[b, t]
+        for row in range(4):
             for i in range(3):
-                for r in range(m):
-                    turned = u * axes[b, 0, i, r] + v * axes[b, 1, i, r] + w * axes[b, 2, i, r]
-                    out[b, t, i, r] = turned + origin[b, i, r]
+                for r in range(c):
+                    out[b, 4 * n + row, i, r] = 1.0 if i == row else 0.0
+        for j in range(n - 1, -1, -1):
+            a, d, theta, alpha, beta = mdh[b, j]
+            ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
+            own, here, beyond = 4 * (n + 1 + j), 4 * j, 4 * (j + 1)
+            for r in range(c):
+                turn, slide = theta, d
+                if prismatic[j]:
+                    slide += q[lo + r, j]
+                else:
+                    turn += q[lo + r, j]
+                cos, sin = np.cos(turn), np.sin(turn)
+                for i in range(3):
+                    x, y = out[b, beyond, i, r], out[b, beyond + 1, i, r]
+                    z = out[b, beyond + 2, i, r]
+                    u, bent = cb * x + sb * z, cb * z - sb * x
+                    v, w = ca * y - sa * bent, ca * bent + sa * y
+                    way = a * u + slide * w
+                    out[b, own, i, r], out[b, own + 1, i, r] = u, v
+                    out[b, own + 2, i, r], out[b, own + 3, i, r] = w, way
+                    out[b, here, i, r] = cos * u - sin * v
+                    out[b, here + 1, i, r] = cos * v + sin * u
+                    out[b, here + 2, i, r] = w
+                    out[b, here + 3, i, r] = out[b, beyond + 3, i, r] - way
     return out
-
-
-@compiled
-def screw(V: Array, W: Array, axis: Array, origin: Array) -> None:
-    """Write the screw of a turn about an axis (3, c) through a point (3, c)."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for r in range(axis.shape[1]):
-            W[i, r] = axis[i, r]
-            V[i, r] = origin[j, r] * axis[k, r] - origin[k, r] * axis[j, r]
-
-
-@compiled
-def swing(c: float, s: float, u: Array, v: Array) -> None:
-    """Turn two axes (3, m) into c u + s v and c v - s u, in place."""
-    for i in range(3):
-        for r in range(u.shape[1]):
-            first = c * u[i, r] + s * v[i, r]
-            v[i, r] = c * v[i, r] - s * u[i, r]
-            u[i, r] = first
-
-
-@compiled
-def unwound(
-    mdh: Array, q: Array, prismatic: Array, slot: Array, V: Array, W: Array
-) -> tuple[Array, Array]:
-    """Axes (3, 3, c) and origin (3, c) of the base in the flange; fills the screws V, W.
-
-    mdh: (n, 5).  q: (c, n).  slot: (5n + 6,) row of each parameter in V and W (s, 3, c), or -1.
-    """
-    c, n = q.shape
-    axes, o = np.zeros((3, 3, c)), np.zeros((3, c))
-    x, y, z = axes[0], axes[1], axes[2]
-    x[0], y[1], z[2] = 1.0, 1.0, 1.0
-    for j in range(n - 1, -1, -1):
-        a, d, theta, alpha, beta = mdh[j]
-        if slot[4 * n + j] >= 0:
-            screw(V[slot[4 * n + j]], W[slot[4 * n + j]], y, o)
-        if beta != 0.0:
-            swing(np.cos(beta), np.sin(beta), x, z)
-        if slot[3 * n + j] >= 0:
-            screw(V[slot[3 * n + j]], W[slot[3 * n + j]], x, o)
-        if slot[j] >= 0:
-            V[slot[j]] = x
-        if alpha != 0.0:
-            swing(np.cos(alpha), -np.sin(alpha), y, z)
-        if slot[n + j] >= 0:
-            V[slot[n + j]] = z
-        for r in range(c):
-            slide = d + q[r, j] if prismatic[j] else d
-            for i in range(3):
-                o[i, r] -= a * x[i, r] + slide * z[i, r]
-        if slot[2 * n + j] >= 0:
-            screw(V[slot[2 * n + j]], W[slot[2 * n + j]], z, o)
-        for r in range(c):
-            turn = theta if prismatic[j] else theta + q[r, j]
-            cos, sin = np.cos(turn), np.sin(turn)
-            for i in range(3):
-                first = cos * x[i, r] - sin * y[i, r]
-                y[i, r] = cos * y[i, r] + sin * x[i, r]
-                x[i, r] = first
-    for i in range(3):
-        if slot[5 * n + i] >= 0:
-            V[slot[5 * n + i]] = axes[i]
-        if slot[5 * n + 3 + i] >= 0:
-            screw(V[slot[5 * n + 3 + i]], W[slot[5 * n + 3 + i]], axes[i], o)
-    return axes, o
 
 
 @compiled
 def sighted(
-    axes: Array, o: Array, rotation: Array, origin: Array, spot: Array, y: Array, root: Array,
-    shift: Array, error: Array, swung: Array,
-) -> None:  # fmt: skip
-    """Write the weighted error (3, c) of one target and its shift (3, c), both in the flange.
-
-    shift: (3, c) by which effects move it, in base axes.
-    """
-    for r in range(y.shape[1]):
-        u, v, w = y[0, r] - origin[0], y[1, r] - origin[1], y[2, r] - origin[2]
-        for i in range(3):
-            error[i, r], swung[i, r] = o[i, r] - spot[i], 0.0
-        for j in range(3):
-            seen = rotation[0, j] * u + rotation[1, j] * v + rotation[2, j] * w
-            for i in range(3):
-                error[i, r] += axes[j, i, r] * (seen - shift[j, r])
-                swung[i, r] += axes[j, i, r] * shift[j, r]
-        for i in range(3):
-            error[i, r] *= root[r]
-
-
-@compiled
-def shifted(effects: Array, fields: Array, moved: Array, t: int, lo: int, hi: int) -> Array:
-    """(3, c) by which effects move target t at the poses lo to hi, in base axes."""
-    out = np.zeros((3, hi - lo))
-    if len(moved):
-        out += moved[t, :, lo:hi]
-    for e in range(len(fields)):
-        out += effects[e] * fields[e, t, :, lo:hi]
-    return out
-
-
-@compiled
-def cost(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array,
-) -> Array:  # fmt: skip
-    """See `plain.cost`."""
-    B, n, k, m = len(mdh), mdh.shape[1], len(y), len(q)
-    out = np.zeros((B, k))
-    slot, none = np.full(5 * n + 6, -1), np.zeros((0, 3, 0))
+    arm: Array, rotation: Array, origin: Array, targets: Array, effects: Array, y: Array,
+    weight: Array, fields: Array, moved: Array, lo: int,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """See `plain.sighted`."""
+    B, c, k = len(arm), arm.shape[3], len(y)
+    some = 1 if len(fields) + len(moved) else 0
+    error, swung, root = np.empty((B, k, 3, c)), np.empty((B * some, k, 3, c)), np.empty((k, c))
+    for t in range(k):
+        for r in range(c):
+            root[t, r] = np.sqrt(weight[t, lo + r])
+    seen = np.empty(3)
     for b in range(B):
-        for lo in range(0, m, BLOCK):
-            hi = min(lo + BLOCK, m)
-            axes, o = unwound(mdh[b], q[lo:hi], prismatic, slot, none, none)
-            error, swung = np.empty((3, hi - lo)), np.empty((3, hi - lo))
-            for t in range(k):
-                shift = shifted(effects[b], fields, moved, t, lo, hi)
-                root = np.sqrt(weight[t, lo:hi])
-                sighted(axes, o, rotation[b], origin[b], targets[b, t], y[t, :, lo:hi], root,
-                        shift, error, swung)  # fmt: skip
-                out[b, t] += np.sum(error * error)
-    return out
+        for t in range(k):
+            for r in range(c):
+                u = y[t, 0, lo + r] - origin[b, 0]
+                v = y[t, 1, lo + r] - origin[b, 1]
+                w = y[t, 2, lo + r] - origin[b, 2]
+                for j in range(3):
+                    seen[j] = rotation[b, 0, j] * u + rotation[b, 1, j] * v + rotation[b, 2, j] * w
+                    if some:
+                        shift = moved[t, j, lo + r] if len(moved) else 0.0
+                        for e in range(len(fields)):
+                            shift += effects[b, e] * fields[e, t, j, lo + r]
+                        seen[j] -= shift
+                        for i in range(3):
+                            before = swung[b, t, i, r] if j else 0.0
+                            swung[b, t, i, r] = before + arm[b, j, i, r] * shift
+                for i in range(3):
+                    total = arm[b, 3, i, r] - targets[b, t, i]
+                    for j in range(3):
+                        total += arm[b, j, i, r] * seen[j]
+                    error[b, t, i, r] = root[t, r] * total
+    return error, swung, root
 
 
 @compiled
 def sensed(
-    J: Array, V: Array, W: Array, spot: Array, root: Array, turns: Array, swung: Array, axes: Array,
-    fields: Array, chosen: Array, t: int, lo: int,
-) -> None:  # fmt: skip
-    """Write the weighted rows J (s + e, 3, c) of one target: screws, then effects.
-
-    turns: (3,) rows of the base's turns, which take along what effects have moved, or -1.
-    """
-    s, c = len(V), J.shape[2]
-    for row in range(s):
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            for r in range(c):
-                swing = W[row, j, r] * spot[k] - W[row, k, r] * spot[j]
-                J[row, i, r] = root[r] * (V[row, i, r] + swing)
-    if len(fields):
-        for row in turns:
-            if row >= 0:
-                for i in range(3):
-                    j, k = (i + 1) % 3, (i + 2) % 3
-                    for r in range(c):
-                        more = W[row, j, r] * swung[k, r] - W[row, k, r] * swung[j, r]
-                        J[row, i, r] += root[r] * more
-    for e in range(len(chosen)):
-        for i in range(3):
-            for r in range(c):
-                total = 0.0
-                for j in range(3):
-                    total += axes[j, i, r] * fields[chosen[e], t, j, lo + r]
-                J[s + e, i, r] = root[r] * total
-
-
-@compiled
-def normal(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """See `plain.normal`."""
-    B, n, k, m, p = len(mdh), mdh.shape[1], len(y), len(q), len(which)
-    cost, gradient, gram = np.zeros((B, k)), np.zeros((B, k, p)), np.zeros((B, k, p, p))
-    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
-    slot = np.full(first, -1)
-    s = int(np.searchsorted(which, first))  # screws, then targets, then effects
-    slot[which[:s]] = np.arange(s)
-    end = int(np.searchsorted(which, last))
-    chosen = which[end:] - last
-    held = np.concatenate((np.arange(s), np.arange(end, p)))  # columns that all targets share
+    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array,
+    lo: int,
+) -> Array:  # fmt: skip
+    """See `plain.sensed`."""
+    B, c, k, s = len(arm), arm.shape[3], targets.shape[1], len(axis)
+    out = np.empty((B, k, s + len(fields), 3, c))
     for b in range(B):
-        for lo in range(0, m, BLOCK):
-            hi = min(lo + BLOCK, m)
-            c = hi - lo
-            V, W = np.zeros((s, 3, c)), np.zeros((s, 3, c))
-            axes, o = unwound(mdh[b], q[lo:hi], prismatic, slot, V, W)
-            J, error, swung = np.empty((len(held), 3, c)), np.empty((3, c)), np.empty((3, c))
-            flat, line = J.reshape(len(held), 3 * c), J.reshape(3 * len(held), c)
-            for t in range(k):
-                spot, root = targets[b, t], np.sqrt(weight[t, lo:hi])
-                shift = shifted(effects[b], fields, moved, t, lo, hi)
-                sighted(axes, o, rotation[b], origin[b], spot, y[t, :, lo:hi], root, shift, error,
-                        swung)  # fmt: skip
-                sensed(J, V, W, spot, root, slot[5 * n + 3 :], swung, axes, fields, chosen, t, lo)
-                cost[b, t] += np.sum(error * error)
-                both, pull = flat @ flat.T, flat @ error.reshape(3 * c)
-                side, own = (line @ root).reshape(len(held), 3), error @ root
-                for i in range(len(held)):
-                    gradient[b, t, held[i]] += pull[i]
-                    for j in range(len(held)):
-                        gram[b, t, held[i], held[j]] += both[i, j]
-                total = np.sum(root * root)
-                for row in range(s, end):
-                    axis = which[row] - first - 3 * t
-                    if 0 <= axis < 3:
-                        gradient[b, t, row] += own[axis]
-                        gram[b, t, row, row] += total
-                        for i in range(len(held)):
-                            gram[b, t, row, held[i]] += side[i, axis]
-                            gram[b, t, held[i], row] += side[i, axis]
-    return cost, gradient, gram
-
-
-@compiled
-def rows(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array, lo: int,
-    hi: int,
-) -> tuple[Array, Array]:  # fmt: skip
-    """See `plain.rows`."""
-    n, k, p, c = mdh.shape[1], len(y), len(which), hi - lo
-    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
-    slot = np.full(first, -1)
-    s, end = int(np.searchsorted(which, first)), int(np.searchsorted(which, last))
-    slot[which[:s]] = np.arange(s)
-    chosen = which[end:] - last
-    V, W = np.zeros((s, 3, c)), np.zeros((s, 3, c))
-    axes, o = unwound(mdh[0], q[lo:hi], prismatic, slot, V, W)
-    error, out = np.empty((k, 3, c)), np.zeros((k, p, 3, c))
-    J, swung = np.empty((s + p - end, 3, c)), np.empty((3, c))
-    for t in range(k):
-        spot, root = targets[0, t], np.sqrt(weight[t, lo:hi])
-        shift = shifted(effects[0], fields, moved, t, lo, hi)
-        sighted(axes, o, rotation[0], origin[0], spot, y[t, :, lo:hi], root, shift, error[t],
-                swung)  # fmt: skip
-        sensed(J, V, W, spot, root, slot[5 * n + 3 :], swung, axes, fields, chosen, t, lo)
-        out[t, :s], out[t, end:] = J[:s], J[s:]
-        for row in range(s, end):
-            axis = which[row] - first - 3 * t
-            if 0 <= axis < 3:
-                out[t, row, axis] = root
-    return error, out
-
-
-@compiled
-def squares(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """See `plain.squares`."""
-    k, m, p = len(y), len(q), len(which)
-    f, slope = np.zeros((k, m)), np.zeros((k, m, p))
-    for lo in range(0, m, BLOCK):
-        hi = min(lo + BLOCK, m)
-        error, J = rows(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
-                        moved, which, lo, hi)  # fmt: skip
         for t in range(k):
-            for i in range(3):
-                for r in range(hi - lo):
-                    f[t, lo + r] += error[t, i, r] ** 2
-                for row in range(p):
-                    for r in range(hi - lo):
-                        slope[t, lo + r, row] -= 2.0 * J[t, row, i, r] * error[t, i, r]
-    return f, slope
+            for row in range(s):
+                at, about, along = point[row], axis[row], len(swung) > 0 and axis[row] < 3
+                for i in range(3):
+                    u, v = (i + 1) % 3, (i + 2) % 3
+                    for r in range(c):
+                        move = arm[b, about, i, r]
+                        if at >= 0:
+                            p = targets[b, t, u] - arm[b, at, u, r]
+                            q = targets[b, t, v] - arm[b, at, v, r]
+                            if along:  # the base takes along what effects have moved
+                                p += swung[b, t, u, r]
+                                q += swung[b, t, v, r]
+                            move = arm[b, about, u, r] * q - arm[b, about, v, r] * p
+                        out[b, t, row, i, r] = root[t, r] * move
+            for e in range(len(fields)):
+                for i in range(3):
+                    for r in range(c):
+                        total = 0.0
+                        for j in range(3):
+                            total += arm[b, j, i, r] * fields[e, t, j, lo + r]
+                        out[b, t, s + e, i, r] = root[t, r] * total
+    return out
 
 
 @compiled
-def solved(matrix: Array, right: Array) -> tuple[Array, bool]:
-    """x (p,) of matrix x = right by Cholesky, and whether the matrix (p, p) was definite enough."""
+def products(rows: Array, out: Array) -> None:
+    """Write rows rows' (h, h), its lower half: two by two, which loads half as often."""
+    h = len(rows)
+    for i in range(0, h, 2):
+        k = min(i + 1, h - 1)
+        for j in range(0, i + 1, 2):
+            m = min(j + 1, h - 1)
+            ij, im, kj, km = 0.0, 0.0, 0.0, 0.0
+            for r in range(rows.shape[1]):
+                ij += rows[i, r] * rows[j, r]
+                im += rows[i, r] * rows[m, r]
+                kj += rows[k, r] * rows[j, r]
+                km += rows[k, r] * rows[m, r]
+            out[i, j], out[i, m], out[k, j], out[k, m] = ij, im, kj, km
+
+
+@compiled
+def summed(
+    error: Array, J: Array, root: Array, which: Array, s: int, end: int, first: int, cost: Array,
+    gradient: Array, gram: Array,
+) -> None:  # fmt: skip
+    """See `plain.summed`."""
+    (B, k, h, c3), c = J.shape, root.shape[1]
+    both = np.empty((h, h))
+    for b in range(B):
+        for t in range(k):
+            total, square = 0.0, 0.0
+            for r in range(c3):
+                total += error[b, t, r] * error[b, t, r]
+            for r in range(c):
+                square += root[t, r] * root[t, r]
+            cost[b, t] += total
+            products(J[b, t], both)
+            for i in range(h):
+                to, pull = i if i < s else i - s + end, 0.0
+                for r in range(c3):
+                    pull += J[b, t, i, r] * error[b, t, r]
+                gradient[b, t, to] += pull
+                for j in range(h):
+                    gram[b, t, to, j if j < s else j - s + end] += both[max(i, j), min(i, j)]
+            for row in range(s, end):
+                axis = which[row] - first - 3 * t
+                if 0 <= axis < 3:
+                    gram[b, t, row, row] += square
+                    pull = 0.0
+                    for r in range(c):
+                        pull += error[b, t, axis * c + r] * root[t, r]
+                    gradient[b, t, row] += pull
+                    for i in range(h):
+                        to, side = i if i < s else i - s + end, 0.0
+                        for r in range(c):
+                            side += J[b, t, i, axis * c + r] * root[t, r]
+                        gram[b, t, row, to] += side
+                        gram[b, t, to, row] += side
+
+
+@compiled
+def pulled(error: Array, J: Array) -> tuple[Array, Array]:
+    """See `plain.pulled`."""
+    k, h, _, c = J.shape
+    square, pull = np.empty((k, c)), np.empty((k, c, h))
+    for t in range(k):
+        for r in range(c):
+            u, v, w = error[t, 0, r], error[t, 1, r], error[t, 2, r]
+            square[t, r] = u * u + v * v + w * w
+            for i in range(h):
+                pull[t, r, i] = u * J[t, i, 0, r] + v * J[t, i, 1, r] + w * J[t, i, 2, r]
+    return square, pull
+
+
+@compiled
+def cholesky(matrix: Array, right: Array, x: Array) -> bool:
+    """Write x (p,) of matrix x = right; False where the matrix (p, p) is not definite enough."""
     p = len(right)
-    scale, L, x = np.empty(p), np.empty((p, p)), np.empty(p)
+    scale, L = np.empty(p), np.empty((p, p))
     for i in range(p):
         scale[i] = 1.0 / np.sqrt(max(matrix[i, i], 1e-300))
+        x[i] = 0.0
     for i in range(p):
         for j in range(i + 1):
             total = matrix[i, j] * scale[i] * scale[j]
@@ -349,7 +265,8 @@ def solved(matrix: Array, right: Array) -> tuple[Array, bool]:
             elif total > PIVOT:
                 L[i, i] = np.sqrt(total)
             else:
-                return x, False
+                return False
+    for i in range(p):
         x[i] = right[i] * scale[i]
         for c in range(i):
             x[i] -= L[i, c] * x[c]
@@ -358,38 +275,48 @@ def solved(matrix: Array, right: Array) -> tuple[Array, bool]:
         x[i] /= L[i, i]
         for c in range(i):
             x[c] -= L[i, c] * x[i]
-    return x * scale, True
+    for i in range(p):
+        x[i] *= scale[i]
+    return True
 
 
 @compiled
-def turned(w: Array) -> Array:
-    """See `plain.turned`."""
+def solved(
+    cost: Array, gradient: Array, gram: Array, off: Array, hold: Array
+) -> tuple[Array, float, float, bool]:
+    """See `plain.solved`."""
+    p, before, gain = len(off), 0.0, 0.0
+    matrix, slope, dx = np.zeros((p, p)), np.empty(p), np.empty(p)
+    for t in range(cost.shape[1]):
+        before += cost[0, t]
+    for i in range(p):
+        slope[i] = hold[i] * off[i]
+        before += slope[i] * off[i]
+        for t in range(cost.shape[1]):
+            slope[i] += gradient[0, t, i]
+            for j in range(p):
+                matrix[i, j] += gram[0, t, i, j]
+        matrix[i, i] += hold[i]
+    definite = cholesky(matrix, slope, dx)
+    for i in range(p):
+        gain += dx[i] * slope[i]
+    return dx, before, gain, definite
+
+
+@compiled
+def turned(S: Array, w: Array, out: Array) -> None:
+    """Write a rotation S (3, 3) times that by a vector w (3,), see `plain.turned`."""
     square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     first, second = 1.0 - square / 6.0, 0.5 - square / 24.0
     if square > 1e-8:
         angle = np.sqrt(square)
         first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-    k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    return np.asarray(np.eye(3) + first * k + second * (k @ k))
-
-
-@compiled
-def values(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, which: Array
-) -> Array:
-    """See `plain.values`."""
-    n, k, out = mdh.shape[1], targets.shape[1], np.zeros(len(which))
-    for i in range(len(which)):
-        w = which[i]
-        if w < 5 * n:
-            out[i] = mdh[0, w % n, w // n]
-        elif w < 5 * n + 3:
-            out[i] = origin[0, w - 5 * n]
-        elif 5 * n + 6 <= w < 5 * n + 6 + 3 * k:
-            out[i] = targets[0, (w - 5 * n - 6) // 3, (w - 5 * n - 6) % 3]
-        elif w >= 5 * n + 6 + 3 * k:
-            out[i] = effects[0, w - 5 * n - 6 - 3 * k]
-    return out
+    for i in range(3):
+        along = S[i, 0] * w[0] + S[i, 1] * w[1] + S[i, 2] * w[2]
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            aside = S[i, k] * w[m] - S[i, m] * w[k]
+            out[i, j] = (1.0 - second * square) * S[i, j] + first * aside + second * along * w[j]
 
 
 @compiled
@@ -400,49 +327,22 @@ def stepped(
     """See `plain.stepped`."""
     n, k = mdh.shape[1], targets.shape[1]
     mdh, origin, targets, effects = mdh.copy(), origin.copy(), targets.copy(), effects.copy()
-    turn = np.zeros(3)
-    for i in range(len(which)):
-        w, move = which[i], dx[i]
-        if w < 5 * n:
-            mdh[0, w % n, w // n] += move
-        elif w < 5 * n + 3:
-            origin[0] += rotation[0, :, w - 5 * n] * move
-        elif w < 5 * n + 6:
-            turn[w - 5 * n - 3] = move
-        elif w < 5 * n + 6 + 3 * k:
-            targets[0, (w - 5 * n - 6) // 3, (w - 5 * n - 6) % 3] += move
+    w, after = np.zeros(3), np.empty((1, 3, 3))
+    for row in range(len(which)):
+        at, move = which[row], dx[row]
+        if at < 5 * n:
+            mdh[0, at % n, at // n] += move
+        elif at < 5 * n + 3:
+            for i in range(3):
+                origin[0, i] += rotation[0, i, at - 5 * n] * move
+        elif at < 5 * n + 6:
+            w[at - 5 * n - 3] = move
+        elif at < 5 * n + 6 + 3 * k:
+            targets[0, (at - 5 * n - 6) // 3, (at - 5 * n - 6) % 3] += move
         else:
-            effects[0, w - 5 * n - 6 - 3 * k] += move
-    return mdh, (rotation[0] @ turned(turn)).reshape(1, 3, 3), origin, targets, effects
-
-
-@compiled
-def descend(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-    mean: Array, hold: Array, step: float, most: int,
-) -> tuple[Array, Array, Array, Array, Array, Array, bool]:  # fmt: skip
-    """See `plain.descend`."""
-    costs, count = np.empty(most + 1), max(int(np.count_nonzero(weight)), 1)
-    for i in range(most):
-        F, g, H = normal(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
-                         moved, which)  # fmt: skip
-        off = mean - values(mdh, rotation, origin, targets, effects, which)
-        slope, matrix = g[0].sum(axis=0) + hold * off, H[0].sum(axis=0) + np.diag(hold)
-        costs[i] = F.sum() + np.sum(hold * off * off)
-        if not (i == 0 or costs[i] <= costs[i - 1] * (1.0 + RISE)) or not np.isfinite(costs[i]):
-            return mdh, rotation, origin, targets, effects, costs[: i + 1], False
-        dx, told = solved(matrix, slope)
-        if not told:
-            return mdh, rotation, origin, targets, effects, costs[: i + 1], False
-        mdh, rotation, origin, targets, effects = stepped(
-            mdh, rotation, origin, targets, effects, which, dx
-        )
-        gain = np.sum(dx * slope)
-        if gain <= count * step**2:
-            costs[i + 1] = costs[i] - gain
-            return mdh, rotation, origin, targets, effects, costs[: i + 2], True
-    return mdh, rotation, origin, targets, effects, costs[:most], False
+            effects[0, at - 5 * n - 6 - 3 * k] += move
+    turned(rotation[0], w, after[0])
+    return mdh, after, origin, targets, effects
 
 
 @compiled
@@ -462,8 +362,11 @@ def misfit(matrix: Array, right: Array, sign: float, S: Array, error: Array) -> 
 @compiled
 def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull: Array) -> None:
     """Write gram (3, 3) and slope (3,) of the cost of `polish` for turns about S's own axes."""
-    gram[:], pull[:] = 0.0, 0.0
     row = np.empty(3)
+    for i in range(3):
+        pull[i] = 0.0
+        for j in range(3):
+            gram[i, j] = 0.0
     for r in range(len(error)):
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
@@ -480,7 +383,8 @@ def slopes(matrix: Array, sign: float, S: Array, error: Array, gram: Array, pull
 def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Array, Array]:
     """See `plain.polish`."""
     turns, costs = starts.copy(), np.empty(len(starts))
-    error, gram, pull = np.empty(len(right)), np.empty((3, 3)), np.empty(3)
+    error, gram, pull, step = np.empty(len(right)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    trial = np.empty((3, 3))
     for s in range(len(starts)):
         at, sign, damping = turns[s], signs[s], FIRST
         cost = misfit(matrix, right, sign, at, error)
@@ -489,15 +393,20 @@ def polish(matrix: Array, right: Array, starts: Array, signs: Array) -> tuple[Ar
             more = damping * (gram[0, 0] + gram[1, 1] + gram[2, 2] + 1e-300)
             for i in range(3):
                 gram[i, i] += more
-            step, _ = solved(gram, pull)
-            trial = at @ turned(step)
+            cholesky(gram, pull, step)
+            turned(at, step, trial)
             new = misfit(matrix, right, sign, trial, error)
-            if new < cost or np.sum(pull * step) <= TRUST * cost:
-                at[:], cost, damping = trial, new, 0.1 * damping
+            gain = pull[0] * step[0] + pull[1] * step[1] + pull[2] * step[2]
+            if new < cost or gain <= TRUST * cost:
+                cost, damping = new, 0.1 * damping
+                for i in range(3):
+                    for j in range(3):
+                        at[i, j] = trial[i, j]
             else:
                 damping *= 4.0
                 misfit(matrix, right, sign, at, error)
-            if np.sum(step * step) <= STILL**2 or damping > STUCK:
+            still = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
+            if still <= STILL**2 or damping > STUCK:
                 break
         costs[s] = cost
     return turns, costs

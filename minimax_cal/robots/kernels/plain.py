@@ -1,24 +1,20 @@
 """The kernels by NumPy: the reference that the compiled ones of `fast` are tested against.
 
 A leading ``B`` is a batch of robots, or of iterates; the pose is the last axis, so that sums over
-poses run through memory in order.  Normal equations are taken in the axes of the flange: there a
-target t stands still, each parameter turns it about an axis or slides it along one, and its own
-columns are unit vectors.  The Jacobian of all points is never stored: poses go in blocks that fit
-the cache.
+poses run through memory in order.  Errors and their derivatives are taken in the axes of the
+flange: there a target t stands still, each parameter turns it about an axis or slides it along one,
+and its own columns are unit vectors.  `sums` puts the kernels together.
 """
 
 from __future__ import annotations
-
-import itertools
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 
 A, D, THETA, ALPHA, BETA = range(5)  # columns of an MDH table
-BLOCK = 768  # points of a target in all robots: its Jacobian then fits the second-level cache
+BLOCK = 768  # points, in all robots: their Jacobian then fits the second-level cache
 CYCLE = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-RISE = 1e-12  # relative: a cost that grows by more did not come from rounding
 FIRST, STUCK = 1e-3, 1e6  # damping of `polish`, relative: the first, and where it gives up
 ROUNDS, STILL = 100, 1e-12  # at most so many steps; a turn that ends them [rad]
 TRUST = 1e-13  # of the cost: a predicted gain below it is not seen through rounding
@@ -102,53 +98,70 @@ def cross(u: Array, v: Array) -> Array:
     return out
 
 
-def unwound(mdh: Array, q: Array, prismatic: Array) -> tuple[Array, Array, Array, Array]:
-    """The arm as seen from the flange.
+def unwound(mdh: Array, q: Array, prismatic: Array, lo: int, hi: int) -> Array:
+    """The arm as seen from the flange, at the poses lo to hi: (B, 8n + 4, 3, c) [m].
 
-    mdh: (B, n, 5).  q: (c, n).  Returns the base's axes (B, 3, 3, c), one a row, and origin
-    (B, 3, c), and what each link parameter and the base's pose do (B, 5n + 6, 3, c): the axis along
-    which it slides or about which it turns, and a point on that axis.
+    mdh: (B, n, 5).  q: (m, n).  In fours, first the frames from the base (0) to the flange (n):
+    three axes and the origin.  Then of each joint the axes of the frame before it, turned by theta
+    (a and alpha go along or about the first, d and theta the third), and the way to the next.
     """
-    B, n, c = len(mdh), mdh.shape[1], len(q)
-    a, d, theta, alpha, beta = np.moveaxis(mdh, -1, 0)[..., None, None]
-    axis, through = np.empty((2, B, 5 * n + 6, 3, c))
-    x, y, z = np.broadcast_to(np.eye(3)[:, None, :, None], (3, B, 3, c))
-    o = np.zeros((B, 3, c))
-    turn = theta[..., 0] + turned_by(q, prismatic)
-    cos, sin = np.cos(turn)[:, :, None], np.sin(turn)[:, :, None]
-    ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
-    bent, slides = beta.any(axis=(0, 2, 3)), prismatic.any()
+    B, n, c = len(mdh), mdh.shape[1], hi - lo
+    out = np.empty((B, 2 * n + 1, 4, 3, c))
+    frames, turned = out[:, : n + 1], out[:, n + 1 :]
+    frames[:, n, :3], frames[:, n, 3] = np.eye(3)[..., None], 0.0
+    turn = mdh[..., THETA, None] + turned_by(q[lo:hi], prismatic)
+    cos, sin = np.cos(turn)[:, :, None, None], np.sin(turn)[:, :, None, None]
+    sin = np.concatenate([-sin, sin], axis=2)
+    fixed, slides = fixed_turns(mdh), prismatic.any()
     for j in range(n - 1, -1, -1):
-        axis[:, 4 * n + j], through[:, 3 * n + j] = y, o
-        if bent[j]:
-            x, z = turn_pair(cb[:, j], sb[:, j], x, z)
-        axis[:, j] = x
-        z, y = turn_pair(ca[:, j], sa[:, j], z, y, axis[:, n + j])
-        o = o - a[:, j] * x - (d[:, j] + q[:, j] * prismatic[j] if slides else d[:, j]) * z
-        through[:, 2 * n + j] = o
-        y, x = turn_pair(cos[:, j], sin[:, j], y, x)
-    axis[:, 2 * n : 3 * n], axis[:, 3 * n : 4 * n] = axis[:, n : 2 * n], axis[:, :n]
-    through[:, 4 * n : 5 * n] = through[:, 3 * n : 4 * n]
-    axes = axis[:, 5 * n : 5 * n + 3]
-    axes[:, 0], axes[:, 1], axes[:, 2] = x, y, z
-    axis[:, 5 * n + 3 :], through[:, 5 * n + 3 :] = axes, o[:, None]
-    return axes, o, axis, through
+        own, here = turned[:, j], frames[:, j]
+        beyond = frames[:, j + 1, :3].reshape(B, 3, 3 * c)
+        np.matmul(fixed[:, j], beyond, out=own.reshape(B, 4, 3 * c))
+        if slides:
+            own[:, 3] += prismatic[j] * q[lo:hi, j] * own[:, 2]
+        np.subtract(frames[:, j + 1, 3], own[:, 3], out=here[:, 3])
+        axes = np.multiply(cos[:, j], own[:, :2], out=here[:, :2])
+        axes += sin[:, j] * own[:, 1::-1]
+        here[:, 2] = own[:, 2]
+    return out.reshape(B, -1, 3, c)
+
+
+def fixed_turns(mdh: Array) -> Array:
+    """(B, n, 4, 3) what takes the axes of a frame over beta and alpha, and the way a, d then."""
+    a, d, _, alpha, beta = np.moveaxis(mdh, -1, 0)
+    ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
+    out = np.empty((*mdh.shape[:2], 4, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = cb, 0.0, sb
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = sa * sb, ca, -sa * cb
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = -ca * sb, sa, ca * cb
+    out[..., 3, :] = a[..., None] * out[..., 0, :] + d[..., None] * out[..., 2, :]
+    return out
 
 
 def sighted(
-    axes: Array, o: Array, rotation: Array, origin: Array, targets: Array, y: Array, shift: Array
-) -> tuple[Array, Array]:
-    """Errors of the targets and their shifts by effects, (B, k, 3, c) each, in the flange [m].
+    arm: Array, rotation: Array, origin: Array, targets: Array, effects: Array, y: Array,
+    weight: Array, fields: Array, moved: Array, lo: int,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Weighted errors (B, k, 3, c) of the targets in the flange, their shift, roots of weights.
 
-    y: (k, 3, c) measured.  shift: (B, k, 3, c) by which effects move them, in base axes; (0,) for
-    none.
+    arm: as `unwound`, from the pose lo on.  Others as `sums.cost`.  The shift by effects, in the
+    flange and not weighted: (B, k, 3, c), or (0, k, 3, c) without any.  Roots: (k, c).
     """
-    seen = np.swapaxes(rotation, -1, -2)[:, None] @ (y - origin[:, None, :, None])
+    c, k = arm.shape[3], len(y)
+    axes, o, poses = arm[:, :3], arm[:, 3], slice(lo, lo + c)
+    seen = np.swapaxes(rotation, -1, -2)[:, None] @ (y[..., poses] - origin[:, None, :, None])
     error = inside(axes, seen) + (o[:, None] - targets[..., None])
-    if not shift.size:
-        return error, shift
-    swung = inside(axes, shift)
-    return error - swung, swung
+    swung, root = np.zeros((0, k, 3, c)), np.sqrt(weight[:, poses])
+    if len(fields) + len(moved):
+        shift = np.zeros((len(arm), k, 3, c))
+        if len(moved):
+            shift += moved[..., poses]
+        if len(fields):
+            shift += np.tensordot(effects, fields[..., poses], 1)
+        swung = inside(axes, shift)
+        error -= swung
+    error *= root[:, None]
+    return error, swung, root
 
 
 def inside(axes: Array, u: Array) -> Array:
@@ -162,219 +175,94 @@ def inside(axes: Array, u: Array) -> Array:
     return np.asarray(out)
 
 
-def shifted(effects: Array, fields: Array, moved: Array, rows: slice) -> Array:
-    """(B, k, 3, c) by which effects move the targets, in base axes [m]; (0,) for none."""
-    if not len(fields) + len(moved):
-        return np.zeros(0)
-    out = np.zeros((len(effects), 1, 1, 1))
-    if len(moved):
-        out = out + moved[..., rows]
-    if len(fields):
-        out = out + np.tensordot(effects, fields[..., rows], 1)
-    return out
-
-
-def blocks(m: int, points: int) -> list[slice]:
-    """The poses in blocks that fit the cache.  points: at each pose, in all robots."""
-    edges = np.linspace(0, m, min(-(-m * points // BLOCK), m) + 1).astype(int)
-    return [slice(lo, hi) for lo, hi in itertools.pairwise(edges)]
-
-
-def cost(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array,
-) -> Array:  # fmt: skip
-    """Weighted sums of squares F_i of each target: (B, k) [m^2].
-
-    mdh: (B, n, 5).  rotation, origin: (B, 3, 3), (B, 3) of the base.  targets: (B, k, 3) in the
-    flange [m].  effects: (B, e) values.  q: (m, n), prismatic: (n,) as `chain`.  y: (k, 3, m)
-    measured [m].  weight: (k, m), 0 where not measured.  fields: (e, k, 3, m) motion of the points
-    per unit of each effect, moved: (k, 3, m) besides, in base axes; (0, ...) for none.
-    """
-    out = np.zeros((len(mdh), len(y)))
-    for rows in blocks(len(q), len(mdh) * len(y)):
-        axes, o, _, _ = unwound(mdh, q[rows], prismatic)
-        shift = shifted(effects, fields, moved, rows)
-        error, _ = sighted(axes, o, rotation, origin, targets, y[..., rows], shift)
-        out += np.einsum("bkic,bkic,kc->bk", error, error, weight[:, rows])
-    return out
-
-
-def normal(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Normal equations by target: F (B, k), J'We (B, k, p) and J'WJ (B, k, p, p).
-
-    which: (p,) the parameters, ascending, in the order of `Names`.  Others as `cost`.
-    """
-    (B, n, _), k, p = mdh.shape, len(y), len(which)
-    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
-    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
-    h = s + p - end  # columns that all targets share: screws and effects
-    total, pull, both = np.zeros((B, k)), np.zeros((B, k, h)), np.zeros((B, k, h, h))
-    side, own = np.zeros((B, k, h, 3)), np.zeros((B, k, 3))
-    for rows in blocks(len(q), B * k):
-        error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
-                                fields, moved, which, rows)  # fmt: skip
-        flat = J.reshape(B, k, h, -1)
-        total += np.einsum("bkic,bkic->bk", error, error)
-        pull += (flat @ error.reshape(B, k, -1, 1))[..., 0]
-        both += flat @ np.swapaxes(flat, -1, -2)
-        side += (J.reshape(B, k, 3 * h, -1) @ root[..., None]).reshape(side.shape)
-        own += (error @ root[..., None])[..., 0]
-    gradient, gram = np.zeros((B, k, p)), np.zeros((B, k, p, p))
-    held = [(slice(0, s), slice(0, s)), (slice(end, p), slice(s, h))]  # there, and among `both`
-    held = held[: 2 if end < p else 1]
-    for to, at in held:
-        gradient[..., to] = pull[..., at]
-        for to_too, at_too in held:
-            gram[..., to, to_too] = both[..., at, at_too]
-    edges, square = np.searchsorted(which, first + 3 * np.arange(k + 1)).tolist(), weight.sum(1)
-    for t, (lo, hi) in enumerate(itertools.pairwise(edges)):
-        axis = which[lo:hi] - first - 3 * t
-        gradient[:, t, lo:hi] = own[:, t, axis]
-        gram[:, t, lo:hi, lo:hi] = square[t] * np.eye(hi - lo)
-        for to, at in held:
-            gram[:, t, to, lo:hi] = part = side[:, t, at][..., axis]
-            gram[:, t, lo:hi, to] = np.swapaxes(part, -1, -2)
-    return total, gradient, gram
-
-
-def shared(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-    poses: slice,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Weighted errors (B, k, 3, c), columns that all targets share (B, k, h, 3, c), roots (k, c).
-
-    The roots are those of the weights.  Of some poses, in the axes of the flange; as `normal`.
-    """
-    n, k = mdh.shape[1], len(y)
-    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
-    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
-    arm, shift = unwound(mdh, q[poses], prismatic), shifted(effects, fields, moved, poses)
-    error, swung = sighted(*arm[:2], rotation, origin, targets, y[..., poses], shift)
-    J = sensed(arm, targets, swung, which[:s])
-    if end < len(which):
-        field = np.swapaxes(fields[which[end:] - last][..., poses], 0, 1)
-        more = inside(arm[0], np.broadcast_to(field, (len(mdh), *field.shape)))
-        J = np.concatenate([J, more], axis=2)
-    root = np.sqrt(weight[:, poses])
-    J *= root[:, None, None]
-    error *= root[:, None]
-    return error, J, root
-
-
-def rows(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array, lo: int,
-    hi: int,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Weighted errors (k, 3, c) of the poses lo to hi, and their Jacobian J (k, p, 3, c).
-
-    In the axes of the flange, of a batch of one; the errors' derivative is -J.  As `normal`.
-    """
-    n, k, p = mdh.shape[1], len(y), len(which)
-    first, last = 5 * n + 6, 5 * n + 6 + 3 * k
-    s, end = (int(at) for at in np.searchsorted(which, (first, last)))
-    error, J, root = shared(mdh, rotation, origin, targets, effects, q, prismatic, y, weight,
-                            fields, moved, which, slice(lo, hi))  # fmt: skip
-    out = np.zeros((k, p, *error.shape[2:]))
-    out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
-    for row in range(s, end):
-        t, axis = divmod(int(which[row]) - first, 3)
-        out[t, row, axis] = root[t]
-    return error[0], out
-
-
-def squares(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Weighted squared distance of every point (k, m) [m^2] and its derivative (k, m, p).
-
-    Of a batch of one, as `normal`.
-    """
-    k, m = weight.shape
-    f, slope = np.zeros((k, m)), np.zeros((k, m, len(which)))
-    for part in blocks(m, k):
-        error, J = rows(mdh, rotation, origin, targets, effects, q, prismatic, y, weight, fields,
-                        moved, which, part.start, part.stop)  # fmt: skip
-        f[:, part] = np.einsum("kic,kic->kc", error, error)
-        slope[:, part] = -2.0 * np.einsum("kpic,kic->kcp", J, error)
-    return f, slope
-
-
 def sensed(
-    arm: tuple[Array, Array, Array, Array], targets: Array, swung: Array, which: Array
-) -> Array:
-    """Rows of all targets for parameters of links and base: (B, k, s, 3, c), in the flange.
+    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array,
+    lo: int,
+) -> Array:  # fmt: skip
+    """Weighted derivatives of the targets by what moves them all: (B, k, h, 3, c), in the flange.
 
-    arm: as `unwound`.  swung: (B, k, 3, c) by which effects move the targets; (0,) for none.
-    which: (s,) the parameters.
+    axis, point: (s,) rows of the arm, see `sums.axes`.  fields: (h - s, k, 3, m) of the effects.
+    arm, lo, swung, root: as `sighted`.
     """
-    *_, axis, through = arm
-    n = axis.shape[1] // 5 - 1
-    angles, moves, turns = (int(at) for at in np.searchsorted(which, (2 * n, 5 * n, 5 * n + 3)))
-    out = np.empty((len(axis), targets.shape[1], len(which), *axis.shape[2:]))
-    for slide in (slice(0, angles), slice(moves, turns)):
-        out[:, :, slide] = axis[:, None, which[slide]]
-    turning = np.concatenate([which[angles:moves], which[turns:]])
-    about = axis[:, turning]
-    swing = cross(about[:, None], targets[:, :, None, :, None])
-    swing += cross(through[:, turning], about)[:, None]
-    out[:, :, angles:moves] = swing[:, :, : moves - angles]
-    out[:, :, turns:] = swing[:, :, moves - angles :]
-    if swung.size:  # the base takes along what effects have moved
-        out[:, :, turns:] += cross(axis[:, None, which[turns:]], swung[:, :, None])
+    (B, _, _, c), s = arm.shape, len(axis)
+    slides, turns = np.flatnonzero(point < 0), np.flatnonzero(point >= 0)
+    out = np.empty((B, targets.shape[1], s + len(fields), 3, c))
+    out[:, :, slides] = arm[:, None, axis[slides]]
+    about, at = arm[:, None, axis[turns]], arm[:, None, point[turns]]
+    reach = [targets[:, :, i, None, None] - at[:, :, :, i] for i in range(3)]
+    if len(swung):  # the base takes along what effects have moved
+        for i in range(3):
+            reach[i][:, :, axis[turns] < 3] += swung[:, :, None, i]
+    for i, j, k in CYCLE:
+        move = about[:, :, :, j] * reach[k]
+        move -= about[:, :, :, k] * reach[j]
+        out[:, :, turns, i] = move
+    if len(fields):
+        field = np.swapaxes(fields[..., lo : lo + c], 0, 1)
+        out[:, :, s:] = inside(arm[:, :3], np.broadcast_to(field, (B, *field.shape)))
+    out *= root[:, None, None]
     return out
 
 
-def descend(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, q: Array,
-    prismatic: Array, y: Array, weight: Array, fields: Array, moved: Array, which: Array,
-    mean: Array, hold: Array, step: float, most: int,
-) -> tuple[Array, Array, Array, Array, Array, Array, bool]:  # fmt: skip
-    """Plain Gauss-Newton steps from a start that is near: the sum of all F_i, and a prior.
+def summed(
+    error: Array, J: Array, root: Array, which: Array, s: int, end: int, first: int, cost: Array,
+    gradient: Array, gram: Array,
+) -> None:  # fmt: skip
+    """Add to the normal equations by target: cost (B, k), gradient (B, k, p), gram (B, k, p, p).
 
-    As `normal`, for a batch of one.  mean, hold: (p,) of the prior on `which`, hold = its weight.
-    step: root mean square motion of a point that ends it [m].  most: steps.
-    Returns mdh, rotation, origin, targets, effects, the cost at every iterate (t,), and whether it
-    ended well: each step led down, and the last one was small.
+    error: (B, k, 3 c), J: (B, k, h, 3 c), root: (k, c), s, end: as `sighted` and `sensed`.  A
+    target's own coordinates are which[s:end], of all that begin with the parameter `first`.
     """
-    at, costs = (mdh, rotation, origin, targets, effects), [np.inf]
-    count, known = max(int(np.count_nonzero(weight)), 1), bool(hold.any())
-    for _ in range(most):
-        F, g, H = normal(*at, q, prismatic, y, weight, fields, moved, which)
-        slope, matrix, paid = g[0].sum(axis=0), H[0].sum(axis=0), 0.0
-        if known:
-            off = mean - values(*at, which)
-            slope, matrix, paid = slope + hold * off, matrix + np.diag(hold), hold @ (off * off)
-        costs.append(F.sum() + paid)
-        if not costs[-1] <= costs[-2] * (1.0 + RISE):
-            return *at, np.array(costs[1:]), False
-        scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-        scaled = matrix * scale[:, None] * scale
-        try:
-            if np.linalg.cholesky(scaled).diagonal().min() ** 2 <= PIVOT:
-                return *at, np.array(costs[1:]), False
-        except np.linalg.LinAlgError:
-            return *at, np.array(costs[1:]), False
-        dx = scale * np.linalg.solve(scaled, scale * slope)
-        at = stepped(*at, which, dx)
-        gain = float(dx @ slope)
-        if gain <= count * step**2:
-            return *at, np.array([*costs[1:], costs[-1] - gain]), True
-    return *at, np.array(costs[1:]), False
+    B, k, h, _ = J.shape
+    cost += np.einsum("bkr,bkr->bk", error, error)
+    pull, both = (J @ error[..., None])[..., 0], J @ np.swapaxes(J, -1, -2)
+    side = (J.reshape(B, k, 3 * h, -1) @ root[..., None]).reshape(B, k, h, 3)
+    own, square = (error.reshape(B, k, 3, -1) @ root[..., None])[..., 0], (root**2).sum(axis=1)
+    held = [(slice(0, s), slice(0, s)), (slice(end, len(which)), slice(s, h))]  # and in `both`
+    held = held[: 2 if end < len(which) else 1]
+    row = np.arange(s, end)
+    t, axis = np.divmod(which[s:end] - first, 3)
+    for to, at in held:
+        gradient[..., to] += pull[..., at]
+        for to_too, at_too in held:
+            gram[..., to, to_too] += both[..., at, at_too]
+        part = side[:, t, at, axis]  # the rows come first
+        gram[:, t, to, row] += part
+        gram[:, t, row, to] += np.swapaxes(part, 0, 1)
+    gradient[:, t, row] += own[:, t, axis]
+    gram[:, t, row, row] += square[t]
 
 
-def values(
-    mdh: Array, rotation: Array, origin: Array, targets: Array, effects: Array, which: Array
-) -> Array:
-    """(p,) the parameters of a batch of one; those of the base's turn are 0, as steps are."""
-    every = (mdh[0].T.reshape(-1), origin[0], np.zeros(3), targets[0].reshape(-1), effects[0])
-    return np.concatenate(every)[which]
+def pulled(error: Array, J: Array) -> tuple[Array, Array]:
+    """Square of every point's error (k, c), and J'e of each (k, c, h).
+
+    error: (k, 3, c), J: (k, h, 3, c) of one robot, as `sighted` and `sensed`.
+    """
+    return np.einsum("kic,kic->kc", error, error), np.einsum("khic,kic->kch", J, error)
+
+
+def solved(
+    cost: Array, gradient: Array, gram: Array, off: Array, hold: Array
+) -> tuple[Array, float, float, bool]:
+    """A Gauss-Newton step dx (p,) of the sum of all targets' squares and of hold (off - dx)^2.
+
+    cost: (1, k), gradient: (1, k, p), gram: (1, k, p, p) as `summed`.  off: (p,) from the
+    parameters to the prior's mean, hold: (p,) its weight.  Returns the cost before the step and
+    what it promises to gain too, and whether the matrix was definite enough to be solved.
+    """
+    slope, matrix = gradient[0].sum(axis=0) + hold * off, gram[0].sum(axis=0)
+    matrix.flat[:: len(matrix) + 1] += hold
+    before = float(cost.sum() + hold @ (off * off))
+    scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    matrix *= scale[:, None] * scale
+    try:
+        definite = np.linalg.cholesky(matrix).diagonal().min() ** 2 > PIVOT
+    except np.linalg.LinAlgError:
+        definite = False
+    if not definite:
+        return np.zeros(len(slope)), before, 0.0, False
+    dx = scale * np.linalg.solve(matrix, scale * slope)
+    return dx, before, float(dx @ slope), True
 
 
 def stepped(
