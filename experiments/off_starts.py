@@ -176,7 +176,7 @@ def to_the_letter(job: Job, robot: Robot, model: Model) -> Outcome:
     begins = [flat(robot, t, a) for t, a in zip(job.theta, job.alpha, strict=True)]
     if job.moved:
         rng = np.random.default_rng(0)
-        begins = [x * (1.0 + ROUNDING * rng.integers(-1, 2, x.size)) for x in begins]
+        begins = [nudged(x, rng) for x in begins]
     # compiling does not count
     letter(job.method, job.parameters, model, begins[0], 1, meant=job.cap)
     began = time.perf_counter()
@@ -187,6 +187,11 @@ def to_the_letter(job: Job, robot: Robot, model: Model) -> Outcome:
         converged.append(ended == pseudo_inverse.CONVERGED)
     seconds = time.perf_counter() - began
     return Outcome(tuple(iterations), tuple(costs), tuple(converged), seconds)
+
+
+def nudged(start: Array, rng: np.random.Generator) -> Array:
+    """A start, each value of it moved by a unit of rounding or not."""
+    return np.asarray(start * (1.0 + ROUNDING * rng.integers(-1, 2, start.size)))
 
 
 def flat(robot: Robot, theta: float = 0.0, alpha: float = 0.0) -> Array:

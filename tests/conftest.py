@@ -55,6 +55,18 @@ def clean(robot: mc.Robot) -> Simulation:
 
 
 @pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration and a diagnosis of one file of measurements."""
+    folder = tmp_path_factory.mktemp("report")
+    made = simulate(mc.load_robot("ur10"), 50, 3, seed=1, truth=Truth(compliance=2e-6))
+    mc.write_measurements(folder / "poses.csv", made.data)
+    data = mc.read_measurements(folder / "poses.csv")
+    mc.calibrate("ur10", data).save(folder / "fit.json")
+    mc.diagnose("ur10", data).save(folder / "gap.json")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """The page to work in, served once for all tests that ask it."""
     from served import serving  # stands beside those tests

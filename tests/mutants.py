@@ -29,7 +29,8 @@ PATIENCE = 6.0  # times what the tests take without a fault
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     ["pytest", "_pytest.assertion.rewrite", "numpy.testing", "scipy.optimize",
-     "scipy.stats", "scipy.spatial", "scipy.cluster.vq", "pydantic", "click", "yaml", "daqp"]
+     "scipy.stats", "scipy.spatial", "scipy.cluster.vq", "pydantic", "click", "yaml", "daqp",
+     "numba", "cvxpy"]
 )  # fmt: skip
 COMPARISONS = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq,

@@ -13,6 +13,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.model import Model, in_base, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot
 
 FEW = 30  # poses that are enough to test a slip of units or signs
@@ -47,8 +48,9 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
         return given
     trials = [("the measurement frame looks left-handed; reverse one of its axes", given.mirrored)]
     few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
-    for text, mended in suspicions(robot, data.take(few)):
-        trials.append((text, fitted(robot, mended).mean_square))
+    with work(brief=False):
+        for text, mended in suspicions(robot, data.take(few)):
+            trials.append((text, fitted(robot, mended).mean_square))
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)

@@ -16,7 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model, SumOfSquares
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.kernels.choice import kernels, ready
+from minimax_cal.robots.kernels.choice import kernels, ready, work
 from minimax_cal.robots.transforms import nearest_rotation
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
@@ -160,6 +160,7 @@ def linear_rows(model: Model, mdh: Array, centre: Array, poses: slice) -> Array:
     return np.asarray(rows[weight > 0.0].reshape(-1, rows.shape[-1]))
 
 
+@work(brief=False)
 def search(
     model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = ROUNDS
 ) -> LeastSquares[State]:

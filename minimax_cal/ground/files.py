@@ -30,10 +30,7 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     if path.exists() and not path.is_file():
         write_into(path, raw)
         return
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+    handle, name = beside(path)
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(raw)
@@ -41,6 +38,14 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
         os.replace(name, path)
     except OSError as error:
         Path(name).unlink(missing_ok=True)
+        raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def beside(path: Path) -> tuple[int, str]:
+    """A new file in the folder of a path, open, and its name.  Raises CalibrationError."""
+    try:
+        return tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
 
 
@@ -80,8 +85,13 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
         raise CalibrationError(f"{path}: the file's ending must be one of {', '.join(suffixes)}")
     if path.is_dir():
         raise CalibrationError(f"{path}: is a folder; name a file")
-    if not resolved(path).parent.is_dir():
+    there = resolved(path)
+    if not there.parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
+    if there.is_file() or not there.exists():  # no pipe and no device
+        handle, name = beside(there)
+        os.close(handle)
+        os.unlink(name)
 
 
 def made_folder(path: Path) -> Path:

@@ -153,6 +153,8 @@ def look_for(cluster: str) -> None:
         found = asyncio.run(asyncio.wait_for(identity(), PATIENCE))["type"]
     except Exception as error:  # no such host, no answer, or an answer of something else
         what = " ".join(str(error).split()) or f"no answer in {PATIENCE:g} s"
+        if isinstance(error, MemoryError):  # its first bytes were taken for a length
+            what = "what answers there is something else"
         raise OptionError(
             f"no Dask scheduler at {cluster!r} ({what}); start one with python -m dask scheduler "
             "and give its address as tcp://host:port"

@@ -1,12 +1,16 @@
 """Noises that are not alike are told from those that are, and found in size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems_fit import study
 
-from minimax_cal.diagnosing.scatter import WholePoses, motions, weighed_anew
+from minimax_cal.diagnosing import scatter
+from minimax_cal.diagnosing.scatter import WholePoses, motions, weighed, weighed_anew
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.evidence.limits import EXACT, LEAST_DOF
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
@@ -85,3 +89,77 @@ def test_the_slope_is_that_of_the_likelihood(plain: Study) -> None:
     step = 1e-4 * np.eye(len(at))
     steps = [rest.cost(at + d, parts)[0] - rest.cost(at - d, parts)[0] for d in step]
     assert_allclose(slope, np.array(steps) / 2e-4, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(("along", "across"), [(0.4, 1.5), (1.5, 0.4), (0.01, 1.0)])
+def test_weighed_rows_have_the_covariance_of_the_noises(
+    plain: Study, along: float, across: float
+) -> None:
+    """With the variance of the best direction, and the joints' RMS as their scatter."""
+    joints = QUIET * np.arange(1.0, 7.0)
+    variance = (POINT * np.array([along, across])) ** 2
+    turned, sight = motions(plain)
+    found = weighed(plain, joints, sight, variance)
+    assert_allclose(found.uneven, (variance[0] + 2.0 * variance[1]) / 3.0 / variance.min()
+                    if variance.min() > 1e-3 * variance.max() else 20.0, rtol=1e-12)  # fmt: skip
+    mean = (variance[0] + 2.0 * variance[1]) / 3.0
+    best = mean / found.uneven
+    alike = best + np.mean(joints**2) * found.rows.size * found.rows.variance_ratio
+    m, r = found.rows.weight.shape
+    told = (found.rows.turn * alike.reshape(m, 1, r)) @ np.swapaxes(found.rows.turn, 1, 2)
+
+    def spread(field: Array) -> Array:
+        flat = np.moveaxis(field.reshape(len(field), r, m), -1, 0)
+        return np.asarray(np.swapaxes(flat, 1, 2) @ flat)
+
+    size = np.maximum(variance, best)
+    expected = sum(joint**2 * spread(part) for joint, part in zip(joints, turned, strict=True))
+    expected = expected + sum(s * spread(part) for s, part in zip(size, sight, strict=True))
+    assert_allclose(told, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_motions_are_those_of_a_point_of_unit_weight(plain: Study) -> None:
+    heavy = replace(plain, model=replace(plain.model, weight=4.0 * plain.model.weight))
+    joints, sight = motions(plain)
+    for one, other in zip(sight, motions(heavy)[1], strict=True):
+        assert_allclose(other, 0.5 * one, rtol=1e-12)
+    assert_allclose(motions(heavy)[0], joints, rtol=0, atol=0)
+    flat = np.concatenate(sight)
+    assert_allclose(np.einsum("dkcm,dlem->mkcle", flat, flat),
+                    np.broadcast_to(np.eye(9).reshape(3, 3, 3, 3), (plain.scene.poses, 3, 3, 3, 3)),
+                    atol=1e-12)  # fmt: skip
+
+
+def test_poses_that_lack_a_point_do_not_count(plain: Study) -> None:
+    """Joints scatter unlike each other at the other poses, and that is found."""
+    joints = np.array([1.0, 1.0, 1.0, 1.0, 30.0, 30.0]) * QUIET
+    made = drawn(plain, joints, POINT, POINT, 1)
+    y = made.data.y.copy()
+    y[::9, 0] = np.nan
+    part = made.data.with_y(y)
+    some = studied(made.robot, part, fit_cell(made.robot, part, SUM, silent))
+    found = weighed_anew(some, nothing(some))
+    assert found is not some
+    assert 0.8 < restricted(found.rows, nothing(found)).jitter / np.sqrt(np.mean(joints**2)) < 1.25
+
+
+def test_of_few_poses_or_of_computed_points_nothing_is_said(
+    plain: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scatter, "UNLIKE", 1.0)  # noises alike are weighed anew too
+    made = drawn(plain, np.full(6, QUIET), POINT, POINT, 1)
+    rows = 3 * made.scene.targets
+    few = -(-(made.rows.basis.shape[1] + LEAST_DOF) // rows)  # poses that are just enough
+    for count in (few - 1, few):
+        data = made.data.take(np.arange(made.scene.poses) < count)
+        some = studied(made.robot, data, made.fit)
+        assert (weighed_anew(some, nothing(some)) is some) == (count < few)
+    spare = rows * few - made.rows.basis.shape[1] - LEAST_DOF
+    columns = np.eye(rows * few)[:, : spare + 1]  # each known column costs a degree of freedom
+    assert weighed_anew(some, columns[:, :spare]) is not some
+    assert weighed_anew(some, columns) is some
+    usual = np.sqrt(restricted(made.rows, nothing(made)).variance)
+    for size, told in ((1e-2, False), (1e2, True)):
+        error = size * EXACT / usual * made.rows.error
+        exact = replace(made, rows=replace(made.rows, error=error))
+        assert (weighed_anew(exact, nothing(exact)) is exact) != told

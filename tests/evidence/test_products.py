@@ -98,6 +98,14 @@ def test_products_are_the_sums_over_rows_that_count(
         assert_allclose(lower @ found.part[i], shared, rtol=ROUNDING, atol=ROUNDING * size.max())
 
 
+def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: Study) -> None:
+    clear = lib.products.clear(np.arange(lib.products.columns.count))
+    size = np.linalg.norm(lib.columns, axis=0)
+    assert np.all(ROUNDING * size >= np.abs(clear @ rough.rows.basis).T)
+    assert_allclose(lib.columns - clear.T, rough.rows.basis @ (rough.rows.basis.T @ lib.columns),
+                    rtol=0, atol=ROUNDING * np.abs(lib.columns).max())  # fmt: skip
+
+
 def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
     lib: Library, rough: Study, poses: Array
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+MOST = 10**300  # a longer integer is no float
 Rng = np.random.Generator
 MARKUP = "<script>alert(1)</script>"
 ESCAPE = "\x1b]0;owned\x07"
@@ -180,7 +181,8 @@ def changed(tree: Any, rng: Rng) -> Any:
         holder, key = pick(rng, at)
         how, old = rng.random(), holder[key]
         if how < 0.5 and isinstance(old, int | float):
-            holder[key] = old * float(pick(rng, (-1.0, 0.9, 1.0 + 1e-9, 2.0, 1e3)))
+            size = max(-MOST, min(old, MOST)) if isinstance(old, int) else old
+            holder[key] = size * float(pick(rng, (-1.0, 0.9, 1.0 + 1e-9, 2.0, 1e3)))
         elif how < 0.6:
             holder[key] = pick(rng, LEAVES)
         elif how < 0.8:

@@ -81,6 +81,7 @@ def judged(one: Case) -> tuple[str, str]:
     code: Any = 0
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
+        warnings.filterwarnings("ignore", "Loky-backed")  # of daemons, as these processes are
         try:
             with redirect_stdout(said), redirect_stderr(told):
                 main(list(one.arguments))

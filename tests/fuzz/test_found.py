@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import errno
 import json
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -274,3 +276,24 @@ def test_measurements_without_a_joint_are_not_those_of_the_fit(
     for command in ("iso9283", "map", "evaluate", "check"):
         more = ("--tolerance", "rms 0.5") if command == "check" else ()
         assert "has 5 joint columns" in refused(capsys, command, fit, path, *more)
+
+
+def test_of_two_outputs_none_is_left_where_one_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fleet's page stood there when its rows could not be written."""
+    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
+        (tmp_path / name).write_bytes(material()[name])
+    page, closed, made = tmp_path / "out.html", tmp_path / "closed", tempfile.mkstemp
+    closed.mkdir()
+
+    def denied(prefix: str, dir: Path) -> tuple[int, str]:
+        if dir == closed:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return made(prefix=prefix, dir=dir)
+
+    monkeypatch.setattr(tempfile, "mkstemp", denied)
+    told = refused(capsys, "fleet", tmp_path / "cells.toml", "--page", page, "--jobs", 1, "-o",
+                   closed / "out.json")  # fmt: skip
+    assert "cannot be written (Permission denied)" in told
+    assert not page.exists()

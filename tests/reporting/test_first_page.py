@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from conftest import run
-from test_report import WORDING, Seen, results
+from test_report import WORDING, Seen
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
@@ -13,8 +13,6 @@ from minimax_cal.reporting import report
 from minimax_cal.reporting.html import compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
-
-__all__ = ["results"]  # the fixture
 
 
 @pytest.fixture(scope="module")

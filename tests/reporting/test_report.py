@@ -32,7 +32,7 @@ from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.words import visible
 from minimax_cal.modelling.parameters import Names
-from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.modelling.simulate import simulate
 from minimax_cal.reporting.html import (
     Figure,
     Section,
@@ -59,18 +59,6 @@ SECTIONS = [
 ]  # fmt: skip
 NASTY = '<script>alert(1)</script>&amp;"\u2028</script><img src=x onerror=alert(2)>'
 WORDING = Wording("2026-11-21", author="A. Smith", customer="Example Ltd")
-
-
-@pytest.fixture(scope="session")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A calibration and a diagnosis of one file of measurements."""
-    folder = tmp_path_factory.mktemp("report")
-    made = simulate(mc.load_robot("ur10"), 50, 3, seed=1, truth=Truth(compliance=2e-6))
-    mc.write_measurements(folder / "poses.csv", made.data)
-    data = mc.read_measurements(folder / "poses.csv")
-    mc.calibrate("ur10", data).save(folder / "fit.json")
-    mc.diagnose("ur10", data).save(folder / "gap.json")
-    return folder
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import run
-from test_report import NASTY, WORDING, hostile, results, write
+from test_report import NASTY, WORDING, hostile, write
 
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
@@ -21,8 +21,6 @@ from minimax_cal.reporting.html.content import Figure
 
 A4 = (680, 993)  # pixels between the margins
 PATIENCE = 120.0  # seconds; drawing by software on a busy machine is slow
-
-__all__ = ["results"]  # the fixture
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -55,6 +57,33 @@ def test_the_right_multipliers_prove_the_optimum(seed: int) -> None:
     for factor in (1e-3, 7.0):  # their size is not believed
         scaled = Multipliers(factor * right.y, factor * right.lam)
         assert_allclose(lower_bound(*problem, scaled), bound, rtol=1e-9)
+
+
+def test_the_bound_has_the_unit_of_the_norms() -> None:
+    rows, lower, upper = made(0)
+    _, right = optimum((rows, lower, upper))
+    bound = lower_bound(rows, lower, upper, right)
+    for unit in (1e-6, 1e6):
+        there = Rows(unit * rows.r, unit * rows.J, rows.c, rows.C)
+        same = Multipliers(right.y, unit * right.lam)
+        assert_allclose(lower_bound(there, lower, upper, same), unit * bound, rtol=1e-9)
+
+
+def test_what_pulls_along_an_open_direction_proves_nothing() -> None:
+    """No vector moves with the last variable, and a constraint does: its multiplier is worthless.
+
+    However little it pulls, as the sum then falls for ever along that direction.
+    """
+    rows, lower, upper = made(0)
+    _, right = optimum((rows, lower, upper))
+    J, C = rows.J.copy(), rows.C.copy()
+    J[:, :, 3], C[:, 3] = 0.0, 0.0
+    C[0, 3] = 1e-12
+    free, lam = Rows(rows.r, J, rows.c, C), np.array([-1.0, 0.0, 0.0])
+    given = Multipliers(balanced(free, right.y, lam), lam)
+    at_rest = replace(given, y=given.y / np.linalg.norm(given.y, axis=1).sum(), lam=0.0 * lam)
+    assert dual_value(free, lower, upper, at_rest, 0.0) > 0.1
+    assert lower_bound(free, lower, upper, given) == 0.0
 
 
 def test_no_multipliers_prove_too_much() -> None:

@@ -1,0 +1,99 @@
+"""Parts that are left out judge models that were sought without them, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems_fit import study_of
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing import folds
+from minimax_cal.diagnosing.causes import Causes, causes_of
+from minimax_cal.diagnosing.folds import beyond_of, fold_of
+from minimax_cal.diagnosing.gap import Judges
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.fitting.options import silent
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import parts
+from minimax_cal.modelling.parameters import State
+
+
+@pytest.fixture(scope="module")
+def play() -> Study:
+    return study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 1000.0),), seed=1)))
+
+
+@pytest.fixture(scope="module")
+def judges(play: Study) -> Judges:
+    """The poses of the fit, and as many others."""
+    held = replace(play.data, q=play.data.q + 0.02, line=play.data.line + 1000)
+    held = held.take(np.arange(0, held.poses, 4))
+    return Judges(play.data, held, np.zeros((len(held.target_names), held.poses), dtype=bool))
+
+
+def test_every_part_is_left_out_and_judges(
+    play: Study, judges: Judges, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Array, State]] = []
+    told: list[str] = []
+    cells = [play.geometric, play.nominal]
+
+    def fold(study: Study, causes: Any, rows: Array, state: State) -> Any:
+        asked.append((rows, state))
+        return SimpleNamespace(fits=[SimpleNamespace(cell=cell) for cell in reversed(cells)])
+
+    monkeypatch.setattr(folds, "fold_of", fold)
+    found = beyond_of(play, None, judges, told.append)  # type: ignore[arg-type]
+    every = judges.everyone
+    left_out = parts(every)
+    assert [one.where for one in found.folds] == [part.name for part in left_out]
+    assert told == [f"part {i} of {len(left_out)} left out: {part.name}"
+                    for i, part in enumerate(left_out, 1)]  # fmt: skip
+    for one, part, (rows, state) in zip(found.folds, left_out, asked, strict=True):
+        here = every.take(part.rows)
+        assert_array_equal(rows, ~np.isin(play.data.line, here.line))
+        assert one.rms_mm == accuracy(cells[0].error(here)).rms_mm
+        assert one.geometric_mm == accuracy(cells[1].error(here)).rms_mm
+        squares = [np.nansum(play.model.error(s)[:, rows] ** 2) for s in (state, play.fit.state)]
+        assert squares[0] < squares[1]  # the fit of the others alone
+
+
+def test_a_part_that_the_fit_needs_judges_nothing(
+    play: Study, judges: Judges, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = folds.without
+
+    def some(*given: Any) -> list[State | None]:
+        return [None, *plain(*given)[1:]]
+
+    def fold(*given: Any) -> Any:
+        return SimpleNamespace(fits=[SimpleNamespace(cell=play.geometric)])
+
+    monkeypatch.setattr(folds, "fold_of", fold)
+    monkeypatch.setattr(folds, "without", some)
+    found = beyond_of(play, None, judges, silent)  # type: ignore[arg-type]
+    assert [one.where for one in found.folds] == [p.name for p in parts(judges.everyone)][1:]
+    monkeypatch.setattr(folds, "parts", lambda data: ())
+    monkeypatch.setattr(folds, "without", plain)
+    nothing = beyond_of(play, None, judges, silent)  # type: ignore[arg-type]
+    assert nothing.folds == ()
+    assert nothing.reason == "the poses are too few or too much alike"
+
+
+def test_a_fold_is_sought_and_fitted_on_its_rows_alone(play: Study) -> None:
+    _, causes = causes_of(play, (), (), silent)
+    assert isinstance(causes, Causes)
+    rows = np.arange(play.data.poses) % 5 > 0
+    found = fold_of(play, causes, rows, play.fit.state)
+    assert_array_equal(found.fits[0].study.data.line, play.data.line[rows])
+    assert [term.key for term in found.last.terms] == [("backlash", "J2")]
+    spoilt = play.data.y + np.where(rows, 0.0, 1e-3)[:, None, None]
+    other = replace(play, data=play.data.with_y(spoilt))
+    again = fold_of(other, causes, rows, play.fit.state)
+    assert_allclose(again.last.state.effects, found.last.state.effects, rtol=1e-12)

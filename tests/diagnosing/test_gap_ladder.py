@@ -1,0 +1,382 @@
+"""The ladder and the share of the gap that it closes, against sums written out here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems_fit import study_of
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing import gap
+from minimax_cal.diagnosing.gap import (
+    HELPS,
+    RESAMPLES,
+    SPARED,
+    Judges,
+    Ladder,
+    climbed,
+    closed,
+    closed_share,
+    drawn,
+    folds,
+    motions,
+    shaky,
+    share_of,
+    spared,
+    sums,
+    valued,
+    with_shares,
+)
+from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
+from minimax_cal.diagnosing.result import Finding, Step
+from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.evidence.noise import Noise
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.modelling.effects.maps import curve_of, usual
+from minimax_cal.modelling.effects.table import Term
+
+PLAY = Term("backlash", "J2")
+SOFT = Term("joint_compliance", "J3", {"parts": 128.0})
+TURN = Term("gear_error", "J3", {"turns": 1.0})
+LONG = Term("link_bending", "L2", {"side": 1.0})
+
+
+@pytest.fixture(scope="module")
+def play() -> Study:
+    return study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 1000.0),), seed=1)))
+
+
+@pytest.fixture(scope="module")
+def mapped(play: Study) -> Term:
+    """Any smooth curve of joint 4's angle."""
+    return Term("joint_error_map", "J4", usual(play.scene, "J4")[0])
+
+
+@pytest.fixture(scope="module")
+def ladder(play: Study) -> Ladder:
+    """Geometry, and with play: the first of two effects is one that no pose is met better with."""
+    return climbed(play, [(Term("gear_ripple", "J6", {"turns": 31.0}),), (PLAY,)])
+
+
+def finding(effect: str, place: str, count: int = 1, unit: str = "rad", **more: object) -> Finding:
+    zero = (0.0,) * count
+    names = tuple(f"c{i}" for i in range(count))
+    return Finding((Term(effect, place),), names, (unit,) * count, zero, zero, 1.0, 1e-9,
+                   **more)  # type: ignore[arg-type]  # fmt: skip
+
+
+def scores(rms: float) -> Accuracy:
+    return Accuracy(rms, 2.0 * rms, 0.9 * rms, 20, (20.0 * rms**2,), (20,))
+
+
+def rung(name: str, train: float, holdout: float, trusted: float) -> Step:
+    return Step(name, scores(train), scores(holdout), scores(trusted))
+
+
+def judges_of(play: Study) -> Judges:
+    """The even poses are held out, and two points of theirs stand out."""
+    data = play.data
+    odd = np.arange(data.poses) % 2 > 0
+    held = data.take(~odd)
+    far = np.zeros((len(data.target_names), held.poses), dtype=bool)
+    far[0, 1] = far[-1, 4] = True
+    return Judges(data.take(odd), held, far)
+
+
+# ---- the ladder --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_folds_keep_groups_together_and_are_even(play: Study, count: int) -> None:
+    twice = play.data.take(np.repeat(np.arange(play.data.poses), 2))  # each pose visited again
+    part, group = folds(twice, count), clusters(twice)
+    assert_array_equal(part[::2], part[1::2])
+    assert_array_equal(np.array([len(set(part[group == i])) for i in range(group.max() + 1)]), 1)
+    sizes = np.bincount(part[np.unique(group, return_index=True)[1]])
+    assert len(sizes) == count
+    assert sizes.max() - sizes.min() <= 1
+    assert not np.array_equal(part, group % count)  # at random
+
+
+def test_a_rung_is_taken_that_meets_groups_left_out_better(play: Study, ladder: Ladder) -> None:
+    assert ladder.last is ladder.fits[-1]
+    assert ladder.taken[-1] == 1
+    assert ladder.last.terms[-1] is PLAY
+    parts = list(ladder.parts)
+    assert_array_equal(np.sum(parts, axis=0), 1)
+    squares = [fit.cross_validated(parts) for fit in ladder.fits]
+    assert np.all(np.diff(squares) < -HELPS * np.array(squares[:-1]))
+
+
+def test_a_rung_has_to_help_by_so_much(play: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after = joint(play, ()), joint(play, (PLAY,))
+    parts = [folds(play.data, FOLDS) == number for number in range(FOLDS)]
+    fall = 1.0 - after.cross_validated(parts) / before.cross_validated(parts)
+    assert 0.1 < fall < 0.9
+    for helps, taken in ((0.99 * fall, (0,)), (1.01 * fall, ())):
+        monkeypatch.setattr(gap, "HELPS", helps)
+        assert climbed(play, [(PLAY,)]).taken == taken
+
+
+def test_what_meets_the_training_poses_worse_is_no_rung(
+    play: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Joint, "no_worse", lambda self, other: False)
+    assert climbed(play, [(PLAY,)]).taken == ()
+
+
+def test_findings_get_the_values_of_the_last_rung(play: Study, ladder: Ladder) -> None:
+    two = joint(play, (PLAY, TURN))
+    whole = Ladder((ladder.fits[0], joint(play, (PLAY,)), two), (2, 0), ladder.parts)
+    named = [finding("gear_error", "J3", 2), finding("gear_ripple", "J6", 2),
+             finding("backlash", "J2")]  # fmt: skip
+    found = valued(named, whole)
+    assert [f.term.effect for f in found] == ["backlash", "gear_error"]
+    assert_allclose([v for f in found for v in f.values], two.state.effects)
+    assert_allclose([v for f in found for v in f.sigmas], two.uncertainty.sigma[-3:])
+    assert np.all(two.uncertainty.sigma[-3:] > 0.0)
+    assert [(len(f.values), f.curve.shape) for f in found] == [(1, (3, 0)), (2, (3, 0))]
+    assert valued(named, Ladder(ladder.fits[:1], (), ladder.parts)) == []
+
+
+def test_an_error_map_is_drawn_with_its_own_uncertainty(
+    play: Study, ladder: Ladder, mapped: Term
+) -> None:
+    last = joint(play, (PLAY, mapped, TURN))
+    count = len(last.state.effects) - 3
+    named = [finding("backlash", "J2"), finding("joint_error_map", "J4", count),
+             finding("gear_error", "J3", 2)]  # fmt: skip
+    named[1] = replace(named[1], terms=(mapped,))
+    found = valued(named, Ladder((*ladder.fits[:1], last), (0, 1, 2), ladder.parts))
+    assert [f.curve.shape[1] > 0 for f in found] == [False, True, False]
+    covariance = last.uncertainty.covariance[-2 - count : -2, -2 - count : -2]
+    sign = float(play.robot.sign[3])
+    expected = curve_of(mapped.choice, sign, last.state.effects[1:-2], covariance)
+    assert_allclose(found[1].curve, expected, rtol=1e-12)
+    assert found[1].curve[2].max() > 0.0
+    own = Finding((Term("of_mine", "J1"),), (), (), (), (), 1.0, 1e-9)
+    assert drawn(own, last, slice(0, 0)).shape == (3, 0)  # an effect that nobody knows here
+
+
+def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:
+    light = replace(play.scene.robot, mass=np.full(play.scene.joints, np.nan))
+    scene = replace(play.scene, robot=light)
+    soft = replace(finding("joint_compliance", "J3", unit="rad/(N m)"), terms=(SOFT,))
+    assert_allclose(motions(scene, soft), [np.abs(SOFT.columns(scene).turn).max()])
+    long = replace(finding("link_bending", "L2", unit="1/(N m^2)"), terms=(LONG,))
+    moved = LONG.columns(scene).displacement(scene)
+    assert_allclose(motions(scene, long), np.sqrt((moved**2).sum(axis=2)).max(axis=(1, 2)))
+    assert motions(scene, replace(finding("backlash", "J2"), terms=(PLAY,))) == ()
+    assert motions(scene, replace(soft, units=("rad/(N m)", "rad"))) == ()
+    assert motions(play.scene, soft) == ()  # whose masses are told
+    torque = {"tau1": np.ones(scene.poses)}
+    measured = replace(scene.data, columns={**scene.data.columns, **torque})
+    assert motions(replace(scene, data=measured), soft) == ()
+
+
+# ---- who judges --------------------------------------------------------------------------------
+
+
+def test_everyone_is_both_parts_in_order_without_what_stands_out(play: Study) -> None:
+    judges = judges_of(play)
+    everyone = judges.everyone
+    order = np.argsort(play.data.line)
+    y = play.data.y[order].copy()
+    for line, target in ((judges.held.line[1], 0), (judges.held.line[4], -1)):
+        y[play.data.line[order] == line, target] = np.nan
+    assert_array_equal(everyone.line, play.data.line[order])
+    assert_array_equal(everyone.q, play.data.q[order])
+    assert_array_equal(everyone.y, y)
+    for name, column in everyone.columns.items():
+        assert_array_equal(column, play.data.columns[name][order])
+    lost = replace(judges, far=judges.far | (np.arange(judges.held.poses) == 7))
+    assert judges.held.line[7] not in lost.everyone.line
+    assert lost.everyone.poses == play.data.poses - 1
+
+
+def test_a_rung_is_judged_by_poses_of_the_fit_and_held_out(play: Study) -> None:
+    judges, cell = judges_of(play), play.geometric
+    step = judges.step("geometric", cell)
+    error = cell.error(judges.held)
+    assert step.name == "geometric"
+    assert step.train == accuracy(cell.error(judges.train))
+    assert step.holdout == accuracy(error)
+    trusted = judges.errors(cell)
+    assert_array_equal(np.isnan(trusted).all(axis=2), judges.far)
+    assert_array_equal(trusted[~judges.far], error[~judges.far])
+    assert step.trusted == accuracy(trusted)
+
+
+# ---- shares ------------------------------------------------------------------------------------
+
+STEPS = (
+    rung("nominal", 9.0, 9.0, 9.0),
+    rung("geometric", 1.0, 5.0, 1.0),
+    rung("mended", 0.9, 4.0, 0.8),
+    rung("a", 0.7, 3.0, 0.6),
+    rung("b", 0.6, 2.0, 0.5),
+)
+
+
+def test_each_effect_closes_what_its_rung_does() -> None:
+    one, two = finding("gear_error", "J1"), finding("backlash", "J2")
+    steps = (*STEPS[:2], *STEPS[3:])
+    found = with_shares([two, one], steps, 0.2)
+    assert [(f.term.effect, f.before, f.after) for f in found] == [
+        ("backlash", 1.0, 0.6), ("gear_error", 0.6, 0.5)]  # fmt: skip
+    gap_ = 1.0 - 0.2**2
+    assert_allclose([f.share for f in found], [(1.0 - 0.36) / gap_, (0.36 - 0.25) / gap_])
+    larger = with_shares([one, two], (*steps[:2], rung("a", 1, 1, 0.9), rung("b", 1, 1, 0.2)), 0.2)
+    assert [f.term.effect for f in larger] == ["backlash", "gear_error"]  # the largest share first
+
+
+def test_faults_that_are_mended_share_the_first_rung() -> None:
+    faults = [finding("outliers", "all"), finding("swapped_rows", "all")]
+    more = [finding("gear_error", "J1"), finding("backlash", "J2")]
+    lag = finding("readback", "all")
+    found = with_shares([*faults, lag, *more], STEPS, 0.0)
+    told = {f.term.effect: (f.before, f.after, f.share) for f in found}
+    assert_allclose(told["outliers"], (1.0, 0.8, 0.18))
+    assert_allclose(told["swapped_rows"], (1.0, 0.8, 0.18))
+    assert_allclose(told["gear_error"], (0.8, 0.6, 0.28))
+    assert_allclose(told["backlash"], (0.6, 0.5, 0.11))
+    assert np.isnan(told["readback"]).all()
+    assert found[0].term.effect == "readback"  # what has no share comes first
+    alone = with_shares([faults[0]], STEPS[:3], 0.0)[0]
+    assert_allclose((alone.before, alone.after, alone.share), (1.0, 0.8, 0.36))
+    exact = with_shares([more[0]], (*STEPS[:2], STEPS[3]), 1.0)  # no gap: nothing is divided by 0
+    assert np.isfinite(exact[0].share)
+
+
+@pytest.mark.parametrize(
+    ("source", "floor", "deviation", "trusted", "expected"),
+    [
+        (REPEATS, 1.0, 1e-4, 2.9, True),
+        (AT_MOST, 1.0, 1e-4, 2.9, False),
+        (REPEATS, 1.0, 1e-4, 3.1, False),  # most of what is left is something else
+        (REPEATS, 1.0, 1.9e-4, 0.1, True),  # 3 sqrt(3) times 0.19 mm is a little less than 1 mm
+        (REPEATS, 1.0, 2.0e-4, 0.1, False),
+    ],
+)
+def test_an_arm_is_shaky_whose_visits_differ_by_more_than_the_instrument(
+    source: str, floor: float, deviation: float, trusted: float, expected: bool
+) -> None:
+    noise = Noise(0.0, deviation**2, 0.0)
+    last = rung("b", 1.0, 9.0, trusted)
+    assert shaky(Floor(floor, 0.5, 1.5, source), noise, last) == expected
+
+
+# ---- how much is closed ------------------------------------------------------------------------
+
+
+def test_sums_are_of_the_points_that_were_measured() -> None:
+    error = np.full((2, 3, 3), np.nan)
+    error[0, 0], error[1, 0], error[0, 2] = (1e-3, 2e-3, 2e-3), (0.0, 0.0, 1e-3), (3e-3, 0.0, 0.0)
+    assert_allclose(sums(error), [[10.0, 0.0, 9.0], [2.0, 0.0, 1.0]], rtol=1e-12)
+
+
+def test_the_share_is_of_mean_squares_above_the_floor() -> None:
+    before, after = np.array([[8.0, 1.0, 4.0], [2.0, 1.0, 0.0]]), np.array([[2.0] * 3, [2.0] * 3])
+    found = share_of([before, after], np.array([0.5, 1.0, 1.0]))
+    assert_allclose(found, [1.0 - 0.75 / 3.75, np.nan, 1.0])
+
+
+def test_the_interval_is_that_of_groups_drawn_anew() -> None:
+    """Against a bootstrap written out, with the same draws."""
+    rng = np.random.default_rng(3)
+    before, after = (s * rng.normal(size=(2, 30, 3)) for s in (2e-3, 1e-3))
+    group = np.repeat(np.arange(10) * 7, 3)  # whatever their numbers are
+    floor = Floor(0.5, 0.4, 0.6, REPEATS)
+    share, ends = closed_share(before, after, group, floor, 0.0, np.random.default_rng(5))
+    squares = [1e6 * (e**2).sum(axis=(0, 2)).reshape(10, 3).sum(axis=1) for e in (before, after)]
+
+    def closing(rows: Array, floors: Array) -> Array:
+        one, two = (s[rows].sum(axis=-1) / (6.0 * rows.shape[-1]) for s in squares)
+        return np.asarray(1.0 - (two - floors**2) / (one - floors**2))
+
+    assert_allclose(share, closing(np.arange(10), np.array(0.5)), rtol=1e-12)
+    rng = np.random.default_rng(5)
+    rows = rng.integers(0, 10, (RESAMPLES, 10))
+    drawn = closing(rows, floor.drawn(RESAMPLES, rng))
+    assert_allclose(ends, np.quantile(drawn, (0.025, 0.975)), rtol=1e-9)
+    assert ends[0] < share < ends[1]
+    variance = 3.0 * np.var(drawn)
+    _, wide = closed_share(before, after, group, floor, variance, np.random.default_rng(5))
+    middle = np.median(drawn)
+    assert_allclose(np.array(wide) - middle, 2.0 * (np.array(ends) - middle), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("most", "told"), [(99, False), (100, True)])
+def test_few_draws_with_a_gap_give_no_interval(
+    most: int, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The floor as drawn leaves a gap so often."""
+    error = np.full((1, 40, 3), 1e-3)
+    floors = np.where(np.arange(RESAMPLES) < most, 1.0, 2.0)  # beside an RMS of sqrt(3) mm
+    monkeypatch.setattr(Floor, "drawn", lambda self, count, rng: floors)
+    floor = Floor(1.0, 1.0, 1.0, REPEATS)
+    share, ends = closed_share(error, 0.0 * error, np.arange(40), floor, 0.0,
+                               np.random.default_rng(0))  # fmt: skip
+    assert_allclose(share, 1.5, rtol=1e-12)
+    assert np.isfinite(ends).tolist() == [told, told]
+
+
+def test_what_other_training_poses_would_close_is_a_jackknife(play: Study) -> None:
+    """Against fits made anew without each tenth."""
+    fits = (joint(play, ()), joint(play, (PLAY,)))
+    held = play.data.take(np.arange(play.data.poses) < 30)
+    judges = Judges(play.data, held, np.zeros((len(held.target_names), 30), dtype=bool))
+    floor = Floor(0.01, 0.0, 0.02, REPEATS)
+    part, shares = folds(play.data, SPARED), []
+    for number in range(SPARED):
+        rest = studied(play.robot, play.data.take(part != number), play.fit)
+        pair = [1e6 * np.mean((joint(rest, fit.terms).cell.error(held) ** 2).sum(axis=2)) - 1e-4
+                for fit in fits]  # fmt: skip
+        shares.append(1.0 - pair[1] / pair[0])
+    expected = (SPARED - 1) ** 2 / SPARED * np.var(shares, ddof=1)
+    found = spared(Ladder(fits, (0,), ()), judges, floor)
+    assert_allclose(found, expected, rtol=0.05)  # one step of Newton against its end
+    share, (low, high) = closed(Ladder(fits, (0,), ()), judges, floor, 4)
+    before, after = (judges.errors(fit.cell) for fit in fits)
+    same = closed_share(before, after, clusters(held), floor, found, np.random.default_rng(4))
+    assert (share, (low, high)) == same
+
+
+def test_parts_that_a_fit_needs_are_passed_over(
+    play: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits = (joint(play, ()), joint(play, (PLAY,)))
+    judges = replace(judges_of(play), train=play.data)
+    floor = Floor(0.0, 0.0, 0.0, REPEATS)
+    plain = gap.without
+
+    def share(states: tuple[object, object]) -> float:
+        pair = [sums(judges.errors(fit.with_state(state))).sum(axis=1)  # type: ignore[arg-type]
+                for fit, state in zip(fits, states, strict=True)]  # fmt: skip
+        return float(share_of(pair, np.array([0.0]))[0])
+
+    def kept(count: int, first: bool) -> float:
+        """With so many parts that both fits can do without, others that one of them cannot."""
+
+        def some(estimator: object, state: object, masks: list[Array]) -> list[object]:
+            out: list[object] = list(plain(estimator, state, masks))  # type: ignore[arg-type]
+            mine = (state is fits[0].state) == first
+            return [one if i < count or not mine else None for i, one in enumerate(out)]
+
+        monkeypatch.setattr(gap, "without", some)
+        return spared(Ladder(fits, (0,), ()), judges, floor)
+
+    masks = [folds(judges.train, SPARED) == number for number in range(SPARED)]
+    states = [plain(fit.estimator, fit.state, masks) for fit in fits]
+    shares = [share(pair) for pair in zip(*states, strict=True)]  # type: ignore[arg-type]
+    for count in (3, 6):
+        expected = (count - 1) * np.var(shares[:count])
+        for first in (True, False):
+            assert_allclose(kept(count, first), expected, rtol=1e-9)
+    assert kept(2, True) == 0.0

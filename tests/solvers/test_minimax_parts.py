@@ -1,0 +1,525 @@
+"""The parts of the minimax SQP, each against its formula or a problem whose answer is plain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.solvers.minimax import (
+    Bfgs,
+    Iterate,
+    Kkt,
+    Linear,
+    Plan,
+    Sqp,
+    elastic,
+    epigraph,
+    excess,
+    forgotten,
+    hopeless,
+    optimality,
+    priced,
+    read,
+    search,
+    solve,
+)
+from minimax_cal.solvers.status import Status
+from qp_backends import Problem, Solution
+from qp_backends import Status as QpStatus
+from qp_backends import solve as solve_qp
+
+INF = np.inf
+
+
+def none(mu: Array) -> Array:
+    return np.zeros((0, 0))
+
+
+def linear(
+    f: list[float],
+    jacobian: list[list[float]],
+    c: list[float] | None = None,
+    normal: list[list[float]] | None = None,
+) -> Linear:
+    p = len(jacobian[0])
+    rows = np.array(normal or [], dtype=float).reshape(-1, p)
+    return Linear(np.array(f), np.array(jacobian), np.array(c or []), rows, none)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One function of one variable, and x itself as a constraint."""
+
+    value: Callable[[float], float]
+    slope: Callable[[float], float]
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    upper: Array = field(default_factory=lambda: np.zeros(0))
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        return np.array([self.value(x[0])]), x[: len(self.lower)]
+
+    def linearise(self, x: Array) -> Linear:
+        f, c = self.evaluate(x)
+        return Linear(f, np.array([[self.slope(x[0])]]), c, np.ones((len(c), 1)), none)
+
+    def step(self, x: Array, d: Array) -> Array:
+        return x + d
+
+
+def parabola(lower: float = -INF, upper: float = INF) -> Curve:
+    rows = np.isfinite([lower, upper]).any()
+    bounds = (np.array([lower]), np.array([upper])) if rows else (np.zeros(0), np.zeros(0))
+    return Curve(lambda x: x * x, lambda x: 2.0 * x, *bounds)
+
+
+def begun(problem: Curve, x: float, hessian: str = "bfgs") -> Iterate[Array]:
+    return Iterate.begin(problem, np.array([x]), Sqp(hessian=hessian), np.zeros(0))
+
+
+def standing(here: Linear, mu: Array, lower: Array, upper: Array) -> Iterate[Array]:
+    """An iterate at given derivatives."""
+    problem = Curve(lambda x: x, lambda x: 1.0, lower, upper)
+    lam = np.zeros(len(here.c))
+    kkt = optimality(here, mu, lam, lower, upper)
+    return Iterate(problem, np.zeros(1), here, mu, lam, kkt, None)
+
+
+def plan(d: list[float], mu: list[float], lam: list[float] | None = None, **more: object) -> Plan:
+    said = {"usable": True, "backend": "", "notes": (), "relaxed": False, "penalty": 0.0} | more
+    return Plan(np.array(d), np.array(mu), np.array(lam or []), **said)  # type: ignore[arg-type]
+
+
+# ---- how far from optimal ----------------------------------------------------------------------
+
+LOWER, UPPER = np.array([-INF, 1.5, -0.2]), np.array([0.7, INF, INF])
+BENT = linear(
+    [3.0, 1.0, 3.0],
+    [[1.0, 0.0], [0.0, 1.0], [-1.0, 2.0]],
+    [0.5, 2.0, -1.0],
+    [[1.0, 1.0], [0.0, 2.0], [3.0, 0.0]],
+)
+
+
+def test_the_distance_from_optimal_is_its_formula() -> None:
+    mu, lam = np.array([0.5, 0.2, 0.3]), np.array([0.4, -0.3, 0.0])
+    found = optimality(BENT, mu, lam, LOWER, UPPER)
+    assert_allclose(found.stationarity, 0.6)  # of (0.5 - 0.3 + 0.4, 0.2 + 0.6 + 0.4 - 0.6)
+    assert_allclose(found.complementarity, 0.2 * 2.0 + 0.4 * 0.2 + 0.3 * 0.5)
+    assert_allclose(found.violation, 0.8)
+    free = linear([3.0, 1.0], [[1.0, -4.0], [0.0, 1.0]])
+    found = optimality(free, np.array([0.5, 0.5]), np.zeros(0), np.zeros(0), np.zeros(0))
+    assert (found.stationarity, found.complementarity, found.violation) == (1.5, 1.0, 0.0)
+
+
+@pytest.mark.parametrize("three", [(3.0, 1.0, 2.0), (1.0, 3.0, 2.0), (2.0, 1.0, 3.0)])
+def test_the_residual_is_the_largest(three: tuple[float, float, float]) -> None:
+    assert Kkt(*three).residual == 3.0
+
+
+def test_a_violation_that_no_step_lessens_is_hopeless() -> None:
+    here = linear([0.0], [[1.0]], [2.0, 0.0], [[1.0], [1.0]])
+    lower, upper = np.array([-INF, 1.0]), np.array([1.0, INF])
+    assert_array_equal(excess(here.c, lower, upper), [1.0, 1.0])
+    assert hopeless(here, plan([0.7], [1.0]), lower, upper, 1e-8)  # one gains what the other loses
+    assert not hopeless(here, plan([0.7], [1.0]), lower, upper, 3.0)  # not violated, so large
+    only = replace(here, c=here.c[:1], normal=here.normal[:1])
+    assert not hopeless(only, plan([-0.1], [1.0]), lower[:1], upper[:1], 1e-8)
+    assert hopeless(only, plan([0.1], [1.0]), lower[:1], upper[:1], 1e-8)
+
+
+# ---- quadratic programs ------------------------------------------------------------------------
+
+
+def test_the_epigraph_problem_is_its_formula(rng: np.random.Generator) -> None:
+    hessian = np.array([[2.0, 0.5], [0.5, 1.0]])
+    made = epigraph(BENT, 3.5, hessian, LOWER, UPPER)
+    d, v = rng.normal(size=2), rng.normal()
+    x = np.append(d, v)
+    bent = 0.5 * d @ hessian @ d
+    assert_allclose(0.5 * x @ made.P @ x + made.q @ x, bent + v + 0.5e-8 * v * v, rtol=1e-12)
+    above = BENT.f + BENT.jacobian @ d - 3.5 - v
+    assert_allclose((made.A @ x - made.u)[:3], above, rtol=1e-12)
+    assert np.all(made.l[:3] == -INF)
+    there = BENT.c + BENT.normal @ d
+    assert_allclose((made.A @ x)[3:] - made.u[3:], there - UPPER, rtol=1e-12)
+    assert_allclose((made.A @ x)[3:] - made.l[3:], there - LOWER, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("price", "there"), [(0.5, 0.5), (1.9, 1.9), (5.0, 2.0)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_relaxed_constraint_is_kept_if_its_price_is_high(
+    price: float, there: float, sign: float
+) -> None:
+    """Least 1/2 d^2 with |d| 2 at least: the slope d is paid up to the price."""
+    low, high = (2.0, INF) if sign > 0.0 else (-INF, -2.0)
+    rows = np.array([[0.0, -1.0], [1.0, 0.0]])
+    made = Problem(np.diag([1.0, 1e-8]), np.array([0.0, 1.0]), rows, np.array([-INF, low]),
+                   np.array([0.0, high]))  # fmt: skip
+    found = solve_qp(elastic(made, 1, price), name="daqp", tolerance=1e-9)
+    assert_allclose(found.x[0], sign * there, rtol=1e-6)
+    assert_allclose(found.x[2:].sum(), 2.0 - there, atol=1e-6)
+
+
+def test_multipliers_are_put_in_their_places() -> None:
+    here = linear([0.0] * 5, [[1.0, 2.0]] * 5, [1.0], [[0.0, 1.0]])
+    answer = Solution(np.array([7.0, 8.0, 9.0]), np.array([-1e-9, 0.5, 1.5, -0.25]),
+                      QpStatus.SOLVED, 0.0, "daqp", notes=("slow",))  # fmt: skip
+    found = read(answer, here, np.array([4, 1, 3]), relaxed=True, penalty=3.0)
+    assert_array_equal(found.d, [7.0, 8.0])
+    assert_array_equal(found.mu, [0.0, 0.25, 0.0, 0.75, 0.0])
+    assert_array_equal(found.lam, [-0.25])
+    assert (found.usable, found.backend, found.notes) == (True, "daqp", ("slow",))
+    assert (found.relaxed, found.penalty) == (True, 3.0)
+    for lost in (replace(answer, status=QpStatus.FAILED), replace(answer, y=np.zeros(4))):
+        found = read(lost, here, np.array([4, 1, 3]), relaxed=False, penalty=0.0)
+        assert_allclose(found.mu, 0.2)
+        assert_array_equal(found.lam, [0.0])
+        assert found.usable == lost.solved
+        assert_array_equal(found.d, [7.0, 8.0] if lost.solved else [0.0, 0.0])
+
+
+def test_functions_that_were_forgotten_are_the_worst_beyond() -> None:
+    """Six functions of two variables; the answer makes three of those unknown larger than v."""
+    slopes = [[1.0, 0.0], [0.0, 1.0], [3.0, 0.0], [0.0, 0.0], [2.0, 0.0], [0.0, 4.0]]
+    here = linear([1.0, 0.0, 1.0, 1.0, 0.0, 0.0], slopes)
+    answer = Solution(np.array([1.0, 1.0, 0.5]), np.zeros(1), QpStatus.SOLVED, 0.0)
+    # f + f'd - max f - v of all: 0.5, -0.5, 2.5, -0.5, 0.5, 2.5; of equals the first comes first
+    assert set(forgotten(here, np.array([0]), answer).tolist()) == {2, 5}
+    assert_array_equal(forgotten(here, np.array([0, 2]), answer), [5, 4])
+    assert_array_equal(forgotten(here, np.array([0, 2, 5]), answer), [4])
+    assert not len(forgotten(here, np.array([4, 0, 2, 5]), answer))
+    assert not len(forgotten(here, np.arange(6), answer))
+    lost = replace(answer, status=QpStatus.FAILED)
+    assert_array_equal(forgotten(here, np.array([0, 2]), lost), [1, 3, 4, 5])
+
+
+def test_of_many_functions_the_largest_come_first() -> None:
+    values = [0.0, 9.0, 1.0, 8.0, 2.0]
+    mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    nothing = np.zeros(0)
+    five = standing(linear(values, [[1.0]] * 5), mu, nothing, nothing)
+    assert_array_equal(five.likely(five.here), [1, 3])
+    assert_array_equal(replace(five, step=1).likely(five.here), [1, 2, 3])
+    four = linear(values[:4], [[1.0]] * 4)
+    assert_array_equal(five.likely(four), range(4))
+
+
+def test_contradicting_constraints_are_relaxed_at_a_price() -> None:
+    """x at least 2 and at most 1; a hundred times the slope, or what was paid before."""
+    here = linear([0.0], [[-3.0]], [0.0, 0.0], [[1.0], [1.0]])
+    at = standing(here, np.ones(1), np.array([2.0, -INF]), np.array([INF, 1.0]))
+    qp = partial(solve_qp, name="daqp", tolerance=1e-9)
+    for before, price in ((0.0, 300.0), (1e4, 1e4)):
+        found = replace(at, penalty=before).subproblem(np.eye(1), qp)
+        assert found.usable
+        assert (found.relaxed, found.penalty) == (True, price)
+        assert 1.0 - 1e-6 <= found.d[0] <= 2.0 + 1e-6
+    agreed = standing(here, np.ones(1), np.array([0.5, -INF]), np.array([INF, 1.0]))
+    plain = agreed.subproblem(np.eye(1), qp)
+    assert (plain.relaxed, plain.penalty) == (False, 0.0)
+    assert_allclose(plain.d, 1.0, atol=1e-8)
+    moved = agreed.subproblem(np.eye(1), qp, here.f, here.c + 0.25)
+    assert_allclose(moved.d, 0.75, atol=1e-8)
+
+
+# ---- an iterate --------------------------------------------------------------------------------
+
+
+def test_it_begins_with_even_multipliers_or_those_given() -> None:
+    problem = Plane(np.array([1.0, 2.0, 4.0, 0.0]))
+    at = Iterate.begin(problem, np.zeros(1), Sqp(), np.zeros(0))
+    assert_array_equal(at.mu, 0.25)
+    assert_array_equal(at.lam, [0.0])
+    assert at.quasi is None
+    assert at.kkt.residual == at.kkt.complementarity == 4.0 - 7.0 / 4.0
+    given = np.array([0.0, 0.5, 0.5, 0.0])
+    assert_array_equal(Iterate.begin(problem, np.zeros(1), Sqp(), given).mu, given)
+    assert begun(parabola(), 1.0).quasi is not None
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Functions that do not change, and a constraint that holds."""
+
+    f: Array
+    slope: float = 0.0
+    lower: Array = field(default_factory=lambda: np.array([-1.0]))
+    upper: Array = field(default_factory=lambda: np.array([1.0]))
+
+    def evaluate(self, x: Array) -> tuple[Array, Array]:
+        return self.f, x
+
+    def linearise(self, x: Array) -> Linear:
+        slopes = np.full((len(self.f), 1), self.slope)
+        return Linear(self.f, slopes, x, np.ones((1, 1)), lambda mu: np.eye(1))
+
+    def step(self, x: Array, d: Array) -> Array:
+        return x + d
+
+
+@pytest.mark.parametrize(
+    "problem", [Plane(np.array([1.0]), np.nan), Plane(np.array([np.nan]), 1.0)]
+)
+def test_what_is_no_number_ends_in_a_status(problem: Plane) -> None:
+    asked: list[Problem] = []
+    found = solve(problem, np.zeros(1), lambda one: asked.append(one))  # type: ignore[arg-type, func-returns-value]
+    assert found.status is Status.FAILED
+    assert asked == []
+
+
+def test_the_notes_of_backends_are_told_once() -> None:
+    said = iter(["slow", "slow", "lost", "slow"])
+
+    def qp(problem: Problem) -> Solution:
+        answer = solve_qp(problem, name="daqp", tolerance=1e-9)
+        return replace(answer, notes=(next(said, "lost"),))
+
+    told = []
+    hill = Curve(lambda x: x**4, lambda x: 4.0 * x**3)
+    found = solve(hill, np.array([1.0]), qp, Sqp(hessian="bfgs", iterations=4), told.append)
+    assert found.notes == ("slow", "lost")
+    assert found.status is Status.ITERATION_LIMIT
+    assert found.iterations == len(found.trace) == len(told) == 4
+    assert [step.iteration for step in found.trace] == [1, 2, 3, 4]
+    assert np.all(np.diff([step.value for step in found.trace]) < 0.0)
+
+
+def test_the_hessian_has_a_floor_and_is_damped() -> None:
+    here = replace(linear([1.0, 2.0], [[1.0, 0.0], [0.0, 1.0]]), curvature=np.diag)
+    at = standing(here, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
+    assert_array_equal(at.hessian(0.1), np.diag([1.0, 0.05]))
+    assert_allclose(replace(at, damping=3.0).hessian(0.1), np.diag([4.0, 0.2]))
+    assert_allclose(replace(at, damping=3.0).hessian(0.0), np.diag([4.0, 3e-8]))
+
+
+def test_idle_is_who_falls_neither_in_value_nor_in_residual() -> None:
+    """f is 1 with the slope 2, so that the residual is 2."""
+    at = replace(begun(parabola(), 1.0), best=10.0, lowest=5.0, idle=4)
+    one = plan([0.0], [1.0])
+    fell = at.after(one, 7.0)
+    assert (fell.best, fell.lowest, fell.idle, fell.step) == (2.0, 1.0, 0, 1)
+    assert (fell.penalty, fell.kkt.residual) == (7.0, 2.0)
+    still = fell.after(one, 7.0)
+    assert (still.best, still.lowest, still.idle, still.step) == (2.0, 1.0, 1, 2)
+    assert replace(at, best=2.1, lowest=1.0).after(one, 0.0).idle == 5  # less than a tenth
+    assert replace(at, best=2.3, lowest=1.0).after(one, 0.0).idle == 0
+    value = replace(at, best=1.0, lowest=1.0 + 1e-6).after(one, 0.0)
+    assert (value.best, value.idle) == (1.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("residual", "violation", "idle", "ended"),
+    [
+        (1e-8, 0.0, 0, Status.CONVERGED),
+        (1.1e-8, 0.0, 9, None),
+        (1e-6, 1e-8, 10, Status.CONVERGED),
+        (1.1e-6, 1e-8, 10, Status.STALLED),
+        (1e-6, 1.1e-8, 99, None),
+    ],
+)
+def test_patience_has_an_end(
+    residual: float, violation: float, idle: int, ended: Status | None
+) -> None:
+    at = replace(begun(parabola(), 1.0), kkt=Kkt(residual, 0.0, violation), idle=idle)
+    assert at.patience(1e-8) is ended
+
+
+@pytest.mark.parametrize(
+    ("residual", "violation", "damping", "ended"),
+    [
+        (1e-8, 0.0, 1e9, Status.CONVERGED),
+        (1.0, 0.0, 1e8, None),
+        (1.0, 1e-8, 1.1e8, Status.STALLED),
+        (1.0, 1.1e-8, 1.1e8, Status.INFEASIBLE),
+    ],
+)
+def test_damping_has_an_end(
+    residual: float, violation: float, damping: float, ended: Status | None
+) -> None:
+    at = replace(begun(parabola(), 1.0), kkt=Kkt(residual, 0.0, violation), damping=damping)
+    assert at.arrived(1e-8) is ended
+
+
+def test_damping_grows_and_falls_tenfold() -> None:
+    at = begun(parabola(), 1.0)
+    assert at.damped().damping == 1e-3
+    assert replace(at, damping=2.0).damped().damping == 20.0
+    there = at.problem.linearise(np.array([0.25]))
+    for before, after in ((2.0, 0.2), (2e-6, 2e-7), (1e-6, 0.0), (0.0, 0.0)):
+        move = np.array([-0.75])
+        moved = replace(at, damping=before).moved(move, np.array([0.25]), there)
+        assert_allclose(moved.damping, after, rtol=1e-12)
+    assert moved.kkt.stationarity == 0.5
+    assert_allclose(moved.quasi.matrix, [[2.0]])  # what the two slopes tell
+
+
+@pytest.mark.parametrize(
+    ("relaxed", "d", "penalty", "expected"),
+    [
+        (False, 0.0, 0.5, 3.0),  # one and a half times the largest multiplier
+        (False, 0.0, 7.0, 7.0),
+        (True, -1.0, 7.0, 7.0),
+        (True, -1.0, 0.5, 5.0),
+        (True, 0.0, 7.0, 70.0),  # no step lessens the violation
+        (True, 0.0, 2.9e6, 2.9e7),
+        (True, 0.0, 3.1e6, None),  # a million times the slope 3
+    ],
+)
+def test_the_price_of_a_violation(
+    relaxed: bool, d: float, penalty: float, expected: float | None
+) -> None:
+    here = linear([0.0], [[-3.0]], [2.0], [[1.0]])
+    at = standing(here, np.ones(1), np.array([-INF]), np.array([1.0]))
+    one = plan([d], [1.0], [-2.0], relaxed=relaxed, penalty=5.0)
+    found = priced(replace(at, penalty=penalty), one, 1e-8)
+    assert found == (None if expected is None else pytest.approx(expected))
+
+
+# ---- the search along a step -------------------------------------------------------------------
+
+
+def lost(f: Array, c: Array) -> Plan:
+    return plan([0.0], [1.0], usable=False)
+
+
+def test_a_full_step_that_helps_is_taken() -> None:
+    length, move, end, there = search(begun(parabola(), 1.0), plan([-0.9], [1.0]), lost)
+    assert (length, move[0], there.jacobian[0, 0]) == (1.0, -0.9, 2.0 * end[0])
+    assert_allclose(end, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("d", "length"),
+    [
+        (-2.0, 0.5),  # the vertex of the parabola that the two values and the slope tell
+        (-10.0, 0.1),
+        (-100.0, 0.01),  # by two steps, neither below a tenth
+        (-2.5, 0.4),
+    ],
+)
+def test_a_step_too_long_is_shortened_to_the_vertex(d: float, length: float) -> None:
+    found, move, end, there = search(begun(parabola(), 1.0), plan([d], [1.0]), lost)
+    assert_allclose(found, length, rtol=1e-12)
+    assert_allclose(move, length * d, rtol=1e-12)
+    assert_allclose([end[0], there.f[0]], 0.0, atol=1e-12)
+
+
+def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth() -> None:
+    """Beyond a kink nothing is known (NaN); before it a wall leaves the vertex at the start."""
+    wall = Curve(lambda x: -x if x < 0.3 else INF, lambda x: -1.0)
+    assert search(begun(wall, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
+    steep = Curve(lambda x: -x if x < 0.3 else 1e9, lambda x: -1.0)
+    assert search(begun(steep, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
+    flat = Curve(lambda x: -x if x < 0.3 else 1e-9, lambda x: -1.0)
+    assert_allclose(search(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0], 0.25, rtol=1e-6)
+
+
+def test_no_step_up_a_hill() -> None:
+    uphill = Curve(lambda x: x, lambda x: -1.0)  # whose slope is told wrong
+    length, move, end, _ = search(begun(uphill, 0.0), plan([1.0], [1.0]), lost)
+    assert (length, move[0], end[0]) == (0.0, 0.0, 0.0)
+
+
+def test_a_violation_counts_at_its_price() -> None:
+    """From 1 to 0.5 x^2 falls by 0.75, and x is short of its bound 1 by 0.5."""
+    at = begun(parabola(lower=1.0), 1.0)
+    assert search(replace(at, penalty=1.0), plan([-0.5], [1.0], [0.0]), lost)[0] == 1.0
+    dear = search(replace(at, penalty=10.0), plan([-0.5], [1.0], [0.0]), lost)
+    assert dear[0] == 0.0
+
+
+def test_the_second_order_correction_is_asked_what_the_step_missed() -> None:
+    asked = []
+
+    def bent(f: Array, c: Array, usable: bool = True, d: float = -1.0) -> Plan:
+        asked.append((f, c))
+        return plan([d], [1.0], usable=usable)
+
+    at = begun(parabola(lower=-9.0), 1.0)
+    length, move, end, there = search(at, plan([-4.0], [1.0], [0.0]), bent)
+    assert_array_equal(asked[0], [[9.0 + 8.0], [-3.0 + 4.0]])
+    assert (length, move[0], end[0], there.f[0]) == (1.0, -1.0, 0.0, 0.0)
+    for other in ({"usable": False}, {"d": -8.1}, {"d": -2.0}):  # the last is as high as the start
+        found = search(at, plan([-4.0], [1.0], [0.0]), partial(bent, **other))
+        assert_allclose(found[0], 0.25)  # the vertex
+    far = Curve(lambda x: abs(x + 7.0), lambda x: 1.0)  # at -3 it helps, but not a correction
+    twice = search(begun(far, 1.0), plan([-16.0], [1.0]), partial(bent, d=-8.0))
+    assert (twice[0], twice[1][0]) == (1.0, -8.0)
+
+
+# ---- a Hessian from gradients ------------------------------------------------------------------
+
+
+def changed(q: list[float]) -> tuple[Linear, Linear]:
+    """Before and after a step along which the Lagrangian's gradient changes by q.
+
+    A third of it by f, with the multiplier 1, the rest by c, with the multiplier 2.
+    """
+    third = np.array(q) / 3.0
+    before = linear([0.0], [[1.0, 1.0]], [0.0], [[2.0, 0.0]])
+    jacobian, normal = before.jacobian + third, before.normal + third
+    return before, replace(before, jacobian=jacobian, normal=normal)
+
+
+def updated(start: Bfgs, s: list[float], q: list[float]) -> Bfgs:
+    return start.update(np.array(s), *changed(q), np.ones(1), np.full(1, 2.0))
+
+
+GUESS = Bfgs(np.array([[2.0, 0.5], [0.5, 1.0]]), fresh=False)
+
+
+def test_the_hessian_explains_the_latest_step() -> None:
+    s, q = np.array([1.0, -2.0]), np.array([3.0, -1.0])
+    found = updated(GUESS, s.tolist(), q.tolist())
+    assert_allclose(found.matrix @ s, q, rtol=1e-12)
+    assert_array_equal(found.matrix, found.matrix.T)
+    assert np.linalg.eigvalsh(found.matrix)[0] > 0.0
+    assert_allclose(
+        np.linalg.det(found.matrix),
+        np.linalg.det(GUESS.matrix) * (q @ s) / (s @ GUESS.matrix @ s),
+        rtol=1e-12,
+    )
+
+
+@pytest.mark.parametrize("q", [[-3.0, 1.0], [0.1, 0.0], [0.0, 0.0]])
+def test_curvature_that_is_missing_is_damped_by_powell(q: list[float]) -> None:
+    s = np.array([1.0, -2.0])
+    found = updated(GUESS, s.tolist(), q)
+    assert_allclose(s @ found.matrix @ s, 0.2 * (s @ GUESS.matrix @ s), rtol=1e-12)
+    assert np.linalg.eigvalsh(found.matrix)[0] > 0.0
+
+
+def test_the_first_guess_takes_its_size_from_the_first_step() -> None:
+    fresh = Bfgs(np.eye(2), fresh=True)
+    s, q = np.array([2.0, 0.0]), np.array([4.0, 2.0])
+    size = (q @ q) / (q @ s)
+    sized = updated(Bfgs(size * np.eye(2), fresh=False), s.tolist(), q.tolist())
+    found = updated(fresh, s.tolist(), q.tolist())
+    assert_allclose(found.matrix, sized.matrix, rtol=1e-12)
+    assert not found.fresh
+    back = updated(fresh, s.tolist(), (-q).tolist())  # no size in a fall of the slope
+    assert_allclose(back.matrix, updated(replace(fresh, fresh=False), [2.0, 0.0],
+                                         [-4.0, -2.0]).matrix)  # fmt: skip
+
+
+def test_steps_that_teach_nothing_leave_the_hessian() -> None:
+    assert updated(GUESS, [0.0, 0.0], [1.0, 1.0]) is GUESS
+    assert updated(GUESS, [1.0, 0.0], [np.nan, 1.0]) is GUESS
+    hollow = Bfgs(np.diag([0.0, 1.0]), fresh=False)
+    assert updated(hollow, [1.0, 0.0], [1.0, 1.0]) is hollow
+
+
+def test_the_hessian_begins_with_the_mean_curvature_where_there_is_one() -> None:
+    here = linear([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]])
+    plain = Bfgs.start(here, 2)
+    assert plain.fresh
+    assert_array_equal(plain.matrix, np.eye(2))
+    known = Bfgs.start(replace(here, curvature=lambda mu: np.diag(mu) + 1.0), 2)
+    assert not known.fresh
+    assert_allclose(known.matrix, [[1.5015, 1.0], [1.0, 1.5015]])
