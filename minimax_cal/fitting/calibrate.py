@@ -251,7 +251,8 @@ def judged(
 ) -> tuple[Fit, tuple[str, ...]]:
     """The fit with its accuracy on training and on held-out poses, and what is alarming."""
     held = np.isin(poses.data.line, poses.held.line)
-    cell, nominal = solved.cell(robot, poses.data), solved.nominal_cell(robot, poses.data)
+    cell = solved.cell(robot, poses.data)
+    nominal = solved.nominal_cell(robot, poses.data, cell.sessions.clock)
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
+import scipy
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
@@ -230,7 +231,9 @@ class Provenance:
 @cache
 def versions() -> Mapping[str, str]:
     """Of the packages that a result depends on: asked once, for it takes as long as a fit."""
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    loaded = {"numpy": np.__version__, "scipy": scipy.__version__}
+    found = {name: loaded.get(name) or version(name) for name in PACKAGES}
+    return found | {"python": platform.python_version()}
 
 
 @dataclass(frozen=True)

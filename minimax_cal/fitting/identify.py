@@ -178,6 +178,15 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
 COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
 
 
+def definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix has positive eigenvalues alone."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
 # and those of `plenty_of_poses`
 DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
 
@@ -194,9 +203,8 @@ def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int
     scale = np.sqrt(np.diag(gram)[chosen])
     scale = np.where(scale > 0.0, scale, 1.0)
     alike = gram[np.ix_(chosen, chosen)] / np.outer(scale, scale)
-    values = np.linalg.eigvalsh(alike)  # mostly that is all there is to see
-    if values[0] > rank**2 * values[-1]:
-        return []
+    if definite(alike - rank**2 * np.trace(alike) * np.eye(len(alike))):
+        return []  # no eigenvalue is as small as the rank asks of the largest
     values, vectors = np.linalg.eigh(alike)
     null = vectors[:, values <= (rank**2) * values[-1]]
     gone: list[int] = []

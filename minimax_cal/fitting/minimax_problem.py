@@ -100,20 +100,25 @@ class MinimaxProblem:
         """(free, free): one divisor an entry, so that a quotient is as symmetric as what it was."""
         return self.size * np.outer(self.scale, self.scale)
 
+    @cached_property
+    def columns(self) -> Array:
+        """(2, l, 3) the parameters of both targets of each pair."""
+        first = 5 * self.model.names.joints + 6
+        return first + 3 * self.distances.pairs.T[..., None] + np.arange(3)
+
     def deviation(self, x: State) -> tuple[Array, Array]:
         """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
-        pairs, names = self.distances.pairs, self.model.names
-        if not len(pairs):
+        kept = self.distances
+        count = len(kept.mean)
+        if not count:
             return np.zeros(0), np.zeros((0, len(self.scale)))
-        between = x.target_positions[pairs[:, 0]] - x.target_positions[pairs[:, 1]]
-        length = np.maximum(np.linalg.norm(between, axis=-1), 1e-12)
-        c = (length - self.distances.mean) / self.distances.tolerance
-        jacobian = np.zeros((len(pairs), names.count))
-        unit = between / length[:, None] / self.distances.tolerance[:, None]
-        first = 5 * names.joints + 6
-        for row, (a, b) in enumerate(pairs):
-            jacobian[row, first + 3 * a : first + 3 * a + 3] = unit[row]
-            jacobian[row, first + 3 * b : first + 3 * b + 3] = -unit[row]
+        between = x.target_positions[kept.pairs[:, 0]] - x.target_positions[kept.pairs[:, 1]]
+        length = np.maximum(np.sqrt((between * between).sum(axis=1)), 1e-12)
+        c = (length - kept.mean) / kept.tolerance
+        jacobian = np.zeros((count, self.model.names.count))
+        unit = between / (length * kept.tolerance)[:, None]
+        jacobian[np.arange(count)[:, None], self.columns[0]] = unit
+        jacobian[np.arange(count)[:, None], self.columns[1]] = -unit
         if self.form == "squared":
             jacobian, c = 2.0 * c[:, None] * jacobian, c**2
         return c, jacobian[:, self.model.active] / self.scale

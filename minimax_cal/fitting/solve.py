@@ -22,6 +22,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.grouping import clusters, groups
+from minimax_cal.measuring.history import Clock
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, Sessions, seen_from
 from minimax_cal.modelling.cell import Cell
@@ -97,9 +98,10 @@ class Solved:
         sessions = Sessions.of(seen_from(data, self.frames))
         return Cell.of(robot, self.state, data.target_names, self.effects, sessions)
 
-    def nominal_cell(self, robot: Robot, data: Measurements) -> Cell:
-        """The same of the nominal robot."""
-        sessions = Sessions.of(seen_from(data, self.start))
+    def nominal_cell(self, robot: Robot, data: Measurements, clock: Clock | None = None) -> Cell:
+        """The same of the nominal robot.  clock: of the data, where it is known."""
+        frames = seen_from(data, self.start).frames
+        sessions = Sessions(frames, clock or Clock.of(data))
         return Cell.of(robot, self.nominal, data.target_names, sessions=sessions)
 
     @property

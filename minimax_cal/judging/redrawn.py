@@ -146,15 +146,15 @@ class Redrawn:
 
     def normal(self, x: State) -> tuple[Array, Array, Array]:
         """F (B, k), J'We (B, k, p), J'WJ (B, k, p, p) of every draw at its state."""
-        model, which = self.model, np.flatnonzero(self.model.active)
-        q, prismatic, y, weight, fields, moved = model.sight
-        parts, out = arrays_of(x), []
+        q, prismatic, y, weight, fields, moved = self.model.sight
+        parts, out, own = arrays_of(x), [], kernels()
+        columns = sums.Columns.of(parts, np.flatnonzero(self.model.active))
         for b, times in enumerate(self.draw.times):
             rows = np.flatnonzero(times)
-            some = (part[..., rows] if len(part) else part for part in (fields, moved))
-            drawn = q[rows], prismatic, y[..., rows], weight[:, rows] * times[rows], *some
+            more = (part[..., rows] if len(part) else part for part in (fields, moved))
+            drawn = q[rows], prismatic, y[..., rows], weight[:, rows] * times[rows], *more
             at = tuple(part[b : b + 1] for part in parts)
-            out.append(sums.normal(kernels(), at, drawn, which))
+            out.append(columns.normal(own, at, drawn))
         F, g, G = (np.concatenate(part) for part in zip(*out, strict=True))
         return F, g, G
 

@@ -146,9 +146,12 @@ def swapped(least: Array, own: Array) -> Array:
 
 def outliers(data: Measurements, distance: Array) -> list[str]:
     """Points that miss by far more than the others.  distance: (k, m), NaN where not measured."""
-    usual = float(np.nanmedian(distance))
-    with np.errstate(invalid="ignore"):
-        far = distance > max(STANDS_OUT * usual, 4.0 * np.nanquantile(distance, 0.95), 1e-6)
+    known = np.where(np.isfinite(distance), distance, -1.0)
+    given = known[known >= 0.0]
+    usual = float(np.median(given)) if len(given) else 0.0
+    if known.max(initial=0.0) <= STANDS_OUT * usual:
+        return []
+    far = known > max(STANDS_OUT * usual, 4.0 * np.quantile(given, 0.95), 1e-6)
     found = np.argwhere(far)
     if not len(found):
         return []

@@ -31,7 +31,7 @@ EVEN: Array = np.zeros(0)
 
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
 ROUNDING = 1e-12
-SHARE = 2  # times the unknowns: of more functions than twice that, so many make a first QP
+SHARE = 3  # times the unknowns: of more functions than twice that, so many make a first QP
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay

@@ -200,14 +200,14 @@ def test_functions_that_were_forgotten_are_the_worst_beyond() -> None:
 
 
 def test_of_many_functions_the_largest_come_first() -> None:
-    values = [0.0, 9.0, 1.0, 8.0, 2.0]
-    mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    values = [0.0, 9.0, 1.0, 8.0, 2.0, 7.0, 3.0]
+    mu = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     nothing = np.zeros(0)
-    five = standing(linear(values, [[1.0]] * 5), mu, nothing, nothing)
-    assert_array_equal(five.likely(five.here), [1, 3])
-    assert_array_equal(replace(five, step=1).likely(five.here), [1, 2, 3])
-    four = linear(values[:4], [[1.0]] * 4)
-    assert_array_equal(five.likely(four), range(4))
+    seven = standing(linear(values, [[1.0]] * 7), mu, nothing, nothing)
+    assert_array_equal(seven.likely(seven.here), [1, 3, 5])
+    assert_array_equal(replace(seven, step=1).likely(seven.here), [1, 2, 3, 5])
+    six = linear(values[:6], [[1.0]] * 6)
+    assert_array_equal(seven.likely(six), range(6))
 
 
 def test_contradicting_constraints_are_relaxed_at_a_price() -> None:

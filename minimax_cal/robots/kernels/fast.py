@@ -234,17 +234,25 @@ def summed(
 
 
 @compiled
-def pulled(error: Array, J: Array) -> tuple[Array, Array]:
-    """See `plain.pulled`."""
+def squared(
+    error: Array, J: Array, root: Array, which: Array, s: int, end: int, first: int
+) -> tuple[Array, Array]:
+    """See `plain.squared`."""
     k, h, _, c = J.shape
-    square, pull = np.empty((k, c)), np.empty((k, c, h))
+    square, slope = np.empty((k, c)), np.zeros((k, c, len(which)))
     for t in range(k):
         for r in range(c):
             u, v, w = error[t, 0, r], error[t, 1, r], error[t, 2, r]
             square[t, r] = u * u + v * v + w * w
             for i in range(h):
-                pull[t, r, i] = u * J[t, i, 0, r] + v * J[t, i, 1, r] + w * J[t, i, 2, r]
-    return square, pull
+                to = i if i < s else i - s + end
+                pull = u * J[t, i, 0, r] + v * J[t, i, 1, r] + w * J[t, i, 2, r]
+                slope[t, r, to] = -2.0 * pull
+            for row in range(s, end):
+                axis = which[row] - first - 3 * t
+                if 0 <= axis < 3:
+                    slope[t, r, row] = -2.0 * root[t, r] * error[t, axis, r]
+    return square, slope
 
 
 @compiled

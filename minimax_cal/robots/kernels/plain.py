@@ -233,12 +233,19 @@ def summed(
     gram[:, t, row, row] += square[t]
 
 
-def pulled(error: Array, J: Array) -> tuple[Array, Array]:
-    """Square of every point's error (k, c), and J'e of each (k, c, h).
+def squared(
+    error: Array, J: Array, root: Array, which: Array, s: int, end: int, first: int
+) -> tuple[Array, Array]:
+    """Square of every point's error (k, c), and its derivative (k, c, p).
 
-    error: (k, 3, c), J: (k, h, 3, c) of one robot, as `sighted` and `sensed`.
+    error: (k, 3, c), J: (k, h, 3, c) of one robot, as `sighted` and `sensed`.  Others as `summed`.
     """
-    return np.einsum("kic,kic->kc", error, error), np.einsum("khic,kic->kch", J, error)
+    slope = np.zeros((*root.shape, len(which)))
+    pull = -2.0 * np.einsum("khic,kic->kch", J, error)
+    slope[..., :s], slope[..., end:] = pull[..., :s], pull[..., s:]
+    t, axis = np.divmod(which[s:end] - first, 3)
+    slope[t, :, np.arange(s, end)] = -2.0 * root[t] * error[t, axis]
+    return np.einsum("kic,kic->kc", error, error), slope
 
 
 def solved(

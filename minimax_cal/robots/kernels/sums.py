@@ -82,10 +82,9 @@ class Columns:
         return Columns(which, first, s, end, axis, point, which[end:] - last)
 
     @property
-    def own(self) -> list[tuple[int, int, int]]:
-        """Place, target and axis of those of targets."""
-        told = self.which[self.s : self.end] - self.first
-        return [(row, *divmod(at, 3)) for row, at in enumerate(told.tolist(), self.s)]
+    def ends(self) -> tuple[int, int, int]:
+        """s, end and first, as the kernels ask for them."""
+        return self.s, self.end, self.first
 
     def shared(
         self, own: ModuleType, at: At, sight: Sight, lo: int, hi: int
@@ -107,7 +106,7 @@ class Columns:
         for lo, hi in blocks(len(sight[0]), B * k, own.BLOCK):
             error, J, root = self.shared(own, at, sight, lo, hi)
             flat = error.reshape(B, k, -1), J.reshape(*J.shape[:3], -1), root
-            own.summed(*flat, self.which, self.s, self.end, self.first, *out)
+            own.summed(*flat, self.which, *self.ends, *out)
         return out
 
 
@@ -128,11 +127,11 @@ def rows(
     """
     columns = Columns.of(at, which)
     error, J, root = columns.shared(own, at, sight, lo, hi)
-    s, end = columns.s, columns.end
+    s, end, first = columns.ends
     out = np.zeros((len(root), len(which), *error.shape[2:]))
     out[:, :s], out[:, end:] = J[0, :, :s], J[0, :, s:]
-    for row, t, axis in columns.own:
-        out[t, row, axis] = root[t]
+    t, axis = np.divmod(which[s:end] - first, 3)
+    out[t, np.arange(s, end), axis] = root[t]
     return error[0], out
 
 
@@ -142,14 +141,10 @@ def squares(own: ModuleType, at: At, sight: Sight, which: Array) -> tuple[Array,
     Of a batch of one, as `normal`.
     """
     (k, m), columns = sight[3].shape, Columns.of(at, which)
-    f, slope, s, end = np.empty((k, m)), np.zeros((k, m, len(which))), columns.s, columns.end
+    f, slope, ends = np.empty((k, m)), np.empty((k, m, len(which))), columns.ends
     for lo, hi in blocks(m, k, own.BLOCK):
         error, J, root = columns.shared(own, at, sight, lo, hi)
-        f[:, lo:hi], pull = own.pulled(error[0], J[0])
-        slope[:, lo:hi, :s], slope[:, lo:hi, end:] = pull[..., :s], pull[..., s:]
-        for row, t, axis in columns.own:
-            slope[t, lo:hi, row] = root[t] * error[0, t, axis]
-    slope *= -2.0
+        f[:, lo:hi], slope[:, lo:hi] = own.squared(error[0], J[0], root, which, *ends)
     return f, slope
 
 
