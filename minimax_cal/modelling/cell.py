@@ -207,7 +207,7 @@ def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
     try:
         base, sessions = pose_from_dict(content["base"]), sessions_from(content)
         targets = content["targets_mm"]
-        spots = np.array([targets[name] for name in targets], dtype=float).reshape(-1, 3) * 1e-3
+        spots = np.array(list(targets.values()), dtype=float).reshape(-1, 3) * 1e-3
         robot = content["robot"]
         effects = effects_from(content, source)
     except (AttributeError, KeyError, TypeError, ValueError) as error:

@@ -324,3 +324,12 @@ def test_what_is_no_scheduler_is_told_in_our_words(
     said = refused(capsys, "fleet", tmp_path / "cells.toml", "--cluster", "tcp://127.0.0.1:9")
     assert "what answers there is something else" in said
     assert "uint8" not in said
+
+
+def test_targets_without_names_are_told_in_our_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A list of a number was looked up at that number."""
+    path = broken(tmp_path, "truth.json", lambda content: content.update(targets_mm=[7]))
+    (tmp_path / "data.csv").write_bytes(material()["data.csv"])
+    assert "is not a saved calibration" in refused(capsys, "evaluate", path, tmp_path / "data.csv")

@@ -422,8 +422,8 @@ def test_a_step_is_never_shortened_to_more_than_half_nor_less_than_a_tenth() -> 
     assert search(begun(wall, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
     steep = Curve(lambda x: -x if x < 0.3 else 1e9, lambda x: -1.0)
     assert search(begun(steep, 0.0), plan([1.0], [1.0]), lost)[0] == 0.1
-    flat = Curve(lambda x: -x if x < 0.3 else 1e-9, lambda x: -1.0)
-    assert_allclose(search(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0], 0.25, rtol=1e-6)
+    flat = Curve(lambda x: -x if x < 0.3 else -5e-5 * x, lambda x: -1.0)
+    assert search(begun(flat, 0.0), plan([1.0], [1.0]), lost)[0] == 0.25  # half of a half
 
 
 def test_no_step_up_a_hill() -> None:
@@ -503,7 +503,7 @@ def test_curvature_that_is_missing_is_damped_by_powell(q: list[float]) -> None:
 
 def test_the_first_guess_takes_its_size_from_the_first_step() -> None:
     fresh = Bfgs(np.eye(2), fresh=True)
-    s, q = np.array([2.0, 0.0]), np.array([4.0, 2.0])
+    s, q = np.array([2.0, 0.0]), np.array([0.4, 0.2])
     size = (q @ q) / (q @ s)
     sized = updated(Bfgs(size * np.eye(2), fresh=False), s.tolist(), q.tolist())
     found = updated(fresh, s.tolist(), q.tolist())
@@ -511,7 +511,7 @@ def test_the_first_guess_takes_its_size_from_the_first_step() -> None:
     assert not found.fresh
     back = updated(fresh, s.tolist(), (-q).tolist())  # no size in a fall of the slope
     assert_allclose(back.matrix, updated(replace(fresh, fresh=False), [2.0, 0.0],
-                                         [-4.0, -2.0]).matrix)  # fmt: skip
+                                         [-0.4, -0.2]).matrix)  # fmt: skip
 
 
 def test_steps_that_teach_nothing_leave_the_hessian() -> None:
