@@ -1,6 +1,6 @@
 """The kernels compiled by numba: the names, arguments and results of `plain`.
 
-A kernel that calls another one compiles it once more, so `sums` calls one after the other.  Loops
+A kernel that calls another one compiles it once more: `sums` calls the large ones in turn.  Loops
 on single numbers compile several times as fast as what NumPy does to whole arrays.
 """
 
