@@ -177,9 +177,10 @@ def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationErr
 
 def read_toml(path: Path | str) -> dict[str, Any]:
     """The content of a TOML file.  Raises OptionError."""
+    text = read_text(path, kind=OptionError)
     try:
-        return tomllib.loads(read_text(path, kind=OptionError))
-    except tomllib.TOMLDecodeError as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # numbers too long, tables too deep
         raise OptionError(f"{path}: is not TOML ({error})") from error
 
 

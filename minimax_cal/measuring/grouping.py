@@ -116,8 +116,9 @@ def numbered_by_joints(group: Array, q: Array) -> Array:
     group: (m,).  q: (m, n).
     """
     _, group = np.unique(group, return_inverse=True)
-    order, rank = np.lexsort(np.round(q, 9).T[::-1]), np.empty(len(q), dtype=int)
-    rank[order] = np.arange(len(q))
+    rounded = np.round(q, 9)
+    order, rank = np.lexsort(rounded.T[::-1]), np.zeros(len(q), dtype=int)
+    rank[order[1:]] = (np.diff(rounded[order], axis=0) != 0.0).any(axis=1).cumsum()
     least = np.full(int(group.max()) + 1, len(q))
     np.minimum.at(least, group.reshape(-1), rank)
     return np.asarray(np.argsort(np.argsort(least))[group.reshape(-1)])

@@ -177,8 +177,8 @@ def same_numbers(item: str, one: str, other: str) -> bool:
         pairs = zip(SPAN.findall(one), SPAN.findall(other), strict=True)
         return all(meet(*(tuple(float(x or span[0]) for x in span) for span in p)) for p in pairs)
     a, b = (np.array(NUMBER.findall(cell), dtype=float) for cell in (one, other))
-    away = POINTS if item == MOVED else TINY
-    return item == TIMED or bool(np.allclose(a, b, rtol=LOOSE, atol=away))
+    away = dict(rtol=0.0, atol=POINTS) if item == MOVED else dict(rtol=LOOSE, atol=TINY)
+    return item == TIMED or bool(np.allclose(a, b, **away))
 
 
 def meet(one: tuple[float, ...], other: tuple[float, ...]) -> bool:

@@ -297,3 +297,30 @@ def test_of_two_outputs_none_is_left_where_one_cannot_be_written(
                    closed / "out.json")  # fmt: skip
     assert "cannot be written (Permission denied)" in told
     assert not page.exists()
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000, "2020-02-31"])
+def test_a_fleet_that_python_does_not_read_is_refused(
+    value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A number of 5000 digits was a traceback."""
+    path = tmp_path / "cells.toml"
+    path.write_text(f"[[cells]]\nname = {value}\n")
+    assert "is not TOML" in refused(capsys, "fleet", path)
+
+
+def test_what_is_no_scheduler_is_told_in_our_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask took the first bytes of another server for the size of an array."""
+    distributed = pytest.importorskip("distributed")
+    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
+        (tmp_path / name).write_bytes(material()[name])
+
+    def other(*given: object, **more: object) -> None:
+        raise MemoryError("Unable to allocate 3.07 EiB for an array and data type uint8")
+
+    monkeypatch.setattr(distributed, "rpc", other)
+    said = refused(capsys, "fleet", tmp_path / "cells.toml", "--cluster", "tcp://127.0.0.1:9")
+    assert "what answers there is something else" in said
+    assert "uint8" not in said

@@ -13,6 +13,7 @@ from minimax_cal.measuring.grouping import (
     grouped,
     groups,
     nearest_means,
+    numbered_by_joints,
     parts,
     split,
     with_groups,
@@ -207,3 +208,10 @@ def test_rows_of_a_group_column_are_told(rng: np.random.Generator) -> None:
         label = [str(min(i, 5)) for i in range(poses)]
         notices = split(made(rng.normal(size=(poses, 6)), group=np.array(label)), 0.3, 0)[2]
         assert bool(notices) == told
+
+
+def test_groups_are_numbered_alike_in_any_order_of_the_rows(rng: np.random.Generator) -> None:
+    q = rng.integers(0, 3, (40, 2)) * 0.5  # groups at the same joints, too
+    group, order = rng.integers(0, 6, 40), rng.permutation(40)
+    found = numbered_by_joints(group[order], q[order])
+    assert_array_equal(found, numbered_by_joints(group, q)[order])
