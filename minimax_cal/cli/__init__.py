@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -16,8 +17,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     arguments: those of the process unless given.
     """
-    if arguments is None:  # a process of its own, which is to start soon
+    if arguments is None:  # a process of its own, which is to be brief
         gc.set_threshold(COLLECTED)
+        atexit.register(gc.freeze)  # what is left at the end is not looked through
         os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it looks everywhere for them
     try:
         from minimax_cal.cli.running import outcome  # imports take long enough for a Ctrl-C
