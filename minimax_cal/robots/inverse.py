@@ -126,6 +126,8 @@ def at_poses(
     """
     n, batch = len(lower), pose.shape[:-2]
     goal = pose.reshape(-1, 4, 4)
+    if not len(goal):  # of which older SciPy makes no rotations
+        return np.zeros((*batch, n)), np.zeros(batch)
     span = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     middle = np.clip(np.zeros(n), *span)
     begin = middle if near is None else np.asarray(near, dtype=float)

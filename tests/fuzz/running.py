@@ -160,7 +160,7 @@ def truth(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
     if one.command == "calibrate" or fit in one.files:
         try:
             said = disagreement(out, one.files["data.csv"], one.files.get(fit))
-        except (ValueError, KeyError, IndexError, UnicodeDecodeError):
+        except (ValueError, KeyError, IndexError, TypeError):
             return None  # broken in a way that the independent reader does not follow
         if said:
             return "silently wrong", said

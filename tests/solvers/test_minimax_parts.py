@@ -248,7 +248,7 @@ class Plane:
     """Functions that do not change, and a constraint that holds."""
 
     f: Array
-    slope: float = 0.0
+    slope: float | Array = 0.0
     lower: Array = field(default_factory=lambda: np.array([-1.0]))
     upper: Array = field(default_factory=lambda: np.array([1.0]))
 
@@ -264,7 +264,13 @@ class Plane:
 
 
 @pytest.mark.parametrize(
-    "problem", [Plane(np.array([1.0]), np.nan), Plane(np.array([np.nan]), 1.0)]
+    "problem",
+    [
+        Plane(np.array([1.0]), np.nan),
+        Plane(np.array([np.nan]), 1.0),
+        Plane(np.array([1.0, np.nan]), 1.0),
+        Plane(np.array([1.0, 2.0]), np.array([[1.0], [np.nan]])),
+    ],
 )
 def test_what_is_no_number_ends_in_a_status(problem: Plane) -> None:
     asked: list[Problem] = []
