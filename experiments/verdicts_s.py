@@ -31,6 +31,7 @@ REACHED = {  # Fig. 5: which methods reach the minimum within 10000 iterations
 ENDS = {(3.0, -2.8): "; NLGN ends at 107.99 mm"}
 NEAR = 20.0  # percent points that count as alike where so much is not told
 ALIKE = 5.0  # and of the same starts, moved by rounding
+ALL = 99.9  # percent that count as all: rounding may cost one start in a thousand
 SEVERAL = "the paper tells neither base, pose range, size of errors, unit nor rule of damping"
 
 
@@ -99,7 +100,7 @@ def table_2(found: Table2) -> list[Verdict]:
 
     starts = listed((at(0, method) for method in PAPER), ".0f")
     where = f"{NAMES}; all parameters, pseudo-inverses, mm; starts {starts}"
-    separable = min(at(5, "snlgn"), at(5, "snllm")) == 100.0
+    separable = min(at(5, "snlgn"), at(5, "snllm")) >= ALL
     metres = by["all, m", "nllm"].cells()
     share = float(metres[-1])
     alike = [
@@ -134,8 +135,9 @@ def table_2(found: Table2) -> list[Verdict]:
                 "(JᵀJ + μI) adds square millimetres to square radians: the failure of NLLM is one "
                 "of units"),
         Verdict("S Table 2: separable methods on the identifiable parameters", "convergence",
-                "100 / 100", listed(own), told(*(value == 100.0 for value in own)),
-                "the library's own; other arms and wider poses: the study's other tables"),
+                "100 / 100", listed(own), told(*(value >= ALL for value in own)),
+                f"at least {ALL} %: rounding may cost a start in a thousand; other arms and wider "
+                "poses: the study's other tables"),
         rounding(found.moved),
         Verdict("S Fig. 3, text: every NLLM start that converges reaches the minimum",
                 "convergence", "yes", "yes" if caught else "no", told(caught)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 from collections import UserDict
@@ -188,18 +187,11 @@ def leads_with(one: Path, other: Path) -> bool:
 def quickly(name: str) -> ModuleType:
     """A module, imported without what only takes time.
 
-    SciPy copies every name of NumPy, which would load a compiler's front end and a test framework;
-    pydantic looks for plugins in all that is installed; and what is imported stays.
+    SciPy copies every name of NumPy, which would load a compiler's front end and a test framework.
     """
     for part in SPARED:
         when_used(part)
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.disable()
-    try:
-        return import_module(name)
-    finally:
-        gc.freeze()  # what is there now need not be looked through again
-        gc.enable()
+    return import_module(name)
 
 
 def when_used(name: str) -> None:

@@ -332,3 +332,21 @@ def test_results_are_written_before_pictures(
     out = tmp_path / "fit.json"
     assert run("calibrate", "irb2600", csv, "-o", out, "--figure", tmp_path / "a.png") == 1
     assert mc.load_fit(out).status == "converged"
+
+
+def test_calibrate_starts_without_what_it_does_not_use() -> None:
+    """And what is put off is there when it is asked for."""
+    unused = (
+        "numba", "numpy.f2py.crackfortran", "unittest", "yaml", "minimax_cal.evidence.selection",
+        "minimax_cal.judging.bootstrap", "minimax_cal.robots.urdf",
+    )  # fmt: skip
+    code = (
+        "import sys\n"
+        "from minimax_cal.cli.commands import quickly\n"
+        "quickly('minimax_cal.cli.calibrate')\n"
+        f"print([name for name in {unused} if name in sys.modules])\n"
+        "from numpy import testing\n"
+        "testing.assert_allclose(1.0, 1.0)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "[]\n"

@@ -17,6 +17,7 @@ from minimax_cal.fitting.suspects import (
     Scores,
     Spread,
     Suspect,
+    likeliest,
     scores,
     spread_of,
     suspects_of,
@@ -26,6 +27,7 @@ from minimax_cal.fitting.suspects import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.solvers.scalar import least_between
 
 # ---- leverage --------------------------------------------------------------------------------
 
@@ -132,6 +134,21 @@ def drawn(rng: np.random.Generator, count: int, tail: float) -> Array:
     """Squared lengths of 3-D Student's t vectors of scale NOISE: (1, count)."""
     wide = tail / rng.chisquare(tail, size=count)
     return (NOISE**2 * wide * rng.chisquare(3, size=count))[None]
+
+
+@pytest.mark.parametrize("tail", [3.0, 10.0, 1e4])
+def test_the_likeliest_scale_is_where_the_density_is_largest(
+    rng: np.random.Generator, tail: float
+) -> None:
+    square = drawn(rng, 500, tail)[0]
+    found = likeliest(square, np.full(500, 1.5), tail, float(np.log(NOISE)) + 1.0)
+
+    def loss(log_scale: float) -> float:
+        ratio = square / 3.0 / np.exp(2.0 * log_scale)
+        return float(2.0 * 500 * log_scale - stats.f.logpdf(ratio, 3, tail).sum())
+
+    at, _ = least_between(loss, found - 1.0, found + 1.0, 1e-9)
+    assert abs(found - at) < 1e-6  # of a flat bottom no more is seen
 
 
 @pytest.mark.parametrize("tail", [3.0, 6.0, 1e5])

@@ -16,6 +16,7 @@ from minimax_cal.measuring.faults.limits import FALSE_ALARM
 from minimax_cal.measuring.history import sessions, visits
 from minimax_cal.measuring.measurements import Measurements
 
+CHUNK = 65536  # poses whose displacements are solved for at a time
 ROUNDS = 10  # of asking each jump again
 CLEAR = 0.1  # of the squares that all poses as one body leave: a jump explains so much, or is none
 
@@ -130,15 +131,18 @@ class Rigid:
             np.einsum("mij,mi->mj", design, value),
             (value**2).sum(axis=1),
         )
-        sums = [np.concatenate([0.0 * part[:1], np.cumsum(part, axis=0)]) for part in parts]
-        return Rigid(design, value, *sums)
+        return Rigid(design, value, *map(summed_up, parts))
 
     def left(self, first: Array, last: Array) -> Array:
-        """(...) squares that one displacement for the poses first to last - 1 leaves [m^2]."""
-        gram, pull = self.gram[last] - self.gram[first], self.pull[last] - self.pull[first]
-        gram = gram + 1e-9 * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] * np.eye(6)
-        explained = np.einsum("...i,...i", pull, np.linalg.solve(gram, pull[..., None])[..., 0])
-        return np.asarray(self.square[last] - self.square[first] - explained)
+        """(a,) squares that one displacement for the poses first to last - 1 leaves [m^2]."""
+        out = self.square[last] - self.square[first]
+        for lo in range(0, len(out), CHUNK):
+            a, b = first[lo : lo + CHUNK], last[lo : lo + CHUNK]
+            gram, pull = self.gram[b] - self.gram[a], self.pull[b] - self.pull[a]
+            gram += 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+            step = np.linalg.solve(gram, pull[..., None])[..., 0]
+            out[lo : lo + CHUNK] -= np.einsum("ai,ai->a", pull, step)
+        return out
 
     def fitted(self, first: int, last: int) -> Array:
         """(6,) the displacement of some poses."""
@@ -148,6 +152,13 @@ class Rigid:
     def size(self, step: Array) -> float:
         """RMS motion of all poses by a displacement [m]."""
         return float(np.sqrt(((self.design @ step) ** 2).sum(axis=1).mean()))
+
+
+def summed_up(part: Array) -> Array:
+    """(m + 1, ...) sums of the rows (m, ...) before each."""
+    out = np.zeros((len(part) + 1, *part.shape[1:]))
+    np.cumsum(part, axis=0, out=out[1:])
+    return out
 
 
 def jumps_in(poses: Rigid, count: int) -> list[int]:
@@ -180,8 +191,9 @@ def jump_between(poses: Rigid, first: int, last: int) -> int:
     dof = 3 * (last - first) - 12
     if not len(at) or dof < 1:
         return 0
-    ends = np.full_like(at, first), np.full_like(at, last), [first, 0], [last, len(poses.value)]
-    left = poses.left(np.concatenate([ends[0], at, ends[2]]), np.concatenate([at, *ends[1::2]]))
+    begin, end = np.full_like(at, first), np.full_like(at, last)
+    starts = np.concatenate([begin, at, [first, 0]])  # and all these poses, and all there are
+    left = poses.left(starts, np.concatenate([at, end, [last, len(poses.value)]]))
     before, after, (whole, every) = np.split(left, [len(at), 2 * len(at)])
     apart = before + after
     best = int(np.argmin(apart))

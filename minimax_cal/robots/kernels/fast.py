@@ -1,6 +1,6 @@
 """The kernels compiled by numba: the names, arguments and results of `plain`.
 
-A kernel that calls another one compiles it once more, so `sums` calls one after the other.  Loops
+A kernel that calls another one compiles it once more: `sums` calls the large ones in turn.  Loops
 on single numbers compile several times as fast as what NumPy does to whole arrays.
 """
 
@@ -144,8 +144,7 @@ def sighted(
 
 @compiled
 def sensed(
-    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array,
-    lo: int,
+    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array
 ) -> Array:  # fmt: skip
     """See `plain.sensed`."""
     B, c, k, s = len(arm), arm.shape[3], targets.shape[1], len(axis)
@@ -171,7 +170,7 @@ def sensed(
                     for r in range(c):
                         total = 0.0
                         for j in range(3):
-                            total += arm[b, j, i, r] * fields[e, t, j, lo + r]
+                            total += arm[b, j, i, r] * fields[e, t, j, r]
                         out[b, t, s + e, i, r] = root[t, r] * total
     return out
 

@@ -176,13 +176,12 @@ def inside(axes: Array, u: Array) -> Array:
 
 
 def sensed(
-    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array,
-    lo: int,
+    arm: Array, axis: Array, point: Array, targets: Array, swung: Array, root: Array, fields: Array
 ) -> Array:  # fmt: skip
     """Weighted derivatives of the targets by what moves them all: (B, k, h, 3, c), in the flange.
 
-    axis, point: (s,) rows of the arm, see `sums.axes`.  fields: (h - s, k, 3, m) of the effects.
-    arm, lo, swung, root: as `sighted`.
+    axis, point: (s,) rows of the arm, see `sums.axes`.  fields: (h - s, k, 3, c) of the effects.
+    arm, swung, root: as `sighted`.
     """
     (B, _, _, c), s = arm.shape, len(axis)
     slides, turns = np.flatnonzero(point < 0), np.flatnonzero(point >= 0)
@@ -198,7 +197,7 @@ def sensed(
         move -= about[:, :, :, k] * reach[j]
         out[:, :, turns, i] = move
     if len(fields):
-        field = np.swapaxes(fields[..., lo : lo + c], 0, 1)
+        field = np.swapaxes(fields, 0, 1)
         out[:, :, s:] = inside(arm[:, :3], np.broadcast_to(field, (B, *field.shape)))
     out *= root[:, None, None]
     return out

@@ -96,8 +96,8 @@ class Columns:
         (mdh, *place), (q, prismatic, *seen), fields = at, sight, sight[4]
         arm = own.unwound(mdh, q, prismatic, lo, hi)
         error, swung, root = own.sighted(arm, *place, *seen, lo)
-        some = fields[self.effects] if len(fields) else fields
-        return error, own.sensed(arm, self.axis, self.point, at[3], swung, root, some, lo), root
+        some = fields[..., lo:hi].take(self.effects, axis=0)
+        return error, own.sensed(arm, self.axis, self.point, at[3], swung, root, some), root
 
     def normal(self, own: ModuleType, at: At, sight: Sight) -> tuple[Array, Array, Array]:
         """See `sums.normal`."""
