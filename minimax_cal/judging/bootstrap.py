@@ -24,6 +24,7 @@ from minimax_cal.fitting.options import Progress, silent, solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.redrawn import Draw, solved_at_once
@@ -149,8 +150,7 @@ def bootstrap(
     """
     if replicates < 2:
         raise OptionError(f"{replicates} replicates: give 2 or more, 500 as a rule")
-    if seed < 0:
-        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    check_seed(seed)
     if fit.objective == "point":
         raise OptionError(
             "objective point rests on the few worst points, which a bootstrap cannot draw anew; "

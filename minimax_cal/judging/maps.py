@@ -20,6 +20,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import option
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, Saved
@@ -363,8 +364,7 @@ def check_grid(grid: Grid) -> None:
     ):
         if not least <= value <= most:
             raise OptionError(f"{name} {value}: give {least} to {most}")
-    if grid.seed < 0:
-        raise OptionError(f"seed {grid.seed}: give a whole number, 0 or more")
+    check_seed(grid.seed)
     if grid.slab <= 0.0 or np.isinf(grid.slab) or np.isinf(grid.height):
         raise OptionError("height and slab of the section: give finite numbers, slab over 0")
 

@@ -17,6 +17,7 @@ import scipy
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.measuring.history import clock, numbered, sessions
 from minimax_cal.measuring.measurements import Measurements
 
@@ -223,8 +224,7 @@ def held_out(
     data: Measurements, holdout: float, seed: int, by: str | None = None
 ) -> tuple[Array, tuple[str, ...]]:
     """(m,) True for rows that no fit may see, and notices.  As `split`."""
-    if seed < 0:
-        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    check_seed(seed)
     if not 0.0 <= holdout < 1.0:
         raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
     if "split" in data.columns and by is None:

@@ -11,6 +11,7 @@ import scipy
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots import kinematics
@@ -93,8 +94,7 @@ def simulate(
             f"simulate needs at least one pose and one target, at most {MOST_POSES} and "
             f"{MOST_TARGETS}"
         )
-    if seed < 0:
-        raise OptionError(f"seed {seed}: give a whole number, 0 or more")
+    check_seed(seed)
     for name, value in vars(truth).items():
         if not (np.isfinite(value) and value >= 0.0):
             raise OptionError(f"simulate: {name} {value:g} must be a finite number, 0 or more")

@@ -12,6 +12,7 @@ import numpy as np
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.options import SI, option, pair, triple
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.planning.prospect import Instrument
 from minimax_cal.planning.result import MEANINGS, POWER
 from minimax_cal.planning.visibility import NORMALS
@@ -201,8 +202,7 @@ def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
             f"candidates={options.candidates}: give at least as many as poses, at most "
             f"{MOST_CANDIDATES}"
         )
-    if options.seed < 0:
-        raise OptionError(f"seed {options.seed}: give a whole number, 0 or more")
+    check_seed(options.seed)
     if not 0 <= options.revisit <= poses:
         raise OptionError(f"revisit={options.revisit}: give 0 to {poses}, the number of poses")
     if options.approach not in EFFORTS:

@@ -321,9 +321,11 @@ def test_what_is_no_scheduler_is_told_in_our_words(
         raise MemoryError("Unable to allocate 3.07 EiB for an array and data type uint8")
 
     monkeypatch.setattr(distributed, "rpc", other)
-    said = refused(capsys, "fleet", tmp_path / "cells.toml", "--cluster", "tcp://127.0.0.1:9")
+    said = refused(capsys, "fleet", tmp_path / "cells.toml", "--cluster", "tcp://127.0.0.1:9",
+                   "--out", tmp_path / "made")  # fmt: skip
     assert "what answers there is something else" in said
     assert "uint8" not in said
+    assert not (tmp_path / "made").exists()  # an empty folder was left
 
 
 def test_targets_without_names_are_told_in_our_words(
@@ -333,3 +335,13 @@ def test_targets_without_names_are_told_in_our_words(
     path = broken(tmp_path, "truth.json", lambda content: content.update(targets_mm=[7]))
     (tmp_path / "data.csv").write_bytes(material()["data.csv"])
     assert "is not a saved calibration" in refused(capsys, "evaluate", path, tmp_path / "data.csv")
+
+
+def test_a_seed_below_zero_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """NumPy's generator said so in the middle of a check."""
+    for name in ("data.csv", "fit.json"):
+        (tmp_path / name).write_bytes(material()[name])
+    more = ("--tolerance", "rms 0.5", "--seed", -1)
+    assert "seed -1" in refused(
+        capsys, "check", tmp_path / "fit.json", tmp_path / "data.csv", *more
+    )

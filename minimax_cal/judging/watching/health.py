@@ -16,6 +16,7 @@ from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interv
 from minimax_cal.fitting.options import listed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.seeds import check_seed
 from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
 from minimax_cal.judging.watching.moved import Search, search
 from minimax_cal.judging.watching.opening import in_names, own_rows, watched_of
@@ -56,6 +57,7 @@ def check(
     limits = limits_of(tolerance)
     if not limits:
         raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
+    check_seed(seed)
     known = tuple(listed(known))
     for part in known:
         if part not in KNOWN:

@@ -11,6 +11,7 @@ from minimax_cal.fitting.options import silent
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, json_text, made_folder, write_whole
 from minimax_cal.ground.optional import optional
+from minimax_cal.ground.parallel import look_for
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
 from minimax_cal.judging.watching.result import NOT_VALID, VALID
@@ -115,6 +116,8 @@ def fleet(
         optional("jinja2", "an overview page", NEEDED)
     folder = Path(out).resolve() if out is not None else None
     jobs = read_cells(path, folder)
+    if cluster:
+        look_for(cluster)  # before anything is written
     if folder is not None:
         made_folder(folder)
     rows: dict[str, Row] = {}
