@@ -320,17 +320,24 @@ def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
 
 
 def repeats(scene: Scene, rest: Rest) -> tuple[float, float]:
-    """F test of lack of fit: scatter between poses against scatter at the same pose."""
-    group = groups(scene.data)
-    names, count = np.unique(group, return_counts=True)
+    """F test of lack of fit: scatter between poses against scatter at the same pose.
+
+    Without poses that are off by themselves: among few repeated poses there is none as a rule.
+    """
     block = rest.rows.reshape(scene.poses, -1)
+    used = np.count_nonzero(rest.root.reshape(block.shape), axis=1)
+    size = (block**2).sum(axis=1)
+    sound = stats.chi2.sf(size, np.maximum(used, 1)) * scene.poses >= STRUCTURE
+    group = np.where(sound, groups(scene.data), -1)
+    names, count = np.unique(group[sound], return_counts=True)
     pure, pure_dof = 0.0, 0
     for name in names[count > 1]:
         mine = block[group == name]
         pure += float(((mine - mine.mean(axis=0)) ** 2).sum())
         pure_dof += (len(mine) - 1) * int(np.count_nonzero(np.ptp(mine, axis=0) > 0.0))
-    dof = rest.dof - pure_dof
+    dof = rest.dof - int(used[~sound].sum()) - pure_dof
     if pure_dof < 20 or dof < 20:
         return 1.0, 0.0
-    ratio = ((rest.total - pure) / dof) / (pure / pure_dof)
-    return float(stats.f.sf(ratio, dof, pure_dof)), (rest.total - pure) * (1.0 - 1.0 / ratio)
+    between = float(size[sound].sum()) - pure
+    ratio = (between / dof) / (pure / pure_dof)
+    return float(stats.f.sf(ratio, dof, pure_dof)), between * (1.0 - 1.0 / ratio)

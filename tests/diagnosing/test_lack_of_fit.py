@@ -8,7 +8,7 @@ from problems_fit import study
 from scipy import stats
 
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.lack_of_fit import rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import repeats, rest_of, structure
 from minimax_cal.evidence.noise import Noise, restricted
 
 
@@ -74,3 +74,18 @@ def test_one_pose_that_is_off_is_no_structure() -> None:
         error[row] += 9.0 * spread[row]
         found = structure(made.scene, replace(made.rows, error=error), noise, none)
         assert min(t.p for t in found if "wave" not in t.name) * len(found) > 0.005
+
+
+def test_poses_that_are_off_are_no_lack_of_fit() -> None:
+    """Poses measured twice scatter as the others do, but for one in fifty that is far off."""
+    made, rng, noise = study(6e-6, 1.0, 0), np.random.default_rng(2), Noise(0.0, 1e-10, 0.0)
+    data, again = made.scene.data, np.repeat(np.arange(10), 2)
+    q = np.concatenate([data.q[again], data.q[len(again) :]])
+    scene = replace(made.scene, data=replace(data, q=q))
+    error = 1e-5 * rng.normal(size=len(made.rows.error))
+    none = np.zeros((len(error), 0))
+    off, bent = error.copy(), error.reshape(len(q), -1).copy()
+    off[9 * len(again) :: 450] += 1.2e-4
+    assert repeats(scene, rest_of(replace(made.rows, error=off), noise, none))[0] > 0.01
+    bent += 1e-5 * np.sin(5.0 * q[:, :1])
+    assert repeats(scene, rest_of(replace(made.rows, error=bent.ravel()), noise, none))[0] < 1e-3
