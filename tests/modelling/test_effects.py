@@ -393,6 +393,14 @@ def test_settling_is_a_share_of_the_last_move() -> None:
     assert_allclose(turn, [0.0, *np.diff(DATA.q[:, 1])], rtol=0, atol=0)
 
 
+def test_slides_settle_too() -> None:
+    slide = SCENES["a slide"]
+    assert "J3" in EFFECTS["settling"].places(slide)
+    assert "J3" not in EFFECTS["backlash"].places(slide)  # whose play is told in radians
+    way = columns("settling", "J3", slide).turn[0, 2]
+    assert_allclose(way, [0.0, *np.diff(slide.data.q[:, 2])], rtol=0, atol=0)
+
+
 # ---------------------------------------------------------------- time
 
 

@@ -162,12 +162,13 @@ JOINT_COUPLING = Effect(
 
 
 def moved(scene: Scene, stem: str) -> list[int]:
-    """Turning joints whose column of the history varies."""
-    return [j for j in turning(scene) if scene.has(f"{stem}{j + 1}")]
+    """Joints whose column of the history varies; those that slide have no play in radians."""
+    among = turning(scene) if stem == "approach" else range(scene.joints)
+    return [j for j in among if scene.has(f"{stem}{j + 1}")]
 
 
 def moved_places(scene: Scene, stem: str) -> tuple[str, ...]:
-    """Each joint whose column of the history varies, and all together."""
+    """Each of these joints, and all together."""
     joints = moved(scene, stem)
     each = tuple(f"J{j + 1}" for j in joints)
     return (*each, "all") if len(joints) > 1 else each
