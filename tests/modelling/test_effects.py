@@ -398,7 +398,7 @@ def test_slides_settle_too() -> None:
     assert "J3" in EFFECTS["settling"].places(slide)
     assert "J3" not in EFFECTS["backlash"].places(slide)  # whose play is told in radians
     way = columns("settling", "J3", slide).turn[0, 2]
-    assert_allclose(way, [0.0, *np.diff(slide.data.q[:, 2])], rtol=0, atol=0)
+    assert_allclose(way, [0.0, *np.diff(slide.q[2])], rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------- time
