@@ -125,7 +125,15 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         "backends": ("backends", "The QP backends that are installed, with their versions."),
     },
 }
-WRITTEN = ("output", "figure", "path", "pdf", "truth", "write")  # parameters that name outputs
+WRITTEN = (
+    "output",
+    "figure",
+    "path",
+    "pdf",
+    "truth",
+    "write",
+    "out",
+)  # parameters that name outputs
 SPARED = ("numpy.f2py", "numpy.testing")
 LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}

@@ -179,8 +179,8 @@ class CurvePart(Part):
         """As the code has it.  Raises ValueError."""
         x = numbers(self.x.values)
         y = tuple(numbers(view.values) for view in self.views)
-        if not x.size or any(part.shape != x.shape for part in y):
-            raise ValueError(f"curve {self.title!r} has values that differ in length")
+        if not (x.size and y) or any(part.shape != x.shape for part in y):
+            raise ValueError(f"curve {self.title!r} has no values, or some that differ in length")
         return Curve(self.title, self.x.label, self.y.label, x, y)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import cross
+from minimax_cal.robots.ranges import near_zero
 
 STEPS = 40  # of the search, at most
 STARTS = 12  # random ones, where none is given
@@ -128,7 +129,7 @@ def at_poses(
     goal = pose.reshape(-1, 4, 4)
     if not len(goal):  # of which older SciPy makes no rotations
         return np.zeros((*batch, n)), np.zeros(batch)
-    span = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
+    span = near_zero(lower, upper)
     middle = np.clip(np.zeros(n), *span)
     begin = middle if near is None else np.asarray(near, dtype=float)
     q, left = find(goal, np.broadcast_to(begin, (*batch, n)).reshape(-1, n))

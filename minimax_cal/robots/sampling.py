@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.ranges import near_zero
 from minimax_cal.robots.robot import Robot
 
 SLIDE = 0.5  # how far a slide goes to either side, at most [m]
@@ -13,10 +14,9 @@ SLIDE = 0.5  # how far a slide goes to either side, at most [m]
 def joint_range(robot: Robot, span: float = np.pi) -> tuple[Array, Array]:
     """(n,) lowest and highest joint values: the limits, at most one turn [rad, m].
 
-    span: most that a joint turns from 0 [rad].
+    span: most that a joint turns from 0 [rad], where it comes there.
     """
-    most = np.where(robot.prismatic, SLIDE, span)
-    return np.maximum(robot.lower, -most), np.minimum(robot.upper, most)
+    return near_zero(robot.lower, robot.upper, np.where(robot.prismatic, SLIDE, span))
 
 
 def random_joints(robot: Robot, size: tuple[int, ...], rng: np.random.Generator) -> Array:

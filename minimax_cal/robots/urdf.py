@@ -12,6 +12,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.ranges import near_zero
 from minimax_cal.robots.transforms import (
     SAME,
     along,
@@ -106,10 +107,8 @@ def rest_frames(urdf: Urdf, start: str, pose: Array, *, moving: bool) -> dict[st
 
 
 def random_joints(lower: Array, upper: Array, count: int = 60) -> Array:
-    """Joint values within limits, and all zero: (count, n)."""
-    q = np.random.default_rng(0).uniform(
-        np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower))
-    )
+    """Joint values within limits, of at most a turn, and all zero: (count, n)."""
+    q = np.random.default_rng(0).uniform(*near_zero(lower, upper), (count, len(lower)))
     q[0] = 0.0
     return np.asarray(q)
 

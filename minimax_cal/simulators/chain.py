@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,11 +26,15 @@ ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its rob
 DRIVES_TENDON = 3  # mjTRN_TENDON
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
 Bodies = Sequence[int]
+LOG = logging.getLogger("minimax_cal")
 
 
 def mujoco() -> Any:
-    """The package.  Raises OptionError without it."""
-    return optional("mujoco", "a simulator's model", "minimax-cal[mujoco]")
+    """The package, whose warnings would go to a file.  Raises OptionError without it."""
+    found = optional("mujoco", "a simulator's model", "minimax-cal[mujoco]")
+    if found.get_mju_user_warning() is None:
+        found.set_mju_user_warning(LOG.info)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import run
+from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
@@ -19,6 +20,7 @@ from minimax_cal.ground.files import json_of
 from minimax_cal.ground.records import Packed, packed, unpacked
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
+from minimax_cal.robots.ranges import near_zero
 from qp_backends import Problem, child
 from qp_backends.problem import COLD
 
@@ -345,3 +347,54 @@ def test_a_seed_below_zero_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "seed -1" in refused(
         capsys, "check", tmp_path / "fit.json", tmp_path / "data.csv", *more
     )
+
+
+def test_a_folder_of_results_is_no_file_of_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder was made, the cells were done, and their rows could not be written."""
+    for name in ("cells.toml", "robot.json", "data.csv", "fit.json"):
+        (tmp_path / name).write_bytes(material()[name])
+    told = ("--out", tmp_path / "a", "-o", tmp_path / "a")
+    assert "two results" in refused(capsys, "fleet", tmp_path / "cells.toml", *told)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_chart_of_nothing_is_told_in_our_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A curve without a view was NumPy's empty maximum."""
+
+    def empty(content: Any) -> None:
+        for curve in content["curves"].values():
+            curve["views"] = []
+
+    path = broken(tmp_path, "diagnosis.json", empty)
+    assert "has no values" in refused(capsys, "report", path, "-o", tmp_path / "page.html")
+
+
+def test_a_joint_that_never_comes_to_zero_is_no_trouble() -> None:
+    """Limits of 3.5 to 7 rad, or of 1 to 3 m, left nothing to draw from."""
+    for lower, upper in ((3.5, 7.0), (-20.0, -15.0), (4.0, np.inf), (-np.inf, -4.0), (-1.0, 9.0)):
+        low, high = near_zero(np.array([lower]), np.array([upper]))
+        assert lower <= low[0] < high[0] <= upper
+        assert high[0] - low[0] <= 2.0 * np.pi + 1e-12
+    low, high = near_zero(np.array([1.0]), np.array([3.0]), np.array([0.5]))
+    assert_allclose([low[0], high[0]], [1.0, 2.0])
+
+
+def test_a_simulator_keeps_no_log_beside_the_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """MuJoCo wrote its warnings to a file in the folder where it was called."""
+    pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
+    from minimax_cal.simulators.chain import mujoco
+
+    monkeypatch.chdir(tmp_path)
+    found = mujoco()
+    model = '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+    data = found.MjData(found.MjModel.from_xml_string(model))
+    data.qvel[:] = np.nan
+    found.mj_step(data.model, data)
+    assert data.warning[found.mjtWarning.mjWARN_BADQVEL].number
+    assert not list(tmp_path.iterdir())
