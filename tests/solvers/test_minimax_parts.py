@@ -294,6 +294,7 @@ def test_the_notes_of_backends_are_told_once() -> None:
     assert found.iterations == len(found.trace) == len(told) == 4
     assert [step.iteration for step in found.trace] == [1, 2, 3, 4]
     assert np.all(np.diff([step.value for step in found.trace]) < 0.0)
+    assert replace(found, f=np.array([1.0, 3.0, 2.0])).value == 3.0
 
 
 def test_the_hessian_has_a_floor_and_is_damped() -> None:
