@@ -86,7 +86,10 @@ def parsed(path: Path) -> ET.Element:
     """An XML file with its comments; document types are refused."""
     raw = read_raw(path, kind=RobotError)
     parse_xml(raw, str(path))
-    return ET.fromstring(raw, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    try:
+        return ET.fromstring(raw, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
+    except ET.ParseError as error:  # an encoding that is not the declared one
+        raise RobotError(f"{path}: is not XML ({error})") from error
 
 
 def written_out(path: Path, folder: Path, depth: int) -> ET.Element:
