@@ -125,16 +125,9 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         "backends": ("backends", "The QP backends that are installed, with their versions."),
     },
 }
-WRITTEN = (
-    "output",
-    "figure",
-    "path",
-    "pdf",
-    "truth",
-    "write",
-    "out",
-)  # parameters that name outputs
-SPARED = ("numpy.f2py", "numpy.testing")
+# parameters that name outputs
+WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
+SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
 LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 

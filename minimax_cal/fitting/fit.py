@@ -195,9 +195,10 @@ def link_by_link(
     order = names.link_by_link
     numbers = (part[order].tolist() for part in (after, before, sigma, known.active))
     return tuple(
-        Parameter(names.all[i], value, nominal, own, units[i], told, reason)
+        Parameter(
+            names.all[i], value, nominal, own, units[i], told, known.reasons.get(names.all[i], "")
+        )
         for i, value, nominal, own, told in zip(order.tolist(), *numbers, strict=True)
-        for reason in [known.reasons.get(names.all[i], "")]
     )
 
 

@@ -174,8 +174,9 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
     return known[asked]
 
 
-# the answers of `generic_count`, for which every fit of a robot asks
+# the answers of `generic_count`, and the joints of `plenty_of_poses`: every fit of a robot asks
 COUNTED: WeakKeyDictionary[Robot, dict[tuple[int, bytes, bytes], int]] = WeakKeyDictionary()
+DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
 
 
 def definite(matrix: Array) -> bool:
@@ -185,10 +186,6 @@ def definite(matrix: Array) -> bool:
     except np.linalg.LinAlgError:
         return False
     return True
-
-
-# and those of `plenty_of_poses`
-DRAWN: WeakKeyDictionary[Robot, dict[int, Array]] = WeakKeyDictionary()
 
 
 def redundant(gram: Array, active: Array, order: Array, rank: float) -> list[int]:

@@ -8,9 +8,11 @@ from minimax_cal.ground.arrays import Array
 
 
 def near_zero(lower: Array, upper: Array, most: Array | float = np.pi) -> tuple[Array, Array]:
-    """(n,) ends of the part of joint ranges within `most` of zero, or as wide where zero is not.
+    """(n,) ends of the part of joint ranges within `most` of zero.
 
-    lower, upper: (n,) limits, infinite where unknown [rad, m].
+    Of a range that lies beyond, its nearest part that is as wide.  lower, upper: (n,) limits,
+    infinite where unknown [rad, m].
     """
-    low = np.maximum(lower, np.minimum(-most, upper - 2.0 * most))
-    return low, np.minimum(upper, np.maximum(most, low + 2.0 * most))
+    low = np.where(upper > -most, -most, upper - 2.0 * most)
+    high = np.where(lower < most, most, lower + 2.0 * most)
+    return np.maximum(lower, low), np.minimum(upper, high)

@@ -379,6 +379,9 @@ def test_a_joint_that_never_comes_to_zero_is_no_trouble() -> None:
         low, high = near_zero(np.array([lower]), np.array([upper]))
         assert lower <= low[0] < high[0] <= upper
         assert high[0] - low[0] <= 2.0 * np.pi + 1e-12
+    for lower, upper in ((-5.0, 1.0), (-1.0, 5.0), (-7.0, 7.0), (-np.inf, np.inf)):  # as ever
+        ends = near_zero(np.array([lower]), np.array([upper]))
+        assert ends == (max(lower, -np.pi), min(upper, np.pi))
     low, high = near_zero(np.array([1.0]), np.array([3.0]), np.array([0.5]))
     assert_allclose([low[0], high[0]], [1.0, 2.0])
 

@@ -21,6 +21,7 @@ from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import read_raw
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.inverse import NEAR, missing, nearest
+from minimax_cal.robots.ranges import near_zero
 from minimax_cal.robots.robot import LEVER, Robot
 
 LANGUAGES: dict[str, ModuleType] = {
@@ -177,8 +178,8 @@ def joints_of(
 
 def all_ways(robot: Robot, goals: Array) -> Iterator[Array]:
     """For each goal (4, 4) of the flange the different joints (s, n) that reach it."""
-    lower, upper = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    begin = np.random.default_rng(0).uniform(lower, upper, (STARTS, robot.joints))
+    span = near_zero(robot.lower, robot.upper)
+    begin = np.random.default_rng(0).uniform(*span, (STARTS, robot.joints))
     lever, signs = LEVER * robot.reach(), robot.sign
     for first in range(0, len(goals), CHUNK):
         chunk = np.repeat(goals[first : first + CHUNK], STARTS, axis=0)
