@@ -28,7 +28,8 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
     FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.
     """
     measured = read_measurements(data)
-    cell, _, said = open_result(fit, rung).placed_by(measured)
+    opened = open_result(fit, rung)
+    cell, _, said = opened.placed_by(measured)
     found = accuracy(cell.error(measured))
     doubts = checks.outliers(measured, np.linalg.norm(cell.error(measured), axis=-1))
     if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
@@ -41,10 +42,12 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
         "schema": 1,
         "kind": "evaluation",
         "fit": str(fit),
+        "rung": opened.rungs[opened.number].name,
         "data": str(data),
         "data_sha256": measured.digest,
         "accuracy": found.to_dict(),
     }
     if to.deliver(lambda: json_text(content)):
-        show(found.table(f"{cell.robot.name} on {data}", measured.target_names))
+        name = cell.robot.name if rung is None else f"{cell.robot.name}, {content['rung']},"
+        show(found.table(f"{name} on {data}", measured.target_names))
     return 0

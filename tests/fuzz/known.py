@@ -208,13 +208,16 @@ def rms(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values) / len(values))
 
 
-def disagreement(answer: str, raw: bytes, fit_text: bytes | None) -> str:
+def disagreement(answer: str, raw: bytes, fit_text: bytes | None, nominal: bool = False) -> str:
     """Where the accuracy that a command printed is not that of its own robot on the file; ''.
 
-    fit_text: the fit that was evaluated, None for one that the answer itself holds.
+    fit_text: the fit that was evaluated, None for one that the answer itself holds.  nominal: its
+    arm before calibration was asked for.
     """
     found = json.loads(answer)
     fit = json.loads(fit_text) if fit_text else found
+    if nominal:
+        fit = {**fit["nominal_cell"], "robot": fit["nominal_robot"]}
     if fit.get("effects"):
         return ""
     rows = table(raw.removeprefix(b"\xef\xbb\xbf"))

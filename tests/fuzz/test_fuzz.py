@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import minimax_cal as mc
+from minimax_cal.cli import main
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.robots.robot import robot_from_dict
 
@@ -135,6 +136,21 @@ def test_the_independent_code_agrees_and_catches() -> None:
     content = json.loads(answer)
     content["robot"]["joints"][1]["a"] += 0.1
     assert "train: says" in disagreement(json.dumps(content), data, None)
+
+
+def test_the_independent_code_knows_the_arm_before_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = material()
+    for name in ("fit.json", "data.csv"):
+        (tmp_path / name).write_bytes(files[name])
+    fit, data = files["fit.json"], files["data.csv"]
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main(["evaluate", f"{tmp_path}/fit.json", f"{tmp_path}/data.csv", "--rung", "0", "--json"])
+    answer = capsys.readouterr().out
+    assert json.loads(answer)["rung"] == "nominal"
+    assert disagreement(answer, data, fit, nominal=True) == ""
+    assert disagreement(answer, data, fit).startswith("says")
 
 
 @pytest.mark.parametrize("way", [*HARMLESS, *FATAL])
