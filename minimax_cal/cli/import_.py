@@ -24,9 +24,10 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import names_of
+from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
 from minimax_cal.measuring.left_out import left_out
-from minimax_cal.measuring.measurements import read_measurements
+from minimax_cal.measuring.measurements import check_finite, measurements_in
 
 TOLD = "What the files do not tell"
 
@@ -88,11 +89,11 @@ def import_command(
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
     found = replace(found, data=left_out(found.data, names_of([leave_out])))
+    check_finite(found.data)  # what is left of it
     to.write_rows(
-        lambda: to.cells(csv_of(found), safe_cells), lambda: json_text(content(found, to.path))
+        lambda: readable(to.cells(csv_of(found), safe_cells), to.path),
+        lambda: json_text(content(found, to.path)),
     )
-    if to.path and to.path.suffix.lower() != ".json":
-        read_measurements(to.path)  # what was written can be read
     to.notice(*found.data.notices)
     if to.as_json:
         click.echo(json_text(content(found, to.path)), nl=False)
@@ -100,6 +101,12 @@ def import_command(
     show(found.files(), *found.columns())
     click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
     return 0
+
+
+def readable(text: str, path: Path | None) -> str:
+    """CSV that is about to be written, if it can be read again.  Raises DataError."""
+    measurements_in(rows_in(text, path or ""))
+    return text
 
 
 def content(found: Imported, output: Path | None) -> dict[str, object]:

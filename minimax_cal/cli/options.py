@@ -109,8 +109,8 @@ def option_of(name: str, default: Any, told: Option) -> Decorator:
     def in_si(_: click.Context, __: click.Parameter, given: Any) -> Any:
         if told.many:
             return told.many(map(read, given) if told.read else names_of(given))
-        if isinstance(given, float) and MOST < abs(given) < inf:
-            raise click.BadParameter(f"{given:g} cannot be; at most {MOST:g}")
+        if isinstance(given, float) and (isnan(given) or MOST < abs(given) < inf):
+            raise click.BadParameter(f"{given:g} cannot be; give a finite number, at most {MOST:g}")
         return default if given is None else read(given)
 
     return click.option(

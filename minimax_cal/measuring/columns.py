@@ -85,7 +85,11 @@ class Rows:
 
 def read_rows(path: Path | str) -> Rows:
     """Read a CSV file.  Raises DataError where it is none."""
-    text = read_text(path, kind=DataError)
+    return rows_in(read_text(path, kind=DataError), path)
+
+
+def rows_in(text: str, path: Path | str) -> Rows:
+    """The rows of CSV that is, or shall be, in a file.  Raises DataError where it is none."""
     digest = hashlib.sha256(text.encode()).hexdigest()
     if "\0" in text:
         raise DataError(f"{path}: is not a text file; expected CSV")

@@ -220,13 +220,18 @@ def split(
     return data.take(~held), data.take(held), notices
 
 
+def check_chance(holdout: float, seed: int) -> None:
+    """Raise OptionError for a share of poses, or a seed, that cannot be."""
+    check_seed(seed)
+    if not 0.0 <= holdout < 1.0:
+        raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
+
+
 def held_out(
     data: Measurements, holdout: float, seed: int, by: str | None = None
 ) -> tuple[Array, tuple[str, ...]]:
     """(m,) True for rows that no fit may see, and notices.  As `split`."""
-    check_seed(seed)
-    if not 0.0 <= holdout < 1.0:
-        raise OptionError(f"holdout {holdout:g} is not a fraction; give 0 <= holdout < 1, as 0.2")
+    check_chance(holdout, seed)
     if "split" in data.columns and by is None:
         return told_to_hold(data)
     group = grouped(data, by)

@@ -18,6 +18,7 @@ from minimax_cal.measuring.columns import (
     JOINT,
     TARGET,
     TEXT,
+    Rows,
     header_check,
     near,
     optional_kind,
@@ -196,8 +197,12 @@ def read_measurements(path: Path | str) -> Measurements:
 
     >>> data = mc.read_measurements("poses.csv")
     """
-    file = read_rows(path)
-    header = file.header
+    return measurements_in(read_rows(path))
+
+
+def measurements_in(file: Rows) -> Measurements:
+    """The measurements in a file's rows.  Raises DataError."""
+    path, header = file.path, file.header
     header_check(path, header)
     q, sliding = whole_rows(file).joints()
     found = sorted({int(m[1]) for name in header if (m := TARGET.fullmatch(name))})

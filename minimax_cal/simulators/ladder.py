@@ -18,6 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.transforms import inverse
@@ -59,6 +60,7 @@ def simulator_gap(
     >>> print(mc.simulator_gap("arm.xml", "poses.csv", write="corrected.xml").summary())
     """
     began = time.perf_counter()
+    check_chance(holdout, seed)
     if write is not None:
         check_writable(write, (".xml", ".mjcf"))
     mujoco()

@@ -130,7 +130,7 @@ def test_a_lever_that_cannot_be_is_refused(
     assert "must be positive and finite" in line
     for option in ("--lever", "--tolerance"):
         line = refused(capsys, "compensate", "fit.json", "targets.csv", option, "1e308")
-        assert "cannot be; at most 1e+12" in line
+        assert "cannot be; give a finite number, at most 1e+12" in line
     assert "cannot be" in refused(capsys, "plan", "irb120", "--poses", 9, "--noise", "-1e300")
 
 
@@ -414,3 +414,29 @@ def test_xml_in_another_encoding_than_it_says_is_refused(code: str, tmp_path: Pa
     path.write_bytes(f'<?xml version="1.0" encoding="{other}"?><mujoco/>'.encode(code))
     with pytest.raises(mc.CalibrationError, match=r"arm\.xml"):
         parsed(path)
+
+
+def test_import_writes_nothing_that_cannot_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What was left of a target could not be used, which was seen after writing."""
+    header, *rows = material()["data.csv"].decode().splitlines()
+    out, data = tmp_path / "out.csv", tmp_path / "data.csv"
+    data.write_text("\n".join([header, *rows[:4]]))
+    lines = ",".join(f"{n}:smr2" for n in range(2, 6))
+    line = refused(capsys, "import", data, "--leave-out", lines, "-o", out)
+    assert "smr2 is measured at no pose" in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("options", [("--holdout", "nan"), ("--holdout", 7), ("--seed", -1)])
+def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(
+    options: tuple[object, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A given fit has its split; the odd share went into the answer."""
+    pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
+    for name in ("arm.xml", "data.csv", "fit.json"):
+        (tmp_path / name).write_bytes(material()[name])
+    files = [tmp_path / name for name in ("arm.xml", "data.csv")]
+    told = refused(capsys, "gap", *files, "--fit", tmp_path / "fit.json", *options, "--json")
+    assert str(options[0]).strip("-") in told
