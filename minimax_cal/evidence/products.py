@@ -162,7 +162,8 @@ class Sums:
         step = max(1, BLOCK // (g * max(n, 1)))
         for i in range(0, len(few), step):
             block = few[i : i + step, None] * self.weights
-            out[i : i + step] = (block.reshape(-1, n) @ many.T).reshape(-1, g, len(many))
+            flat = block.reshape(len(block) * g, n) @ many.T  # of no rows 0
+            out[i : i + step] = flat.reshape(len(block), g, len(many))
         return out
 
     def among(self, index: Array) -> Array:

@@ -39,6 +39,7 @@ from minimax_cal.solvers.status import Status
 
 BUNDLES = 2000  # more poses than these are drawn in bundles
 LEAST = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
+MOST = 100_000  # replicates: of 2000 poses their draws fill 1.6 GB
 MOST_LOST = 0.5  # of the replicates
 TOGETHER = 250  # replicates of a minimax that are solved at once
 BATCH = 64  # replicates whose Gram matrices are kept at a time
@@ -148,8 +149,8 @@ def bootstrap(
 
     >>> print(mc.bootstrap(fit, replicates=200).table().text())
     """
-    if replicates < 2:
-        raise OptionError(f"{replicates} replicates: give 2 or more, 500 as a rule")
+    if not 2 <= replicates <= MOST:
+        raise OptionError(f"{replicates} replicates: give 2 to {MOST}, 500 as a rule")
     check_seed(seed)
     if fit.objective == "point":
         raise OptionError(

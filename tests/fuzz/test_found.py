@@ -440,3 +440,21 @@ def test_a_share_that_cannot_be_is_refused_where_it_is_not_needed(
     files = [tmp_path / name for name in ("arm.xml", "data.csv")]
     told = refused(capsys, "gap", *files, "--fit", tmp_path / "fit.json", *options, "--json")
     assert str(options[0]).strip("-") in told
+
+
+def test_more_replicates_than_memory_holds_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "data.csv").write_bytes(material()["data.csv"])
+    line = refused(capsys, "calibrate", "irb120", tmp_path / "data.csv", "--objective", "sum",
+                   "--bootstrap", 10**20)  # fmt: skip
+    assert "give 2 to 100000" in line
+
+
+def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path: Path) -> None:
+    """Of the 12 training poses it left out none, and products of no rows were a traceback."""
+    path = tmp_path / "data.csv"
+    path.write_bytes(material()["data.csv"])
+    found = mc.diagnose("irb120", path, holdout=0.5)
+    assert found.beyond.folds
+    assert np.isfinite(found.beyond.typical_mm)

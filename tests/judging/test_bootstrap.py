@@ -269,7 +269,8 @@ def test_progress_is_told(fit: mc.Fit) -> None:
 @pytest.mark.parametrize(
     ("objective", "options", "say"),
     [
-        ("sum", {"replicates": 1}, "give 2 or more"),
+        ("sum", {"replicates": 1}, "give 2 to 100000"),
+        ("sum", {"replicates": 10**6}, "give 2 to 100000"),
         ("sum", {"seed": -1}, "seed -1"),
         ("point", {}, "objective point rests on the few worst points"),
     ],
