@@ -32,8 +32,8 @@ def check_joints(robot: Robot, data: Measurements) -> None:
             f"{data.source}: joint {i + 1} of {robot.name} {kind}; name its column "
             f"q{i + 1}_{mend}, not q{i + 1}_{unit}"
         )
-    limit = np.where(robot.prismatic, np.inf, np.maximum(TURNS, 2.0 * span(robot)))
-    beyond = np.abs(data.q) > limit
+    limit = np.where(robot.prismatic, np.inf, np.maximum(0.5 * TURNS, span(robot)))
+    beyond = 0.5 * np.abs(data.q) > limit
     if beyond.any():
         row, joint = np.argwhere(beyond)[0]
         raise DataError(

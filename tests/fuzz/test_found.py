@@ -6,6 +6,7 @@ import base64
 import errno
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
 from minimax_cal.ground.files import json_of
 from minimax_cal.ground.records import Packed, packed, unpacked
+from minimax_cal.measuring.checks import check_joints
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.reporting.plots.figures import new_figure, save
 from minimax_cal.robots.ranges import near_zero
@@ -458,3 +460,11 @@ def test_a_part_of_held_out_poses_alone_judges_a_diagnosis(tmp_path: Path) -> No
     found = mc.diagnose("irb120", path, holdout=0.5)
     assert found.beyond.folds
     assert np.isfinite(found.beyond.typical_mm)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_joint_limit_beyond_all_numbers_is_no_warning() -> None:
+    """Twice 1e308 overflowed."""
+    robot = mc.load_robot("irb120")
+    upper = np.where(np.arange(6) == 0, 1e308, robot.upper)
+    check_joints(replace(robot, upper=upper), simulate(robot, poses=9).data)
