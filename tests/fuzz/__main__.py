@@ -2,6 +2,7 @@
 
 python -m tests.fuzz --cases 10000 --seed 7          # the table, as docs/reliability.md has it
 python -m tests.fuzz --seed 7 --only 4711            # one of them again, with its files
+python -m tests.fuzz --each-option                   # every option with every odd value
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from .cases import case
+from .cases import EACH, case, each_option
 from .running import GOOD, KINDS, Outcome, outcome, outcomes
 
 
@@ -51,16 +52,19 @@ def show(seed: int, number: int) -> None:
 def main() -> int:
     """Run them; 1 where something is none of GOOD."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--cases", type=int, help="default: 300, of --each-option all")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int)
+    parser.add_argument("--each-option", dest="seed", action="store_const", const=EACH)
     chosen = parser.parse_args()
+    whole = len(each_option()) - chosen.first if chosen.seed == EACH else 300
+    count = whole if chosen.cases is None else chosen.cases
     if chosen.only is not None:
         show(chosen.seed, chosen.only)
         return 0
     began, found = time.perf_counter(), list[Outcome]()
-    numbers = range(chosen.first, chosen.first + chosen.cases)
+    numbers = range(chosen.first, chosen.first + count)
     with suppress(KeyboardInterrupt):  # what was found until then
         for each in outcomes(chosen.seed, numbers):
             found.append(each)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import click
@@ -65,6 +67,7 @@ TEMPLATES = (
     "robots --json",
     "backends --json",
 )
+EACH = -1  # in place of a seed
 KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some changes is known
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
@@ -107,7 +110,11 @@ class Case:
 
 
 def case(seed: int, number: int) -> Case:
-    """The hostile run of that number."""
+    """The hostile run of that number.  seed: EACH for those of `each_option`."""
+    if seed == EACH:
+        words = each_option()[number]
+        said = " ".join(words[len(words) - 2 :])[:60]
+        return Case(number, seed, words, dict(material()), (said,))
     rng = np.random.default_rng([seed, number])
     rates = np.array([RATES.get(line.split()[0], 1.0) for line in TEMPLATES])
     line = TEMPLATES[int(rng.choice(len(TEMPLATES), p=rates / rates.sum()))]
@@ -129,6 +136,34 @@ def case(seed: int, number: int) -> Case:
         else:
             broke.append(place(words, rng))
     return Case(number, seed, tuple(words), files, tuple(broke))
+
+
+@cache
+def each_option() -> tuple[tuple[str, ...], ...]:
+    """Every command line with every option of the command and every odd value, or odd output."""
+    out = []
+    for line in TEMPLATES:
+        words = tuple("irb120" if word == "ROBOT" else word for word in line.split())
+        for flag, values in odd_options(words[0]):
+            out.append((*words, flag, *values))
+        for where in PLACES:
+            at = words.index("-o") if "-o" in words else len(words)
+            out.append((*words[:at], "-o", where, *words[at + 2 :]))
+    return tuple(out)
+
+
+def odd_options(command: str) -> Iterator[tuple[str, list[str]]]:
+    """The options of a command with each odd value, and with each choice there is."""
+    for part in cli.commands[command].params:
+        if not isinstance(part, click.Option) or "--pdf" in part.opts:  # which starts a browser
+            continue
+        flag = max(part.opts, key=len)
+        if part.is_flag:
+            yield flag, []
+            continue
+        choices = part.type.choices if isinstance(part.type, click.Choice) else ()
+        for value in (*choices, *VALUES):
+            yield flag, [str(value)] * part.nargs
 
 
 def known(seed: int, number: int, words: list[str], files: dict[str, bytes], rng: Rng) -> Case:

@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,11 +20,12 @@ from hypothesis import strategies as st
 
 import minimax_cal as mc
 from minimax_cal.cli import main
+from minimax_cal.cli.running import cli
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.robots.robot import robot_from_dict
 
 from .__main__ import lines
-from .cases import TEMPLATES, Case, case
+from .cases import EACH, TEMPLATES, Case, case, each_option
 from .known import FATAL, HARMLESS, disagreement, with_known
 from .material import material
 from .running import GOOD, Outcome, judged, outcomes
@@ -151,6 +153,18 @@ def test_the_independent_code_knows_the_arm_before_calibration(
     assert json.loads(answer)["rung"] == "nominal"
     assert disagreement(answer, data, fit, nominal=True) == ""
     assert disagreement(answer, data, fit).startswith("says")
+
+
+def test_every_option_of_every_command_is_among_the_cases() -> None:
+    lines = each_option()
+    given = {(words[0], flag) for words in lines for flag in words}
+    for name in {line.split()[0] for line in TEMPLATES}:
+        for part in cli.commands[name].params:
+            if isinstance(part, click.Option) and "--pdf" not in part.opts:
+                assert (name, max(part.opts, key=len)) in given
+    assert len(set(lines)) == len(lines)
+    some = range(0, len(lines), len(lines) // 20)
+    assert bad(list(outcomes(EACH, some))) == []
 
 
 @pytest.mark.parametrize("way", [*HARMLESS, *FATAL])
