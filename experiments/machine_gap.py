@@ -148,7 +148,8 @@ def score(asked: Asked, made: Made, said: Row) -> Row:
     power = np.array(made.powers)
     gap = said.get("gap", {})
     count = len(made.truth)
-    beside = [name for name in names if not (asked.off and name[0] == "outliers")]
+    there = {"outliers": asked.off, "frame_drift": asked.creep}  # and small, but no wrong names
+    beside = [name for name in names if name in made.truth or not there.get(name[0])]
     return {
         "condition": asked.condition,
         "asked": [asked.robot, asked.poses, asked.spread, asked.targets,

@@ -35,7 +35,12 @@ from experiments import speed_peers, sweep
 from experiments.speed_peers import Raw
 from experiments.sweep import Study, study_options
 from minimax_cal.fitting import identify, start
-from minimax_cal.fitting.minimax_problem import MinimaxProblem, measured_distances, minimax_problem
+from minimax_cal.fitting.minimax_problem import (
+    Distances,
+    MinimaxProblem,
+    measured_distances,
+    minimax_problem,
+)
 from minimax_cal.fitting.options import solver_of
 from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.tables import Table
@@ -118,9 +123,9 @@ def worst_target(case: Case) -> float:
     return minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0]).value * problem.size
 
 
-def worst_point(case: Case, begin: State, data: Measurements) -> float:
+def worst_point(case: Case, begin: State, kept: Distances) -> float:
     """Our least worst point from a least-squares fit, distances left free [m]."""
-    problem = minimax_problem(case.model, begin, measured_distances(data), "off", "point")
+    problem = minimax_problem(case.model, begin, kept, "off", "point")
     found = minimax.solve(problem, begin, solver_of("daqp", QP_TOLERANCE)[0])
     return float(np.sqrt(found.value * problem.size))
 
@@ -203,8 +208,8 @@ def points(seed: int, counts: tuple[int, ...]) -> dict[str, float]:
     out: dict[str, float] = {}
     for count in counts:
         case, data = case_of(count // 3, seed), simulated(count // 3, seed)
-        begin = squares(case)
-        runs: dict[str, Run] = {f"point_{count}": lambda: worst_point(case, begin, data)}  # noqa: B023
+        begin, kept = squares(case), measured_distances(data)
+        runs: dict[str, Run] = {f"point_{count}": lambda: worst_point(case, begin, kept)}  # noqa: B023
         raw = raw_of(case, data)
         if there("cvxpy"):
             first = speed_peers.gauss_newton(raw)
@@ -212,7 +217,7 @@ def points(seed: int, counts: tuple[int, ...]) -> dict[str, float]:
             end = raw.rows(speed_peers.cones(raw, first))[0]
             out[f"point_{count}_cvxpy"] = time.process_time() - began
             largest = float(np.sqrt((end**2).sum(axis=0)).max())
-            alike("worst point", {"ours": worst_point(case, begin, data), "cvxpy": largest})
+            alike("worst point", {"ours": worst_point(case, begin, kept), "cvxpy": largest})
             if count <= 300:
                 runs[f"point_{count}_cvxpy"] = lambda: speed_peers.cones(raw, first)  # noqa: B023
         out |= race(runs, 3)

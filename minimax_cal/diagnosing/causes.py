@@ -17,7 +17,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import CERTAIN, ENOUGH, EXACT
+from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
@@ -61,7 +61,7 @@ def causes_of(
     progress("effects")
     lib, choice = chosen(study, exclude)
     traces = left_by(study, choice)
-    left = any(trace.p * len(traces) < CERTAIN for trace in traces)  # each joint would absorb it
+    left = any(trace.p * len(traces) < STRUCTURE for trace in traces)  # each joint would absorb it
     plain, study = study, weighed_anew(study, choice.known, each=not left)
     if study is not plain:
         progress("effects beside noises that differ")
@@ -99,8 +99,8 @@ def named_in(choice: Choice) -> list[Named]:
     out = []
     for candidate, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
         motion = choice.library.columns[:, candidate.main].T
-        motion = motion if len(motion) <= FEW else (value @ motion)[None]
-        out.append(Named(candidate.term, motion))
+        whole = value @ motion
+        out.append(Named(candidate.term, motion if len(motion) <= FEW else whole[None], whole))
     return out
 
 

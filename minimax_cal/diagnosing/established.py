@@ -9,11 +9,24 @@ from scipy.stats import chi2
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.evidence.alternatives import alternatives
+from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import AGAIN, DIFFER, FOLDS, MOST, SAME
+from minimax_cal.evidence.limits import (
+    AGAIN,
+    ASKED,
+    DIFFER,
+    DWARFED,
+    ENOUGH,
+    FOLDS,
+    HALF,
+    MOST,
+    SAME,
+)
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.table import EFFECTS
 
 
 def judged_again(
@@ -26,12 +39,31 @@ def judged_again(
     if not findings:
         return []
     part = folds(data, FOLDS)
-    times = [0] * len(findings)
+    told: list[list[bool]] = [[] for _ in findings]
     for number in range(FOLDS):
         choice = select(library.only(part != number), ripple=ripple, level=AGAIN, seldom=MOST)
-        times = [n + is_found(one, choice, whole) for n, one in zip(times, findings, strict=True)]
-    pairs = zip(findings, times, strict=True)
-    return [replace(one, again=n / FOLDS) for one, n in pairs]
+        for one, known in zip(findings, told, strict=True):
+            found = is_found(one, choice, whole)
+            known += [found] if found or shows(one, choice, whole) else []
+    return [
+        replace(one, again=share(known), dwarfed=any(dwarfs(other, one) for other in findings))
+        for one, known in zip(findings, told, strict=True)
+    ]
+
+
+def share(found: Sequence[bool]) -> float:
+    """How often an effect was found in the parts that could show it; too few of them show none."""
+    return sum(found) / len(found) if len(found) >= ASKED else 0.0
+
+
+def dwarfs(large: Finding, small: Finding) -> bool:
+    """Whether an effect may be what the law of a far larger one lacks: of the same course.
+
+    How the time, or the way to a pose, acts on a machine no formula tells to the per cent.
+    """
+    one, other = (EFFECTS[found.term.effect] for found in (large, small))
+    alike = one.follows == other.follows == "time" or (one.of_move and other.of_move)
+    return alike and small.size < DWARFED * large.size
 
 
 def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
@@ -42,10 +74,37 @@ def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
     if not own:  # all joints hold one, too
         alike = {candidate.key for candidate in choice.chosen}
         wide = any(name == effect and "all" in (place, other) for name, other in alike)
-        return wide or bool(alike & rivals)
+        return wide or bool(alike & rivals) or is_rival(finding, choice)
     if own.keys() != before.keys():
         return True  # another variant of the law, or another of its lines
     return all(agree(own[text], before[text]) for text in own)
+
+
+def is_rival(finding: Finding, choice: Choice) -> bool:
+    """Whether an effect that a part names instead cannot be told from this one there."""
+    pairs = zip(choice.benches, choice.fits, strict=True)
+    return any(
+        other.candidate.key == finding.term.key
+        for table, one in pairs
+        for other, _, _ in alternatives(table, one)
+    )
+
+
+def shows(finding: Finding, choice: Choice, whole: Choice) -> bool:
+    """Whether a part, as noisy as it is, has enough of an effect as large as before.
+
+    One that holds less than half of what all poses show of it, and little, is no test of its name:
+    the poses that it lacks, the end of a joint, are those that tell.
+    """
+    term = finding.term
+    one = next((fit for fit in whole.fits if fit.candidate.term == term), None)
+    if one is None:
+        return True
+    before = {candidate.key for candidate in whole.chosen} - {term.key}
+    table = bench(choice.library, [c for c in choice.chosen if c.key in before])
+    there = replace(one, ratio=table.settings.ratios[0], variance=choice.noise.variance)
+    size, _ = table.likeness(there, one.candidate)
+    return size > min(ENOUGH, HALF * finding.size)
 
 
 def estimates_of(finding: Finding, choice: Choice) -> dict[str, tuple[Array, Array]]:

@@ -58,6 +58,9 @@ def probes(scene: Scene) -> Iterator[Probe]:
         u, v = unit(load[j]), unit(move[j])
         carried = [u, u**2, u**3] if u.any() else []
         led = [side[j], v, np.abs(v), v * np.abs(v)] if side[j].any() else []
+        if led and j in circle:
+            turned = [side[j], *(side[j] * row for row in circle[j][:2])]
+            yield Probe(f"{name} with its approach and angle", motion, np.array(turned))
         if carried or led:
             yield Probe(f"{name} with its load or last move", motion, np.array([*carried, *led]))
     first = angles[:3]
@@ -176,10 +179,29 @@ def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """An effect that was named.  motion: (d, N) rows of its motion, as fitted or in its parts."""
+    """An effect that was named.
+
+    motion: (d, N) rows of its motion, as fitted or in its parts.  whole: (N,) as fitted.
+    """
 
     term: Term
     motion: Array
+    whole: Array
+
+    @property
+    def joint(self) -> int | None:
+        """The joint, from 0, or the link's joint, where it has one."""
+        place = self.term.place
+        return int(place[1:]) - 1 if place[:1] in "JL" and place[1:].isdigit() else None
+
+    def size(self, scene: Scene, rows: Rows) -> Array:
+        """(m,) how much there is of it at each pose, at most 1: of a joint's effect its angle."""
+        m, r = rows.weight.shape
+        size = np.linalg.norm(self.whole.reshape(m, r), axis=1)
+        if self.joint is not None:
+            lever = rows.of(scene.jacobian[[self.joint]]).reshape(m, r)
+            size = size / np.maximum(np.linalg.norm(lever, axis=1), 1e-300)
+        return unit(size)
 
 
 def doubted(scene: Scene, named: Named) -> Iterator[tuple[str, Array]]:
@@ -187,8 +209,7 @@ def doubted(scene: Scene, named: Named) -> Iterator[tuple[str, Array]]:
 
     Each with its functions (f, m).
     """
-    place, name = named.term.place, named.term.label
-    joints = [int(place[1:]) - 1] if place[:1] in "JL" and place[1:].isdigit() else []
+    name, joints = named.term.label, [] if named.joint is None else [named.joint]
     angles = [j for j in joints or range(min(scene.joints, 3)) if j in turning(scene)]
     if angles:
         yield f"{name} with angle", np.concatenate([wave(scene.q[j], 1) for j in angles])
@@ -222,6 +243,10 @@ def structure(
             spread = np.repeat(functions, r, axis=1) * rest.root
             features = (one.motion[:, None] * spread).reshape(-1, len(rest.root)).T
             found.append(Trace(name, *share(features, rest)))
+        size = one.size(scene, rows)  # a law that is not in proportion to what drives it
+        spread = np.repeat([size, size**2], r, axis=1) * rest.root
+        found.append(Trace(f"{one.term.label} with its own size",
+                           *share((one.whole * spread).T, rest)))  # fmt: skip
     found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
     found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
     return tuple(found)

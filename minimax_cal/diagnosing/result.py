@@ -88,7 +88,8 @@ class Finding:
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
     told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
-    was found again.  curve: (3, g) of an error map: joint value, turn, sigma [rad].
+    was found again.  dwarfed: whether it may be what the law of a far larger effect lacks.
+    curve: (3, g) of an error map: joint value, turn, sigma [rad].
     """
 
     terms: tuple[Term, ...]
@@ -106,12 +107,13 @@ class Finding:
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
     again: float = 1.0
+    dwarfed: bool = False
     curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
 
     @property
     def established(self) -> bool:
-        """Whether it was found again whichever poses were left out."""
-        return self.again >= FIRM
+        """Whether it was found again whichever poses were left out, and stands by itself."""
+        return self.again >= FIRM and not self.dwarfed
 
     @property
     def term(self) -> Term:

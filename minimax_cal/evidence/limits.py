@@ -34,9 +34,12 @@ FOLDS = 5  # fifths of the groups of poses
 AGAIN = 0.2  # chance of a false name in four fifths: the name is known, only its place is contested
 DIFFER = 1e-3  # chance that parameters of four fifths differ so much from those of all poses
 SAME = 0.05  # of their square: a smaller difference is none, however sure they are (real arms)
+ASKED = 3  # parts at least that can show an effect, or nothing is said of it
 FIRM = 1.0  # share of the parts without which an effect is found again, to be established
 WEAK = 0.8  # the same, for what is found less often not to be in the model (study: with 0.5 two of
 # four models that met new poses worse than geometry held such an effect)
+DWARFED = 0.05  # of a larger effect's lambda, both driven by the time or both by the way: below it
+# an effect may be what the larger one's law lacks (study: growth of two time constants, 0.01, 0.04)
 
 # ---- what is unknown -----------------------------------------------------------------------------
 
@@ -45,4 +48,5 @@ MATTERS = 0.015  # share of what was explained below which structure is of no ac
 # machines are not quite ours (study, saturating and loaded forms), real arms leave 1 %
 WORTH = 0.02  # of the noise: structure that would lower the RMS by less than 1 % is of no account
 CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
-HALF = 0.5  # of the predictable gap, which what is established must close
+HALF = 0.5  # of the predictable gap, which what is established must close; of an effect, below
+# which a part of the poses is no test of it

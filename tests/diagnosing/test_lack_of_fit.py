@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems_fit import study
 from scipy import stats
 
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.lack_of_fit import repeats, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, repeats, rest_of, structure
+from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.noise import Noise, restricted
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.table import Term
 
 
 def test_probabilities_are_right_on_noise() -> None:
@@ -89,3 +93,43 @@ def test_poses_that_are_off_are_no_lack_of_fit() -> None:
     assert repeats(scene, rest_of(replace(made.rows, error=off), noise, none))[0] > 0.01
     bent += 1e-5 * np.sin(5.0 * q[:, :1])
     assert repeats(scene, rest_of(replace(made.rows, error=bent.ravel()), noise, none))[0] < 1e-3
+
+
+def of_joint(made: Study, joint: int, turn: Array) -> Array:
+    """(N,) rows of a joint that turns by so much (m,) [rad]."""
+    return made.rows.of((turn * made.scene.jacobian[joint])[None])[:, 0]
+
+
+@pytest.mark.parametrize(("power", "heard"), [(1, False), (3, True)])
+def test_a_law_that_is_not_in_proportion_leaves_a_trace(power: int, heard: bool) -> None:
+    """A joint that gives way as the cube of its load, named a compliance."""
+    made, noise = study(6e-6, 1.0, 3), Noise(0.1, 1e-10, 0.0)
+    rng, load = (
+        np.random.default_rng(2),
+        made.scene.gravity[1] / np.abs(made.scene.gravity[1]).max(),
+    )
+    spread = np.sqrt(1.0 / noise.weights(made.rows))
+    error = spread * rng.normal(size=len(spread)) + of_joint(made, 1, 6e-4 * load**power)
+    rows = replace(made.rows, error=error)
+    column = of_joint(made, 1, load)
+    named = Named(Term("joint_compliance", "J2"), column[None], column)
+    assert_allclose(named.size(made.scene, rows), np.abs(load), rtol=1e-9)
+    found = structure(made.scene, rows, noise, column[:, None], [named])
+    (own,) = (trace for trace in found if trace.name.endswith("with its own size"))
+    assert (own.p < 1e-6) == heard
+    assert heard or own.p > 0.01
+
+
+def test_play_in_one_sector_leaves_a_trace() -> None:
+    """By a question of three functions, where those of load and move by themselves ask seven."""
+    made, noise = study(6e-6, 1.0, 3), Noise(0.1, 1e-10, 0.0)
+    q, side = made.scene.q[2], made.scene.each("approach")[2]
+    turn = 5e-5 * np.where(q < np.median(q), side, 0.0)
+    spread = np.sqrt(1.0 / noise.weights(made.rows))
+    error = spread * np.random.default_rng(2).normal(size=len(spread)) + of_joint(made, 2, turn)
+    found = structure(
+        made.scene, replace(made.rows, error=error), noise, np.zeros((len(spread), 0))
+    )
+    first = min(found, key=lambda trace: trace.p)
+    assert first.name == "J3 with its approach and angle"
+    assert first.p * len(found) < 0.005

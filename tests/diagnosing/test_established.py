@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from problems_fit import study_of
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.established import dwarfs, is_found, is_rival, share, shows
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.alternatives import alternatives
+from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.modelling.effects.table import Term
+
+
+def found(effect: str, place: str, size: float) -> Finding:
+    return Finding((Term(effect, place),), ("x",), ("1",), (1.0,), (0.1,), size, 1e-9)
+
+
+def test_a_small_effect_of_the_same_course_is_dwarfed() -> None:
+    warm = found("thermal_growth", "all", 4000.0)
+    assert dwarfs(warm, found("frame_drift", "frame", 100.0))
+    assert not dwarfs(warm, found("frame_drift", "frame", 400.0))
+    assert not dwarfs(warm, found("gear_error", "J2", 100.0))
+    assert dwarfs(found("settling", "all", 4000.0), found("backlash", "J1", 100.0))
+
+
+def test_what_is_dwarfed_is_not_established() -> None:
+    drift = found("frame_drift", "frame", 100.0)
+    assert drift.established
+    assert not replace(drift, dwarfed=True).established
+    assert not replace(drift, again=0.8).established
+
+
+def test_a_part_that_cannot_show_an_effect_is_no_test_of_it() -> None:
+    assert share([True, True, True]) == 1.0
+    assert share([True, True, True, False]) == 0.75
+    assert share([True, True]) == 0.0  # three parts at least must ask
+    assert share([]) == 0.0
+
+
+@pytest.fixture(scope="module")
+def geared() -> tuple[Study, Library]:
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 300.0),), seed=4)))
+    return study, library(study.scene, study.rows)
+
+
+def named(choice: Choice, *key: str) -> Finding:
+    one = next(fit for fit in choice.fits if fit.candidate.key == key)
+    size, _ = choice.benches[choice.fits.index(one)].likeness(one, one.candidate)
+    return replace(found(*key, size), terms=(one.candidate.term,))
+
+
+def test_an_effect_is_shown_by_poses_that_turn_its_joint(geared: tuple[Study, Library]) -> None:
+    """And not by a fifth of the sweep, in which one wave a turn is what geometry does."""
+    study, lib = geared
+    whole = select(lib)
+    effect = named(whole, "gear_error", "J1")
+    q = study.data.q[:, 0]
+    order = np.argsort(np.argsort(q))
+    some = select(lib.only(order % 5 != 0))
+    assert shows(effect, some, whole)
+    assert is_found(effect, some, whole)
+    few = select(lib.only(np.abs(order - len(q) / 2) < 0.1 * len(q)))
+    assert not shows(effect, few, whole)
+
+
+def test_an_effect_is_found_where_its_rival_is_named(geared: tuple[Study, Library]) -> None:
+    study, lib = geared
+    whole = select(lib)
+    effect = replace(named(whole, "gear_error", "J1"), alternatives=())
+    candidates = tuple(c for c in lib.candidates if c.term.effect != "gear_error")
+    other = select(replace(lib, candidates=candidates))
+    assert other.chosen
+    # told without gears it is another's, and where gears are among the rivals it is found
+    assert not is_rival(effect, other)
+    half = lib.only(study.data.q[:, 0] < np.median(study.data.q[:, 0]))
+    choice = select(half)
+    rivals = {a.candidate.key for t, one in zip(choice.benches, choice.fits, strict=True)
+              for a, _, _ in alternatives(t, one)}  # fmt: skip
+    assert is_rival(effect, choice) == (("gear_error", "J1") in rivals)

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems_fit import study_of
+from scipy.optimize import minimize_scalar
+from scipy.stats import multivariate_normal
+
+from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.joint import joint
+from minimax_cal.diagnosing.sizes import unsized, weights_of
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.joint_fit import extended
+
+GEAR = Term("gear_error", "J2", {"turns": 1.0})
+
+
+@pytest.fixture(scope="module")
+def geared() -> Study:
+    return study_of(make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4)))
+
+
+def linear(study: Study, *terms: Term) -> tuple[Poses, np.ndarray]:
+    base = study.model.only(study.fit.identification.active)
+    model, state = extended(base, study.robot, study.data, study.fit.state, terms)
+    return Poses.of(Estimator(model, np.ones(len(model.y))), state), state.effects
+
+
+def test_the_size_is_the_likeliest(geared: Study) -> None:
+    """Against the marginal likelihood of the same linear model, maximised by SciPy."""
+    poses, values = linear(geared, GEAR)
+    weight = weights_of(poses, values, [slice(0, 2)])
+    columns, e = poses.jacobian.reshape(-1, poses.jacobian.shape[2]), poses.error.reshape(-1)
+    motion = columns[:, -2:]
+    motion = motion / np.linalg.norm(motion, axis=0)
+    plain = np.linalg.svd(columns[:, :-2], full_matrices=True)
+    rest = plain[0][:, np.linalg.matrix_rank(columns[:, :-2]) :]  # what geometry cannot do
+    y, f = rest.T @ e, rest.T @ motion
+    variance = float(e @ e) / (len(e) - columns.shape[1])
+
+    def unlikely(log: float) -> float:
+        covariance = variance * np.eye(len(y)) + np.exp(log) * f @ f.T
+        return -float(multivariate_normal.logpdf(y, np.zeros(len(y)), covariance))
+
+    best = minimize_scalar(unlikely, bounds=np.log([1e-6 * variance, 1e6 * variance]))
+    size = np.linalg.norm(columns[:, -2:], axis=0)
+    # 20 rounds of expectation and maximisation come within a per cent
+    assert_allclose(weight, variance / np.exp(best.x) * size**2, rtol=2e-2)
+
+
+def test_what_the_data_tell_is_left_alone(geared: Study) -> None:
+    found = joint(geared, (GEAR,))
+    poses, _ = linear(geared, GEAR)
+    gram = poses.bread
+    free = np.linalg.lstsq(gram, poses.pull + poses.prior * poses.off, rcond=None)[0][-2:]
+    sigma = np.sqrt(np.diag(np.linalg.pinv(gram, hermitian=True))[-2:])
+    sigma *= np.sqrt((poses.error**2).mean())
+    assert (np.abs(found.state.effects - free) < 0.3 * sigma).all()
+
+
+def test_what_the_data_do_not_tell_stays_small(geared: Study) -> None:
+    """An effect that is not there: its square falls well below that of least squares."""
+    other = Term("gear_error", "J5", {"turns": 1.0})
+    poses, values = linear(geared, GEAR, other)
+    weight = weights_of(poses, values, [slice(0, 2), slice(2, 4)])
+    gram, pull = poses.bread, poses.pull + poses.prior * poses.off
+    prior = np.concatenate([np.zeros(len(gram) - 4), weight])
+    free, held = (np.linalg.solve(gram + np.diag(w), pull)[-2:] for w in (0.0 * prior, prior))
+    assert np.linalg.norm(held) < 0.7 * np.linalg.norm(free)
+
+
+def test_single_parameters_and_maps_have_none(geared: Study) -> None:
+    terms = (Term("backlash", "J2"), GEAR, Term("joint_compliance", "J2", {"parts": 128.0}))
+    assert unsized(terms, geared.scene) == [slice(1, 3)]
+    poses, values = linear(geared, terms[0])
+    assert not weights_of(poses, values, []).any()
