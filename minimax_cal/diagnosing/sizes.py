@@ -17,6 +17,7 @@ from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.solvers.least_squares import solve_normal
 
 RIDGE = 1e-12  # of a unit field: what nothing tells stays finite
 ROUNDS = 20  # of expectation and maximisation
@@ -45,13 +46,14 @@ def weights_of(poses: Poses, values: Array, parts: Sequence[slice]) -> Array:
         return weight
     gram, pull = poses.bread, poses.pull + poses.prior * poses.off
     p = len(gram) - len(values)
-    across = np.linalg.lstsq(gram[:p, :p], gram[:p, p:], rcond=None)[0]
+    across = solve_normal(gram[:p, :p], gram[:p, p:])
     left = gram[p:, p:] - gram[p:, :p] @ across  # what geometry leaves of the effects
     size = np.sqrt(np.diag(gram)[p:])  # how far a unit moves all points
     left = left / np.outer(size, size)
     told = (pull[p:] - across.T @ pull[:p]) / size + left @ (values * size)
     square = float((poses.error**2).sum())
-    variance = square / max(3 * int(np.count_nonzero(poses.seen)) - len(gram), 1)
+    least = square - float(pull @ solve_normal(gram, pull[:, None])[:, 0])
+    variance = least / max(3 * int(np.count_nonzero(poses.seen)) - len(gram), 1)
     for part in parts:
         weight[part] = variance / square  # as if each might explain all that is left
     for _ in range(ROUNDS):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,9 +12,11 @@ from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import extended
 
+TOLERANCE = 2e-2
 GEAR = Term("gear_error", "J2", {"turns": 1.0})
 
 
@@ -21,32 +25,39 @@ def geared() -> Study:
     return study_of(make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4)))
 
 
-def linear(study: Study, *terms: Term) -> tuple[Poses, np.ndarray]:
-    base = study.model.only(study.fit.identification.active)
-    model, state = extended(base, study.robot, study.data, study.fit.state, terms)
+def linear(study: Study, *terms: Term, at: float = 0.0) -> tuple[Poses, Array]:
+    """The poses at a state whose effects are all of one value, and those values."""
+    base, state = study.model.only(study.fit.identification.active), study.fit.state
+    model, state = extended(base, study.robot, study.data, state, terms)
+    state = replace(state, effects=state.effects + at)
+    model, state = extended(base, study.robot, study.data, state, terms)
     return Poses.of(Estimator(model, np.ones(len(model.y))), state), state.effects
 
 
-def test_the_size_is_the_likeliest(geared: Study) -> None:
+@pytest.mark.parametrize("at", [0.0, 4e-5])
+@pytest.mark.parametrize("power", [300.0, 12.0])
+def test_the_size_is_the_likeliest(power: float, at: float) -> None:
     """Against the marginal likelihood of the same linear model, maximised by SciPy."""
-    poses, values = linear(geared, GEAR)
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J2", power),), seed=4)))
+    poses, values = linear(study, GEAR, at=at)
     weight = weights_of(poses, values, [slice(0, 2)])
+    poses, _ = linear(study, GEAR)  # a linear model is the same everywhere
     columns, e = poses.jacobian.reshape(-1, poses.jacobian.shape[2]), poses.error.reshape(-1)
-    motion = columns[:, -2:]
-    motion = motion / np.linalg.norm(motion, axis=0)
-    plain = np.linalg.svd(columns[:, :-2], full_matrices=True)
-    rest = plain[0][:, np.linalg.matrix_rank(columns[:, :-2]) :]  # what geometry cannot do
-    y, f = rest.T @ e, rest.T @ motion
-    variance = float(e @ e) / (len(e) - columns.shape[1])
+    size = np.linalg.norm(columns[:, -2:], axis=0)
+    u, s, _ = np.linalg.svd(columns[:, :-2], full_matrices=True)
+    rest = u[:, int(np.count_nonzero(s > 1e-9 * s[0])) :]  # what geometry cannot do
+    across, f = np.linalg.qr(rest.T @ (columns[:, -2:] / size))
+    y = across.T @ (rest.T @ e)  # all that tells the size: the rest is noise whatever it is
+    least = np.sum((rest.T @ e) ** 2) - y @ y
+    variance = float(least) / (len(e) - columns.shape[1])
 
     def unlikely(log: float) -> float:
-        covariance = variance * np.eye(len(y)) + np.exp(log) * f @ f.T
-        return -float(multivariate_normal.logpdf(y, np.zeros(len(y)), covariance))
+        covariance = variance * np.eye(2) + np.exp(log) * f @ f.T
+        return -float(multivariate_normal.logpdf(y, np.zeros(2), covariance))
 
     best = minimize_scalar(unlikely, bounds=np.log([1e-6 * variance, 1e6 * variance]))
-    size = np.linalg.norm(columns[:, -2:], axis=0)
-    # 20 rounds of expectation and maximisation come within a per cent
-    assert_allclose(weight, variance / np.exp(best.x) * size**2, rtol=2e-2)
+    # 20 rounds of expectation and maximisation come within two per cent
+    assert_allclose(weight, variance / np.exp(best.x) * size**2, rtol=TOLERANCE)
 
 
 def test_what_the_data_tell_is_left_alone(geared: Study) -> None:

@@ -11,7 +11,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library, library
-from minimax_cal.evidence.noise import Rows, orthonormal, restricted
+from minimax_cal.evidence.noise import FREE, Rows, orthonormal, restricted
 from minimax_cal.evidence.periodogram import sums
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
 from minimax_cal.evidence.selection import select
@@ -118,6 +118,18 @@ def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
     expected = restricted(alone, lib.columns[kept][:, index])
     assert_allclose(found.ratio, expected.ratio, rtol=1e-6)
     assert_allclose(found.variance, expected.variance, rtol=1e-7)
+
+
+def test_few_rows_have_the_noise_of_their_mean_square(lib: Library, rough: Study) -> None:
+    """Fewer than `FREE` degrees of freedom tell no two noises apart."""
+    none = np.zeros(0, dtype=int)
+    number = np.arange(rough.scene.poses)
+    some = [kept_rows(rough, number < count) for count in (1, 2, 3)]
+    rows = next(rows for rows in some if lib.products.of(rows).dof(none) < FREE)
+    noise = lib.products.of(rows).noise(none)
+    error = rough.rows.error[rows]
+    assert noise.ratio == noise.jitter == 0.0
+    assert_allclose(noise.variance, float(error @ error) / rows.sum(), rtol=1e-6)
 
 
 def test_a_candidate_beside_others_is_least_squares_on_the_poses_that_count(
