@@ -120,6 +120,23 @@ def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
     assert_allclose(found.variance, expected.variance, rtol=1e-7)
 
 
+def test_the_span_of_some_poses_is_orthonormal_there(
+    lib: Library, rough: Study, poses: Array
+) -> None:
+    rows = kept_rows(rough, poses)
+    products = lib.products.of(rows)
+    p = len(products.span)
+    basis = rough.rows.basis[rows] @ products.span
+    assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), rtol=0, atol=ROUNDING)
+    beside = products.beside(None)
+    for number in (0, -1):  # coordinates of the geometry's own columns, at both ends of RATIOS
+        weight = 1.0 / (1.0 + beside.sums.ratios[number] * rough.rows.variance_ratio[rows])
+        half = np.sqrt(weight)[:, None] * rough.rows.basis[rows]
+        gram = half.T @ half
+        square = beside.part[number, :, :p].T @ beside.part[number, :, :p]
+        assert_allclose(square, gram, rtol=0, atol=ROUNDING * np.abs(gram).max())
+
+
 def test_few_rows_have_the_noise_of_their_mean_square(lib: Library, rough: Study) -> None:
     """Fewer than `FREE` degrees of freedom tell no two noises apart."""
     none = np.zeros(0, dtype=int)
