@@ -180,6 +180,10 @@ def test_a_stretched_arm_that_is_too_short_gets_as_near_as_it_can(robot: mc.Robo
     assert found.outcome[0].failed
     assert 0.0 < found.distance[0] <= found.distance_before[0]
     assert np.abs(found.q - found.commanded).max() < np.pi / 36 + 1e-12
+    easy = [0.2, 0.3, 0.4, 0.1, 0.7, 0.2]  # a target that is met changes nothing about it
+    both = compensate(cell_of(real), [*found.commanded.tolist(), easy], robot, frame="own")
+    assert not both.outcome[1].failed
+    assert_allclose(both.q[0], found.q[0], rtol=0, atol=1e-9)
 
 
 def test_a_straight_wrist_is_not_swung_about(robot: mc.Robot, rng: np.random.Generator) -> None:
