@@ -58,6 +58,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.external",
         "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
     ),
+    "halves": (
+        "experiments.halves",
+        "Do the sigmas of effects tell how far two halves of a measurement differ",
+    ),
     "blind_gap": (
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
