@@ -62,6 +62,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.halves",
         "Do the sigmas of effects tell how far two halves of a measurement differ",
     ),
+    "closed": (
+        "experiments.closed",
+        "Does the interval of the share of the gap that is closed hold it on new poses",
+    ),
     "blind_gap": (
         "experiments.blind_gap",
         "Does a diagnosis name the true cause: sealed arms, wrong laws, deleted causes",
