@@ -57,7 +57,7 @@ def seen_foot(cell: Cell, data: Measurements) -> Scene | None:
 
 
 def measured(scene: Scene, term: Term) -> Motion:
-    """What the reflectors themselves say of a law: its six parameters fitted to them alone.
+    """What the reflectors themselves say of a law: its d parameters fitted to them alone.
 
     Each stands where it stands: constants are free.  sigma: by blocks of visits left out.
     """
@@ -73,8 +73,8 @@ def measured(scene: Scene, term: Term) -> Motion:
 
 
 def fitted(points: Array, columns: Array, rows: Array) -> Array:
-    """(6,) parameters of a law from reflectors (n, 3, m) alone.  columns: (6, n, 3, m)."""
-    gram, pull = np.zeros((6, 6)), np.zeros(6)
+    """(d,) parameters of a law from reflectors (n, 3, m) alone.  columns: (d, n, 3, m)."""
+    gram, pull = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for own, field in zip(points, np.moveaxis(columns, 1, 0), strict=True):
         known = rows & np.isfinite(own[0])
         y = own[:, known] - own[:, known].mean(axis=1, keepdims=True)
@@ -85,7 +85,7 @@ def fitted(points: Array, columns: Array, rows: Array) -> Array:
 
 
 def motion(scene: Scene, term: Term) -> Array:
-    """(3, 6) motion of the reflectors' middle by each parameter, from first visit to last."""
+    """(3, d) motion of the reflectors' middle by each parameter, from first visit to last."""
     middle = np.nanmean(scene.points, axis=(0, 2))
     points = np.broadcast_to(middle[None, :, None], (1, 3, scene.poses))
     field = term.columns(replace(scene, points=points)).shift[:, 0]
