@@ -132,9 +132,9 @@ class MinimaxProblem:
         """f, c and their derivatives; the curvature is Gauss-Newton's 2 J'J."""
         model = self.model
         at = self.first if x is self.start else PER[self.per][1](model, x)
-        total, weight = model.counts.sum(), model.prior.weight[model.active]
-        slope, held, known = at.jacobian, 0.0, bool(weight.any())
+        slope, held, known = at.jacobian, 0.0, bool(model.prior.weight.any())
         if known:
+            total, weight = model.counts.sum(), model.prior.weight[model.active]
             off = (model.prior.mean - model.values(x))[model.active]
             slope, held = slope - 2.0 * weight * off / total, prior_of(model, x)
         c, normal = self.deviation(x)
@@ -147,7 +147,7 @@ class MinimaxProblem:
 
         return Linear(
             f=(at.f + held) / self.size,
-            jacobian=slope / self.size / self.scale,
+            jacobian=slope / (self.size * self.scale),
             c=c,
             normal=normal,
             curvature=curvature,
