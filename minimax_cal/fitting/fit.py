@@ -40,7 +40,7 @@ from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 from minimax_cal.modelling.joint_fit import extended
-from minimax_cal.modelling.model import NO_MIX, Prior, model_of, pose_weights
+from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
@@ -416,7 +416,7 @@ class Fit:
         if self.cell.effects.terms:
             model, _ = extended(model, self.before.robot, train, state, self.cell.effects.terms)
         model = model.only(self.identification.active)
-        model = model.with_prior(Prior(model.prior.mean, self.prior))
+        model = model.with_prior(replace(model.prior, weight=self.prior))
         mix = pose_weights(train, self.options.lever) if self.objective == "pose" else NO_MIX
         weights = self.weights
         if len(mix):  # a pose needs all of its targets

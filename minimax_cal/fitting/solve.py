@@ -32,7 +32,6 @@ from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
 from minimax_cal.modelling.model import (
     NO_MIX,
     Model,
-    Prior,
     SumOfSquares,
     model_of,
     pose_weights,
@@ -164,7 +163,7 @@ class Task:
         mean_square = self.frame.mean_square / 3.0
         for _ in range(PRIOR_ROUNDS):
             weight = np.concatenate([mean_square / sigma**2, own])
-            model = model.with_prior(Prior(model.prior.mean, weight))
+            model = model.with_prior(replace(model.prior, weight=weight))
             found = nearby(model, begin, self.options.method)
             state = found.x.take(np.array(0))
             _, _, gram = SumOfSquares(model).normal(state)

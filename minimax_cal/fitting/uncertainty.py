@@ -29,10 +29,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
 from minimax_cal.ground.units import in_files
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.scene import BESIDE
 from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
-from minimax_cal.modelling.model import NO_MIX, Block, Model, Normal, Prior, with_poses
+from minimax_cal.modelling.model import NO_MIX, Block, Model, Normal, with_poses
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
@@ -88,7 +87,7 @@ class Estimator:
         chosen = np.random.default_rng(0).permutation(count)[: max(count * most // m, 1)]
         rows = np.flatnonzero(np.isin(member, chosen))
         few, prior = self.at(rows), self.model.prior
-        less = Prior(prior.mean, prior.weight * len(rows) / m)
+        less = replace(prior, weight=prior.weight * len(rows) / m)
         return replace(few, model=few.model.with_prior(less)), rows
 
 
@@ -180,8 +179,8 @@ class Poses:
     @property
     def beside(self) -> Array:
         """(p,) variance beside which a prior was weighed, 0 for a typical coordinate [m^2]."""
-        names, active = self.estimator.model.names, self.estimator.model.active
-        return np.where(np.arange(names.count) < names.geometric, 0.0, BESIDE**2)[active]
+        prior, active = self.estimator.model.prior, self.estimator.model.active
+        return prior.beside[active] if len(prior.beside) else np.zeros(np.count_nonzero(active))
 
     @cached_property
     def sums(self) -> tuple[Array, Array]:

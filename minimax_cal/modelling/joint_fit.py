@@ -10,7 +10,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.scene import BESIDE, Scene
 from minimax_cal.modelling.effects.table import (
     Fitted,
     Term,
@@ -55,7 +55,7 @@ def extended(
         exact = fitted(terms, scene, values).points(scene)
         moved = exact - scene.points - np.tensordot(values, fields, 1)
     count, more = model.names.geometric, len(names)
-    prior = model.prior
+    prior, ridge = model.prior, ridge_of(terms, scene)
     return replace(
         model,
         names=replace(model.names, effects=names),
@@ -64,7 +64,8 @@ def extended(
         active=np.concatenate([model.active[:count], np.ones(more, dtype=bool)]),
         prior=Prior(
             np.concatenate([prior.mean[:count], np.zeros(more)]),
-            np.concatenate([prior.weight[:count], ridge_of(terms, scene)]),
+            np.concatenate([prior.weight[:count], ridge]),
+            np.concatenate([np.zeros(count), np.where(ridge > 0.0, BESIDE**2, 0.0)]),
         ),
     ), replace(state, effects=values)
 

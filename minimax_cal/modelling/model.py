@@ -62,10 +62,14 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian knowledge about parameters: mean (p,) and weight (p,) = noise^2 / sigma^2."""
+    """Gaussian knowledge about parameters: mean (p,) and weight (p,) = noise^2 / sigma^2.
+
+    beside: (p,) that noise^2 [m^2], 0 for what a typical coordinate has; empty for all 0.
+    """
 
     mean: Array
     weight: Array
+    beside: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)

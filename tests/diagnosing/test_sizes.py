@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.sizes import unsized, weights_of
-from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import Term
@@ -86,3 +86,18 @@ def test_single_parameters_and_maps_have_none(geared: Study) -> None:
     assert unsized(terms, geared.scene) == [slice(1, 3)]
     poses, values = linear(geared, terms[0])
     assert not weights_of(poses, values, []).any()
+
+
+def test_the_sigma_of_a_held_effect_is_no_more_than_its_size() -> None:
+    """A joint that turned by 10 degrees: its gear's two waves are nearly geometry there."""
+    made = make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4))
+    study = study_of(made)
+    rows = np.abs(study.data.q[:, 4] - np.median(study.data.q[:, 4])) < 0.5
+    data = study.data.take(rows)
+    few = studied(study.robot, data, study.fit)
+    held = joint(few, (Term("gear_error", "J5", {"turns": 1.0}),))
+    weight = held.model.prior.weight[-2:]
+    assert (weight > 0.0).all()
+    size = np.sqrt(held.poses.mean_square / weight)  # of the prior
+    assert (held.uncertainty.sigma[-2:] < 1.5 * size).all()
+    assert not held.model.prior.beside[-2:].any()

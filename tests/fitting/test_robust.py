@@ -399,7 +399,9 @@ def test_effects_are_fitted_along(robot: mc.Robot) -> None:
         fields=field,
         names=replace(case.model.names, effects=("wind:all",)),
         active=np.append(case.model.active, True),
-        prior=Prior(*(np.append(part, 0.0) for part in vars(case.model.prior).values())),
+        prior=Prior(
+            *(np.append(part, 0.0) for part in (case.model.prior.mean, case.model.prior.weight))
+        ),
     )
     begin = replace(state, effects=np.zeros(1))
     model, plain = FITTER(model, begin)
