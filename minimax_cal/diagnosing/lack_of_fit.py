@@ -20,7 +20,7 @@ from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.effects.scene import Scene, turning
+from minimax_cal.modelling.effects.scene import Scene, joint_of, turning
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.robots.kinematics import cross
@@ -192,7 +192,7 @@ class Named:
     def joint(self) -> int | None:
         """The joint, from 0, or the link's joint, where it has one."""
         place = self.term.place
-        return int(place[1:]) - 1 if place[:1] in "JL" and place[1:].isdigit() else None
+        return joint_of(place) if place[:1] in "JL" and place[1:].isdigit() else None
 
     def size(self, scene: Scene, rows: Rows) -> Array:
         """(m,) how much there is of it at each pose, at most 1: of a joint's effect its angle."""

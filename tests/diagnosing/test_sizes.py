@@ -89,7 +89,7 @@ def test_single_parameters_and_maps_have_none(geared: Study) -> None:
 
 
 def test_the_sigma_of_a_held_effect_is_no_more_than_its_size() -> None:
-    """A joint that turned by 10 degrees: its gear's two waves are nearly geometry there."""
+    """A joint that turned by a radian: its gear's two waves are nearly geometry there."""
     made = make(Case("irb2600", "single", (Cause("gear_error", "J2", 300.0),), seed=4))
     study = study_of(made)
     rows = np.abs(study.data.q[:, 4] - np.median(study.data.q[:, 4])) < 0.5
