@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
@@ -30,11 +29,12 @@ from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Term, names_of
 from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.bounded import bounded
 
 PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
 SETTLED = 1e-4  # relative change of the weighed square that ends them
+ROUNDING = 1e-9  # of a parameter's largest value
 FARTHEST = 0.02  # of the reach: no effect of a body moves a point farther
-RIDGE = 1e-12  # of a parameter's own weight: what nothing tells stays where it is
 FOLDS = 5  # of groups of poses, by which a rung is judged
 WORSE = 1e-3  # relative rise of the training error that is none
 
@@ -140,8 +140,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
             break
     model, state = extended(base, robot, data, state, terms) if terms else (base, state)
     model = believing(model, weight)
-    rests = np.isclose(state.effects[:, None], allowed, rtol=1e-9, atol=0.0).any(axis=1)
-    return Joint(study, terms, state, model, np.asarray(rests))
+    return Joint(study, terms, state, model, at_bounds(state.effects, allowed))
 
 
 def believing(model: Model, weight: Array) -> Model:
@@ -149,6 +148,13 @@ def believing(model: Model, weight: Array) -> Model:
     whole = model.prior.weight.copy()
     whole[len(whole) - len(weight) :] += weight
     return replace(model, prior=replace(model.prior, weight=whole))
+
+
+def at_bounds(values: Array, allowed: Array) -> Array:
+    """(e,) True for parameters that lie at one of their bounds (e, 2), but for rounding."""
+    most = np.abs(allowed).max(axis=1, keepdims=True)
+    near = ROUNDING * np.where(np.isfinite(most), most, 0.0)
+    return np.asarray((np.abs(values[:, None] - allowed) <= near).any(axis=1))
 
 
 def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
@@ -162,26 +168,6 @@ def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
         fields = columns.displacement(scene)
         size = np.sqrt((fields**2).sum(axis=2)).max(axis=(1, 2))
         most = FARTHEST * scene.robot.reach() / np.maximum(size, 1e-300)
-        least = np.zeros_like(most) if EFFECTS[term.effect].positive else -most
+        least = np.where(EFFECTS[term.effect].upward(columns), 0.0, -most)
         out.append(np.stack([least, most], axis=1))
     return np.concatenate(out)
-
-
-def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
-    """The step x (p,) that minimises x'Hx - 2 g'x between bounds."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    unit = gram * np.outer(scale, scale) + RIDGE * np.eye(len(gram))
-    free = np.isinf(low) & np.isinf(high)
-    x = np.linalg.solve(unit, pull * scale)
-    if np.all((x >= low / scale) & (x <= high / scale)):
-        return np.asarray(scale * x)
-    # of the others what the free ones do not take over, and then the free ones
-    across = np.linalg.solve(unit[np.ix_(free, free)], unit[np.ix_(free, ~free)])
-    rest = unit[np.ix_(~free, ~free)] - unit[np.ix_(~free, free)] @ across
-    root = np.linalg.cholesky(0.5 * (rest + rest.T))
-    target = np.linalg.solve(root, (pull * scale)[~free] - across.T @ (pull * scale)[free])
-    room = (low / scale)[~free], (high / scale)[~free]
-    held = lsq_linear(root.T, target, room, method="bvls", tol=1e-12).x
-    x[free] += across @ (x[~free] - held)
-    x[~free] = held
-    return np.asarray(scale * x)

@@ -30,9 +30,9 @@ def unsized(terms: Sequence[Term], scene: Scene) -> list[slice]:
         columns = term.columns(scene)
         own = slice(at, at + len(columns.names))
         at = own.stop
-        several = len(columns.names) > 1 and not len(columns.ridge)
-        if several and not EFFECTS[term.effect].positive and not term.frees_frames:
-            out.append(own)
+        loose = int((~EFFECTS[term.effect].upward(columns)).sum())  # they come last
+        if loose > 1 and not len(columns.ridge) and not term.frees_frames:
+            out.append(slice(own.stop - loose, own.stop))
     return out
 
 

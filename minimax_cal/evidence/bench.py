@@ -15,6 +15,7 @@ from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
 from minimax_cal.evidence.products import LEAST, At, within
 from minimax_cal.ground.arrays import Array
+from minimax_cal.solvers.bounded import bounded
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
 SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
@@ -358,20 +359,47 @@ def stacked(first: Array, part: Array, second: Array) -> Array:
     return whole
 
 
-def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
-    """Values and sigmas (d,) of the parameters of effects, estimated together.
+def normal_equations(
+    lib: Library, fits: Sequence[Added], noise: Noise
+) -> tuple[Array, Array, Array]:
+    """Products (q, q) of the columns of effects and their doubts, (q,) with the error; their units.
 
     fits: the effects; their values are the sizes of their doubts.
     """
     main, loose, ridge = columns_of([one.candidate for one in fits], fits)
     index = np.concatenate([main, loose])
-    if not len(index):
-        return ()
     at = lib.products.at(np.array([noise.ratio]), index)
     gram = beside_priors(at, index, ridge * noise.variance)[0]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram / np.outer(scale, scale), 1e-12, hermitian=True)
-    value = inverse @ (at.pull[0] / scale) / scale
+    return gram / np.outer(scale, scale), at.pull[0] / scale, scale
+
+
+def against_signs(lib: Library, fits: Sequence[Added], noise: Noise) -> float:
+    """By how much -2 log likelihood rises where no parameter has a sign that no body has."""
+    upward = np.concatenate([one.candidate.upward for one in fits]) if fits else np.zeros(0)
+    if not upward.any():
+        return 0.0
+    gram, pull, _ = normal_equations(lib, fits, noise)
+    low = np.full(len(pull), -np.inf)
+    low[: len(upward)][upward] = 0.0
+    free = np.linalg.pinv(gram, 1e-12, hermitian=True) @ pull
+    if np.all(free >= low):
+        return 0.0
+    held = bounded(gram, pull, low, np.full(len(pull), np.inf))
+    off = held - free
+    return float(off @ gram @ off) / max(noise.variance, 1e-300)
+
+
+def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
+    """Values and sigmas (d,) of the parameters of effects, estimated together.
+
+    fits: the effects; their values are the sizes of their doubts.
+    """
+    if not fits:
+        return ()
+    gram, pull, scale = normal_equations(lib, fits, noise)
+    inverse = np.linalg.pinv(gram, 1e-12, hermitian=True)
+    value = inverse @ pull / scale
     sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
     cuts = np.cumsum([len(one.candidate.main) for one in fits])
     return tuple(zip(np.split(value, cuts)[:-1], np.split(sigma, cuts)[:-1], strict=True))

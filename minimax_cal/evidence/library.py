@@ -25,13 +25,15 @@ class Candidate:
 
     main: (d,) columns.  doubt: (r,) further columns, one sigma each per unit of main[owner].
     tries: of a line, how many frequencies were looked at, at all joints, to find it and its like.
+    upward: (d,) True for parameters that no body has below 0.
     """
 
     term: Term
     main: Array
     doubt: Array
     owner: Array
-    tries: float = 1.0
+    tries: float
+    upward: Array
 
     @property
     def shapes(self) -> int:
@@ -83,7 +85,7 @@ class Kind:
             np.array([len(c.main) + c.shapes for c in same]),
             np.array([c.tries for c in same]),
             np.array([effect.typical for effect in effects]),
-            np.array([effect.positive for effect in effects]) & (main.shape[1] == 1),
+            np.array([len(c.upward) == 1 and c.upward.all() for c in same]),
         )
 
 
@@ -230,7 +232,8 @@ class Stack:
             every.append(doubt)
             owners += [number] * len(doubt)
         main, doubt = np.split(self.place(np.concatenate(every)), [len(fields)])
-        return Candidate(term, main, doubt, np.array(owners, dtype=int), tries)
+        upward = EFFECTS[term.effect].upward(columns)
+        return Candidate(term, main, doubt, np.array(owners, dtype=int), tries, upward)
 
 
 def library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:

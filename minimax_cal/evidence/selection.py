@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from minimax_cal.evidence.bench import Added, Bench, bench, columns_of, together
+from minimax_cal.evidence.bench import Added, Bench, against_signs, bench, columns_of, together
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
@@ -28,7 +28,7 @@ from minimax_cal.evidence.limits import (
     TIE,
     TUNINGS,
 )
-from minimax_cal.evidence.noise import Noise, Rows, remaining
+from minimax_cal.evidence.noise import FREE, Noise, Rows, remaining
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
@@ -116,7 +116,7 @@ def select(
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
             break
-        lib, best = addition(lib, table, level)
+        lib, best = addition(lib, table, fits, level)
         if not best:
             break
         fits = [*fits, *best]
@@ -180,14 +180,20 @@ def repeated(c: Candidate, chosen: Sequence[Candidate]) -> bool:
     return any(not several or other.term.text == c.term.text for other in same)
 
 
-def addition(lib: Library, table: Bench, level: float) -> tuple[Library, list[Added]]:
+def addition(
+    lib: Library, table: Bench, fits: Sequence[Added], level: float
+) -> tuple[Library, list[Added]]:
     """The candidate that adds most evidence and passes the gate; none if none does.
 
-    The best few are tuned before they are compared.
+    The best few are tuned before they are compared.  fits: the effects that were chosen.
     """
     best: Added | None = None
+    least = against_signs(lib, fits, table.noise)
     seen: set[tuple[str, str]] = set()
-    for one in (one for one in table.everyone if one.evidence > 0.0):
+    room = table.dof - FREE  # parameters that rows can still tell
+    for one in table.everyone:
+        if one.evidence <= 0.0 or len(one.candidate.main) > room:
+            continue
         if best and one.evidence < best.evidence - max(NEAR, 0.2 * best.gain):
             break
         if one.candidate.key in seen or repeated(one.candidate, table.chosen):
@@ -195,13 +201,26 @@ def addition(lib: Library, table: Bench, level: float) -> tuple[Library, list[Ad
         if table.improbable(one, level):
             seen.add(one.candidate.key)
             lib, better = adopted(lib, tuned(table, one), one.candidate)
-            best = better if not best or better.evidence > best.evidence else best
+            better = signed(lib, fits, better, least, table)
+            if better.evidence > 0.0 and table.p_value(better) < level:
+                best = better if not best or better.evidence > best.evidence else best
         if len(seen) == CONTENDERS:
             break
     if not best:
         return lib, []
     lib, stored = lib.stored(best.candidate)
     return lib, [replace(best, candidate=stored)]
+
+
+def signed(lib: Library, fits: Sequence[Added], one: Added, least: float, table: Bench) -> Added:
+    """A candidate, its gain less what it owes to signs that no body has, its own or others'.
+
+    least: what the effects chosen before owe to them.
+    """
+    if lib.lines is not None and lib.lines.holds(one.candidate):
+        return one
+    owed = max(against_signs(lib, [*fits, one], table.noise) - least, 0.0)
+    return replace(one, gain=max(one.gain - owed, 0.0), evidence=one.evidence - owed)
 
 
 def tuned(table: Bench, best: Added) -> Added:

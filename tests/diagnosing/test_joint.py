@@ -1,7 +1,6 @@
 import json
 from dataclasses import replace
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,7 +9,7 @@ from problems_fit import study_of
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.gap import climbed, folds
-from minimax_cal.diagnosing.joint import bounded, bounds, joint
+from minimax_cal.diagnosing.joint import at_bounds, bounds, joint
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.table import Term
@@ -26,19 +25,6 @@ def case(*causes: Cause, seed: int = 1) -> Study:
 @pytest.fixture(scope="module")
 def play() -> Study:
     return case(Cause("backlash", "J2", 1000.0))
-
-
-def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
-    root = rng.normal(size=(12, 9))
-    gram, pull = root.T @ root, 5.0 * rng.normal(size=9)
-    low, high = np.full(9, -np.inf), np.full(9, np.inf)
-    low[:4], high[2:6] = -0.05, 0.02
-    x = cp.Variable(9)
-    cost = cp.quad_form(x, cp.psd_wrap(gram)) - 2.0 * pull @ x
-    cp.Problem(cp.Minimize(cost), [x[:4] >= -0.05, x[2:6] <= 0.02]).solve(solver=cp.CLARABEL)
-    assert_allclose(bounded(gram, pull, low, high), x.value, atol=1e-6)
-    free = bounded(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
-    assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
 
 
 def test_without_effects_it_is_the_geometric_fit(play: Study) -> None:
@@ -74,6 +60,11 @@ def test_compliances_are_not_negative() -> None:
     assert low[0] == 0.0
     assert low[1] == -high[1]
     assert (high > 0.0).all()
+
+
+def test_what_rounding_leaves_of_a_bound_is_at_it() -> None:
+    allowed = np.array([[0.0, 2.0], [0.0, 2.0], [-3.0, 3.0], [-np.inf, np.inf]])
+    assert at_bounds(np.array([4e-18, 1e-6, 3.0, 0.0]), allowed).tolist() == [1, 0, 1, 0]
 
 
 def test_a_fit_is_worse_beyond_a_part_in_a_thousand(play: Study) -> None:

@@ -1,8 +1,11 @@
 """Selection by evidence: names what is there, nothing where nothing is, and knows its rivals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import lsq_linear
 
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.causes import chosen
@@ -10,11 +13,13 @@ from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
+from minimax_cal.evidence.bench import against_signs
 from minimax_cal.evidence.library import Kind, library
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term
@@ -103,6 +108,78 @@ def test_values_are_those_of_least_squares() -> None:
     expected, squares, *_ = np.linalg.lstsq(matrix, made.rows.error, rcond=None)
     assert_allclose(value[0, 0], expected[-1], rtol=1e-8)
     assert_allclose(settings.total[still] - gain[0], squares[0], rtol=1e-8)
+
+
+def yielding(study: Study, tool: Array, stiff: Array) -> Study:
+    """The study of an arm without told masses that gives way, with 4 kg on its flange.
+
+    tool: (3,) where they hang in the last frame [m].  stiff: (n,) compliances [rad/(N m)].
+    """
+    robot = study.scene.robot
+    scene = replace(study.scene, robot=replace(robot, mass=np.full(6, np.nan)))
+    mass, com = (part.copy() for part in scene.masses)
+    com[-1] = (mass[-1] * com[-1] + 4.0 * tool) / (mass[-1] + 4.0)
+    mass[-1] += 4.0
+    torque = scene.torque(mass, com)
+    moved = np.einsum("n,nm,nkcm->kcm", stiff, torque, scene.jacobian)
+    rows = study.rows
+    rest = rows.of(moved[None])[:, 0]
+    rest -= rows.basis @ (rows.basis.T @ rest)
+    return replace(study, scene=scene, rows=replace(rows, error=rows.error + rest))
+
+
+SOFT = np.array([0.0, 1e-6, 1.5e-6, 1e-5, 1.5e-5, 4e-5])
+
+
+def test_the_weight_of_an_untold_tool_is_found_beside_the_axis() -> None:
+    made = yielding(opened(seed=3, poses=200), np.array([0.06, -0.08, 0.1]), SOFT)
+    _, choice = chosen(made, ())
+    (one,) = choice.chosen
+    assert one.key == ("joint_compliance", "all")
+    assert "tool" in one.term.choice
+    value, sigma = choice.estimates[0]
+    assert (value > -4.0 * sigma)[one.upward].all()
+    names = one.term.columns(made.scene).names
+    for j, a, lever in ((5, "x", 0.06), (5, "y", -0.08), (6, "x", 0.06), (6, "y", -0.08)):
+        i = names.index(f"c{j} (tool {a})")
+        assert abs(value[i] - SOFT[j - 1] * 4.0 * lever / 0.1) < 4.0 * sigma[i]
+
+
+def test_a_tool_on_the_axis_needs_no_levers() -> None:
+    made = yielding(opened(seed=3, poses=200), np.array([0.0, 0.0, 0.1]), SOFT)
+    _, choice = chosen(made, ())
+    assert [c.key for c in choice.chosen] == [("joint_compliance", "all")]
+    assert "tool" not in choice.chosen[0].term.choice
+
+
+def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
+    """Against least squares with bounds on all rows: no compliance below 0."""
+    made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), -SOFT)
+    lib = library(made.scene, made.rows)
+    terms = ["joint_compliance:all", "backlash:J1", "link_bending:L2"]
+    found = {c.term.label: c for c in lib.candidates if "tool" not in c.term.choice}
+    fits, chosen_ = [], []
+    for text in terms:
+        fits.append(selection.bench(lib, chosen_, fits).added(found[text]))
+        chosen_.append(found[text])
+    noise = selection.noise_beside(lib, fits)
+    main, loose, ridge = selection.columns_of(chosen_, fits)
+    weight = noise.weights(made.rows)
+    free = np.column_stack([made.rows.basis, lib.columns[:, main], lib.columns[:, loose]])
+    count, none = made.rows.basis.shape[1], np.zeros((len(loose), free.shape[1]))
+    none[:, free.shape[1] - len(loose) :] = np.diag(np.sqrt(ridge))
+    matrix = np.concatenate([free * np.sqrt(weight)[:, None], none])
+    scale = np.linalg.norm(matrix, axis=0)
+    right = np.concatenate([made.rows.error * np.sqrt(weight), np.zeros(len(loose))])
+    low = np.full(matrix.shape[1], -np.inf)
+    upward = np.concatenate([c.upward for c in chosen_])
+    low[count : count + len(upward)][upward] = 0.0
+    bounded, plain = (
+        2.0 * lsq_linear(matrix / scale, right, (least, np.inf), method="bvls", tol=1e-12).cost
+        for least in (low, np.full_like(low, -np.inf))
+    )
+    assert bounded - plain > 100.0
+    assert_allclose(against_signs(lib, fits, noise), bounded - plain, rtol=1e-5)
 
 
 def test_a_line_is_found_by_its_frequency() -> None:

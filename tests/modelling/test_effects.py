@@ -255,6 +255,27 @@ def test_unknown_masses_give_torques_of_parts() -> None:
     assert len(columns("joint_compliance", "J2", **choice).names) == 1
 
 
+def test_a_tool_beside_the_flange_weighs_on_the_joints() -> None:
+    """Its torque is that of its weight on the axis and of two levers, whatever it weighs."""
+    scene = SCENES["no masses"]
+    plain, choice = EFFECTS["joint_compliance"].choices(scene, "all")
+    assert choice == {**plain, "tool": choice["tool"]}
+    found = columns("joint_compliance", "all", scene, **choice)
+    tool = [name for name in found.names if "tool" in name]
+    assert tool == [f"c{j} (tool {a})" for j in range(2, 7) for a in "xy"]  # J1 stands upright
+    upward = EFFECTS["joint_compliance"].upward(found)
+    assert upward.tolist() == ["tool" not in name for name in found.names]
+    on_axis, beside = (
+        scene.torque(np.array([0, 0, 0, 0, 0, 3.0]), np.array([[0.0, 0.0, 0.0]] * 5 + [spot]))
+        for spot in ([0.0, 0.0, 0.1], [0.03, -0.05, 0.1])
+    )
+    for j in range(1, 6):
+        x, y = (found.turn[found.names.index(f"c{j + 1} (tool {a})"), j] for a in "xy")
+        expected = on_axis[j] + 3.0 * (0.03 * x - 0.05 * y) / 0.1
+        assert_allclose(beside[j], expected, rtol=0, atol=EXACT * 1e3)
+    assert len(EFFECTS["joint_compliance"].choices(SCENE, "all")) == 1  # masses are told
+
+
 def test_doubt_is_the_change_of_torque_for_other_masses() -> None:
     """The doubts kept span the most of what one sigma of every mass and centre adds up to."""
     parts = SCENE.gravity_parts[:, 1]

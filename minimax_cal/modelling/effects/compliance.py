@@ -19,11 +19,14 @@ from minimax_cal.modelling.effects.scene import (
     turning,
     unmasked,
 )
+from minimax_cal.robots.gravity import G
 
+TOUCHES = 0.1  # share of its weight's largest torque by which a tool's must vary on a joint
 FELT = 1e-3  # share of the largest torque's variation below which a joint carries nothing
 GROUPS = ("upper arm", "forearm", "wrist")  # two links each
 ALIKE = 0.2  # share of a neighbour's torque that must differ from a joint's own
 WHOLE = 3  # stands for all links together
+BESIDE_AXIS = 0.1  # lever of the kilogram that stands for a tool beside the flange's axis [m]
 
 
 def varying(scene: Scene) -> Array:
@@ -49,7 +52,8 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
 
     With known masses or measured torques there is one torque a joint.  Without, the torques of
     upper arm, forearm and wrist are taken apart, because their masses are free; one that another
-    explains as well is left out.
+    explains as well is left out.  Nobody tells the tool's weight then either, and it may hang
+    beside the flange's axis: all joints together are tried with that too (`tool`: `beside_axis`).
     """
     joints = loaded(scene) if place == "all" else [joint_of(place)]
     if scene.known_masses or scene.measured_torques:
@@ -64,7 +68,27 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
             if np.linalg.norm(rest) > 0.02 * np.linalg.norm(torque - torque.mean()) + 1e-9:
                 chosen.append(4 * j + group)
                 kept = np.concatenate([kept, torque[None]])
-    return ({"parts": mask_of(chosen)},) if chosen else ()
+    if not chosen:
+        return ()
+    parts = {"parts": mask_of(chosen)}
+    tool = beside_axis(scene) if place == "all" else 0.0
+    return (parts, {**parts, "tool": tool}) if tool else (parts,)
+
+
+def beside_axis(scene: Scene) -> float:
+    """Joints on which a tool beside the flange's axis weighs: bit 2 j for its x, 2 j + 1 for y."""
+    every = [(2 * j + a, tool_torque(scene, j, a)) for j in turning(scene) for a in (0, 1)]
+    return mask_of([number for number, torque in every if torque.std() > TOUCHES * G * BESIDE_AXIS])
+
+
+def tool_torque(scene: Scene, joint: int, axis: int) -> Array:
+    """(m,) torque of a kilogram beside the flange's axis, along x or y, less that of one on it.
+
+    About a joint [N m].
+    """
+    one, com = np.zeros(scene.joints), np.zeros((scene.joints, 3))
+    one[-1], com[-1, axis] = 1.0, BESIDE_AXIS
+    return np.asarray((scene.torque(one, com) - scene.torque(one, 0.0 * com))[joint])
 
 
 def torque_of(scene: Scene, joint: int, group: int) -> Array:
@@ -78,7 +102,7 @@ def torque_of(scene: Scene, joint: int, group: int) -> Array:
 
 
 def columns(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = c_j tau_j."""
+    """dq_j = c_j tau_j; and c_j times the torque of a tool on either side of the flange's axis."""
     turns, names, doubts = [], [], []
     for part in unmasked(choice["parts"]):
         j, group = divmod(part, 4)
@@ -89,8 +113,19 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         one = [one_joint(scene, j, shape[None]) for shape in shapes]
         nothing = np.zeros((0, scene.joints, scene.poses))
         doubts.append(np.concatenate([nothing, *one]))
-    units = ("rad/(N m)",) * len(names)
-    return Columns(tuple(names), units, np.concatenate(turns), doubt=tuple(doubts))
+    positive = len(names)
+    for number in unmasked(choice.get("tool", 0.0)):
+        j, axis = divmod(number, 2)
+        turns.append(one_joint(scene, j, tool_torque(scene, j, axis)[None]))
+        names.append(f"c{j + 1} (tool {'xy'[axis]})")
+        doubts.append(np.zeros((0, scene.joints, scene.poses)))
+    return Columns(
+        tuple(names),
+        ("rad/(N m)",) * len(names),
+        np.concatenate(turns),
+        doubt=tuple(doubts),
+        either=np.arange(len(names)) >= positive,
+    )
 
 
 JOINT_COMPLIANCE = Effect(

@@ -203,6 +203,7 @@ class Columns:
     doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
     ridge: (d,) weight of a prior of mean zero, (BESIDE / sigma)^2 [m^2 per unit^2]; empty for none.
+    either: (d,) True for parameters of a positive effect that may have either sign; empty for none.
     """
 
     names: tuple[str, ...]
@@ -213,6 +214,7 @@ class Columns:
     doubt_shift: tuple[Callable[[], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
     ridge: Array = field(default_factory=lambda: np.zeros(0))
+    either: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def only_turns(self) -> bool:
@@ -271,7 +273,8 @@ class Effect:
     columns: its `Columns` at a place, for a choice.  needs: what the data lack, '' if nothing.
     choices: the variants of the law at a place that are worth trying.
     finer: variants near one that was chosen, to try afterwards.
-    positive: whether its one parameter is a compliance, which cannot be negative.
+    positive: whether its parameters are compliances, which cannot be negative, but for those that
+    its columns say may have either sign.
     lines: whether several of its variants at one place are one cause: waves of one gear.
     typical: usual size of a parameter; far larger ones are believed less [SI].
     is_map: whether its parameters are those of a free curve, told by the curve; sought when causes
@@ -301,6 +304,11 @@ class Effect:
     follows: str = ""
     linear: bool = False
     against: Callable[[Scene, int, Choice], tuple[str, Array]] | None = None
+
+    def upward(self, columns: Columns) -> Array:
+        """(d,) True for parameters of its columns that no body has below 0."""
+        either = columns.either if len(columns.either) else np.zeros(len(columns.names), dtype=bool)
+        return np.asarray(self.positive & ~either)
 
     @property
     def of_flange(self) -> bool:

@@ -1,0 +1,30 @@
+"""Least squares between bounds, from their normal equations."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from minimax_cal.ground.arrays import Array
+
+RIDGE = 1e-12  # of a parameter's own weight: what nothing tells stays where it is
+
+
+def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
+    """The step x (p,) that minimises x'Hx - 2 g'x between bounds."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    unit = gram * np.outer(scale, scale) + RIDGE * np.eye(len(gram))
+    free = np.isinf(low) & np.isinf(high)
+    x = np.linalg.solve(unit, pull * scale)
+    if np.all((x >= low / scale) & (x <= high / scale)):
+        return np.asarray(scale * x)
+    # of the others what the free ones do not take over, and then the free ones
+    across = np.linalg.solve(unit[np.ix_(free, free)], unit[np.ix_(free, ~free)])
+    rest = unit[np.ix_(~free, ~free)] - unit[np.ix_(~free, free)] @ across
+    root = np.linalg.cholesky(0.5 * (rest + rest.T))
+    target = np.linalg.solve(root, (pull * scale)[~free] - across.T @ (pull * scale)[free])
+    room = (low / scale)[~free], (high / scale)[~free]
+    held = lsq_linear(root.T, target, room, method="bvls", tol=1e-12).x
+    x[free] += across @ (x[~free] - held)
+    x[~free] = held
+    return np.asarray(scale * x)

@@ -1,0 +1,20 @@
+"""Least squares between bounds against cvxpy."""
+
+import cvxpy as cp
+import numpy as np
+from numpy.testing import assert_allclose
+
+from minimax_cal.solvers.bounded import bounded
+
+
+def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
+    root = rng.normal(size=(12, 9))
+    gram, pull = root.T @ root, 5.0 * rng.normal(size=9)
+    low, high = np.full(9, -np.inf), np.full(9, np.inf)
+    low[:4], high[2:6] = -0.05, 0.02
+    x = cp.Variable(9)
+    cost = cp.quad_form(x, cp.psd_wrap(gram)) - 2.0 * pull @ x
+    cp.Problem(cp.Minimize(cost), [x[:4] >= -0.05, x[2:6] <= 0.02]).solve(solver=cp.CLARABEL)
+    assert_allclose(bounded(gram, pull, low, high), x.value, atol=1e-6)
+    free = bounded(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
+    assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
