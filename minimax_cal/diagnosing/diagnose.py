@@ -193,7 +193,7 @@ def in_rungs(
 ) -> tuple[Causes, Causes, Ladder]:
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
     progress("gap ladder")
-    spoken = replace(causes, effects=tuple(f for f in causes.effects if f.again >= WEAK))
+    spoken = replace(causes, effects=tuple(f for f in causes.effects if not f.again < WEAK))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
     if JOINT_ERROR_MAP.name in exclude:
         return causes, spoken, ladder

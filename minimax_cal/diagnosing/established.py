@@ -20,13 +20,16 @@ from minimax_cal.evidence.limits import (
     ENOUGH,
     FOLDS,
     HALF,
+    LEAST_DOF,
     MOST,
     SAME,
 )
-from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import EFFECTS
+
+UNASKED = float("nan")  # how often an effect is found again where poses are too few to ask
 
 
 def judged_again(
@@ -40,13 +43,20 @@ def judged_again(
         return []
     part = folds(data, FOLDS)
     told: list[list[bool]] = [[] for _ in findings]
+    rich = 0
     for number in range(FOLDS):
-        choice = select(library.only(part != number), ripple=ripple, level=AGAIN, seldom=MOST)
+        rest = library.only(part != number)
+        rich += rest.products.dof(NOTHING) >= LEAST_DOF
+        choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
         for one, known in zip(findings, told, strict=True):
             found = is_found(one, choice, whole)
             known += [found] if found or shows(one, choice, whole) else []
     return [
-        replace(one, again=share(known), dwarfed=any(dwarfs(other, one) for other in findings))
+        replace(
+            one,
+            again=share(known) if rich >= ASKED else UNASKED,
+            dwarfed=any(dwarfs(other, one) for other in findings),
+        )
         for one, known in zip(findings, told, strict=True)
     ]
 

@@ -46,6 +46,7 @@ PEOPLES = {  # how people read a unit of the file
     "rad": (1e3, "mrad"),
     "rad/(N m)": (1e3, "mrad/(N m)"),
 }
+DWARFED = "small beside a larger effect of the same course"  # in a file, too
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
@@ -88,7 +89,8 @@ class Finding:
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
     told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
-    was found again.  dwarfed: whether it may be what the law of a far larger effect lacks.
+    was found again; NaN where poses are too few to ask.  dwarfed: whether it may be what the
+    law of a far larger effect lacks.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
     """
 
@@ -113,7 +115,16 @@ class Finding:
     @property
     def established(self) -> bool:
         """Whether it was found again whichever poses were left out, and stands by itself."""
-        return self.again >= FIRM and not self.dwarfed
+        return not self.why_tentative
+
+    @property
+    def why_tentative(self) -> str:
+        """What keeps it from being established; '' if nothing does."""
+        if math.isnan(self.again):
+            return "poses too few to leave any out"
+        if self.again < FIRM:
+            return "not found again without some of the poses"
+        return DWARFED if self.dwarfed else ""
 
     @property
     def term(self) -> Term:
@@ -176,7 +187,8 @@ class Finding:
             "effect": self.term.effect,
             "place": self.term.place,
             "established": self.established,
-            "found_again": self.again,
+            "found_again": finite(self.again),
+            "why_tentative": self.why_tentative or None,
             "share": finite(self.share),
             "lambda": finite(self.size),
             "chance": finite(self.p_value),

@@ -12,7 +12,15 @@ from pydantic import Field
 
 from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import CURVE, SCHEMA, Alternative, Diagnosis, Finding, Step
+from minimax_cal.diagnosing.result import (
+    CURVE,
+    DWARFED,
+    SCHEMA,
+    Alternative,
+    Diagnosis,
+    Finding,
+    Step,
+)
 from minimax_cal.evidence.limits import FIRM
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
@@ -65,7 +73,16 @@ class FindingPart(Part):
     lines: tuple[int, ...] = ()
     established: bool = True
     found_again: Number = math.nan
+    why_tentative: str | None = None
     curve: dict[str, list[Number]] = Field(default_factory=dict)
+
+    @property
+    def again(self) -> float:
+        """How often it was found again, so that what was tentative stays so."""
+        if self.established:
+            return 1.0
+        every_time = self.found_again >= FIRM and self.why_tentative != DWARFED
+        return BELOW if every_time else self.found_again
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -85,7 +102,8 @@ class FindingPart(Part):
             after=self.holdout_rms_mm.after,
             fixed=self.fixed,
             rows=self.lines,
-            again=1.0 if self.established else min(self.found_again, BELOW),
+            again=self.again,
+            dwarfed=self.why_tentative == DWARFED,
             curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
 

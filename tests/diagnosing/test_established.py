@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from problems_fit import study_of
 
+import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.established import dwarfs, is_found, is_rival, share, shows
 from minimax_cal.diagnosing.result import Finding
@@ -37,6 +38,23 @@ def test_a_part_that_cannot_show_an_effect_is_no_test_of_it() -> None:
     assert share([True, True, True, False]) == 0.75
     assert share([True, True]) == 0.0  # three parts at least must ask
     assert share([]) == 0.0
+
+
+def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> None:
+    """Twenty poses of one target: four fifths of them tell the geometry and little more."""
+    made = make(
+        Case("irb2600", "single", (Cause("joint_compliance", "J2", 2e4),), seed=3, poses=20)
+    )
+    data = made.data.keep(np.arange(len(made.data.target_names)) == 0).take(np.arange(20))
+    columns = {name: column for name, column in data.columns.items() if name != "split"}
+    told = mc.diagnose(made.robot, replace(data, columns=columns), quick=True)
+    (one,) = told.findings
+    assert one.term.key == ("joint_compliance", "J2")
+    assert np.isnan(one.again)
+    assert not one.established
+    assert told.to_dict()["effects"][0]["found_again"] is None
+    geometric, last = told.ladder[1].holdout, told.ladder[-1].holdout
+    assert last.rms_mm < 0.2 * geometric.rms_mm
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import established
 from minimax_cal.diagnosing.lack_of_fit import Trace, heard
 from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.result import DWARFED, Finding
 from minimax_cal.diagnosing.verdict import patched
 from minimax_cal.evidence import limits
 from minimax_cal.ground.arrays import Array
@@ -96,9 +96,25 @@ def test_the_file_tells_what_is_established_and_what_remains(two_orders: mc.Diag
     assert isinstance(again.remainder, Remainder)
     assert again.remainder == two_orders.remainder
     assert json.loads(again.json())["effects"][0]["established"] is True
-    said["effects"][0] |= {"established": False, "found_again": 0.8}
+    assert said["effects"][0]["why_tentative"] is None
+
+
+@pytest.mark.parametrize(
+    ("again", "why"),
+    [
+        (0.8, "not found again without some of the poses"),
+        (None, "poses too few to leave any out"),
+        (1.0, DWARFED),
+    ],
+)
+def test_what_is_tentative_stays_so_in_a_file(
+    two_orders: mc.Diagnosis, again: float | None, why: str
+) -> None:
+    said = json.loads(two_orders.json())
+    told = {"established": False, "found_again": again, "why_tentative": why}
+    said["effects"][0] |= told
     kept = json.loads(mc.Diagnosis.from_dict(said).json())["effects"][0]
-    assert (kept["established"], kept["found_again"]) == (False, 0.8)
+    assert {key: kept[key] for key in told} == told
 
 
 def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None:
