@@ -58,6 +58,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.external",
         "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
     ),
+    "ten_splits": (
+        "experiments.ten_splits",
+        "Do names of causes hold, whichever poses are held out",
+    ),
     "halves": (
         "experiments.halves",
         "Do the sigmas of effects tell how far two halves of a measurement differ",
