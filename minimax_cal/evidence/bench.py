@@ -380,13 +380,13 @@ def against_signs(lib: Library, fits: Sequence[Added], noise: Noise) -> float:
     if not upward.any():
         return 0.0
     gram, pull, _ = normal_equations(lib, fits, noise)
-    low = np.full(len(pull), -np.inf)
+    high = np.full(len(pull), np.inf)
+    low = -high
     low[: len(upward)][upward] = 0.0
-    free = np.linalg.pinv(gram, 1e-12, hermitian=True) @ pull
+    free = bounded(gram, pull, -high, high)
     if np.all(free >= low):
         return 0.0
-    held = bounded(gram, pull, low, np.full(len(pull), np.inf))
-    off = held - free
+    off = bounded(gram, pull, low, high) - free
     return float(off @ gram @ off) / max(noise.variance, 1e-300)
 
 

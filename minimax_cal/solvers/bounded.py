@@ -21,10 +21,11 @@ def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
     # of the others what the free ones do not take over, and then the free ones
     across = np.linalg.solve(unit[np.ix_(free, free)], unit[np.ix_(free, ~free)])
     rest = unit[np.ix_(~free, ~free)] - unit[np.ix_(~free, free)] @ across
-    root = np.linalg.cholesky(0.5 * (rest + rest.T))
-    target = np.linalg.solve(root, (pull * scale)[~free] - across.T @ (pull * scale)[free])
+    values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
+    root = np.sqrt(np.maximum(values, RIDGE))  # columns that are the same leave rounding
+    target = vectors.T @ ((pull * scale)[~free] - across.T @ (pull * scale)[free]) / root
     room = (low / scale)[~free], (high / scale)[~free]
-    held = lsq_linear(root.T, target, room, method="bvls", tol=1e-12).x
+    held = lsq_linear(root[:, None] * vectors.T, target, room, method="bvls", tol=1e-12).x
     x[free] += across @ (x[~free] - held)
     x[~free] = held
     return np.asarray(scale * x)

@@ -18,3 +18,16 @@ def test_a_bounded_step_is_the_optimum(rng: np.random.Generator) -> None:
     assert_allclose(bounded(gram, pull, low, high), x.value, atol=1e-6)
     free = bounded(gram, pull, np.full(9, -np.inf), np.full(9, np.inf))
     assert_allclose(free, np.linalg.solve(gram, pull), rtol=1e-6)
+
+
+def test_columns_that_are_the_same_share_their_part(rng: np.random.Generator) -> None:
+    """Products of rank 3 in 5 parameters: any split of a sum is as good, and none is infinite."""
+    matrix = rng.normal(size=(12, 3))[:, [0, 1, 2, 0, 1]]
+    right = 3.0 * rng.normal(size=12)
+    low, high = np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0]), np.full(5, np.inf)
+    x = bounded(matrix.T @ matrix, matrix.T @ right, low, high)
+    y = cp.Variable(5)
+    best = cp.Problem(cp.Minimize(cp.sum_squares(matrix @ y - right)), [y[2:] >= 0.0])
+    best.solve(solver=cp.CLARABEL)
+    assert (x >= low - 1e-12).all()
+    assert_allclose(np.sum((matrix @ x - right) ** 2), best.value, rtol=1e-5)
