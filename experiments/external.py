@@ -119,11 +119,11 @@ def run(job: Job) -> Claim | None:
         if job.way == "calibrate":
             fit = mc.calibrate(robot, rest, "sum", seed=job.seed)
             held, beyond = fit.accuracy["holdout"], fit.beyond
-            first, last, trusted = fit.cell, fit.cell, fit.trusted
+            first, last, unseen = fit.cell, fit.cell, fit.data.take(fit.held)
         else:
             found = mc.diagnose(robot, rest, seed=job.seed)
             held, beyond = found.ladder[-1].holdout, found.beyond
-            first, last, trusted = found.cells[0], found.cells[-1], found.ladder[-1].trusted
+            first, last, unseen = found.cells[0], found.cells[-1], found.data.take(found.held)
     except mc.CalibrationError:
         return None
     known = outside.keep(np.isin(outside.target_names, last.target_names))
@@ -133,13 +133,12 @@ def run(job: Job) -> Claim | None:
         beyond.worst_mm,
         accuracy(last.error(known)).rms_mm,
         accuracy(first.error(known)).rms_mm,
-        trusted.rms_mm,
-        accuracy(last.error(sound(first, known))).rms_mm,
+        *(accuracy(last.error(sound(last, part))).rms_mm for part in (unseen, known)),
     )
 
 
 def sound(cell: Cell, data: Measurements) -> Measurements:
-    """Measurements without the points that stand out from a fit of the geometry."""
+    """Measurements without the points that stand out from a fit."""
     found = find_faults(cell.placed(data), cell.error(data))
     return mended(data, tuple(fault for fault in found if fault.effect == "outliers"))
 
