@@ -84,6 +84,8 @@ class Line:
     def stays(self, turns: float) -> bool:
         """Whether both halves of the sweep show a wave, of the same frequency, size and phase."""
         low = self.q < np.median(self.q)
+        if not low.any():  # most poses stand at one end: there are no two halves
+            return False
         whole = float(self.gain(turns + np.array([0.0, 1e-3]))[0])
         more = -whole
         for half in (low, ~low):

@@ -50,6 +50,13 @@ def test_a_wave_stays_when_its_sweep_is_cut_and_a_curve_does_not() -> None:
     assert np.mean(move) <= 0.25  # a curve may hold a wave by chance
 
 
+def test_a_joint_that_mostly_stands_at_one_end_shows_no_line(rng: np.random.Generator) -> None:
+    """Its sweep has no two halves: more than half of the poses have the least angle."""
+    q = np.concatenate([np.full(12, -1.0), np.linspace(0.0, 2.0, 8)])
+    wave = line(rng, 5.0 * np.cos(20.0 * q), q)
+    assert not wave.stays(20.0)
+
+
 def test_the_strongest_wave_is_the_one_that_is_there() -> None:
     rng = np.random.default_rng(0)
     q = rng.uniform(-2.5, 2.5, 400)
