@@ -77,18 +77,19 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
 
 def beside_axis(scene: Scene) -> float:
     """Joints on which a tool beside the flange's axis weighs: bit 2 j for its x, 2 j + 1 for y."""
-    every = [(2 * j + a, tool_torque(scene, j, a)) for j in turning(scene) for a in (0, 1)]
-    return mask_of([number for number, torque in every if torque.std() > TOUCHES * G * BESIDE_AXIS])
+    felt = tool_torques(scene).std(axis=2) > TOUCHES * G * BESIDE_AXIS
+    return mask_of([2 * j + axis for j in turning(scene) for axis in (0, 1) if felt[axis, j]])
 
 
-def tool_torque(scene: Scene, joint: int, axis: int) -> Array:
-    """(m,) torque of a kilogram beside the flange's axis, along x or y, less that of one on it.
+def tool_torques(scene: Scene) -> Array:
+    """(2, n, m) torques of a kilogram beside the flange's axis, along x and y, less one's on it.
 
-    About a joint [N m].
+    [N m]
     """
-    one, com = np.zeros(scene.joints), np.zeros((scene.joints, 3))
-    one[-1], com[-1, axis] = 1.0, BESIDE_AXIS
-    return np.asarray((scene.torque(one, com) - scene.torque(one, 0.0 * com))[joint])
+    one, com = np.zeros(scene.joints), np.zeros((3, scene.joints, 3))
+    one[-1], com[0, -1, 0], com[1, -1, 1] = 1.0, BESIDE_AXIS, BESIDE_AXIS
+    along_x, along_y, amid = (scene.torque(one, place) for place in com)
+    return np.stack([along_x - amid, along_y - amid])
 
 
 def torque_of(scene: Scene, joint: int, group: int) -> Array:
@@ -114,9 +115,11 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         nothing = np.zeros((0, scene.joints, scene.poses))
         doubts.append(np.concatenate([nothing, *one]))
     positive = len(names)
-    for number in unmasked(choice.get("tool", 0.0)):
+    levers = unmasked(choice.get("tool", 0.0))
+    tool = tool_torques(scene) if levers else np.zeros((2, 0, 0))
+    for number in levers:
         j, axis = divmod(number, 2)
-        turns.append(one_joint(scene, j, tool_torque(scene, j, axis)[None]))
+        turns.append(one_joint(scene, j, tool[axis, j][None]))
         names.append(f"c{j + 1} (tool {'xy'[axis]})")
         doubts.append(np.zeros((0, scene.joints, scene.poses)))
     return Columns(
