@@ -376,30 +376,34 @@ def normal_equations(
 
 def against_signs(lib: Library, fits: Sequence[Added], noise: Noise) -> float:
     """By how much -2 log likelihood rises where no parameter has a sign that no body has."""
-    upward = np.concatenate([one.candidate.upward for one in fits]) if fits else np.zeros(0)
-    if not upward.any():
+    if not any(one.candidate.upward.any() for one in fits):
         return 0.0
     gram, pull, _ = normal_equations(lib, fits, noise)
-    high = np.full(len(pull), np.inf)
-    low = -high
-    low[: len(upward)][upward] = 0.0
-    free = bounded(gram, pull, -high, high)
-    if np.all(free >= low):
-        return 0.0
-    off = bounded(gram, pull, low, high) - free
+    free = bounded(gram, pull, *np.full((2, len(pull)), [[-np.inf], [np.inf]]))
+    off = with_signs(gram, pull, fits) - free
     return float(off @ gram @ off) / max(noise.variance, 1e-300)
+
+
+def with_signs(gram: Array, pull: Array, fits: Sequence[Added]) -> Array:
+    """(q,) least squares in which no parameter has a sign that no body has."""
+    low, high = np.full((2, len(pull)), [[-np.inf], [np.inf]])
+    upward = np.concatenate([one.candidate.upward for one in fits])
+    low[: len(upward)][upward] = 0.0
+    return bounded(gram, pull, low, high)
 
 
 def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
     """Values and sigmas (d,) of the parameters of effects, estimated together.
 
+    No value has a sign that no body has; sigmas are those of free values.
     fits: the effects; their values are the sizes of their doubts.
     """
     if not fits:
         return ()
     gram, pull, scale = normal_equations(lib, fits, noise)
     inverse = np.linalg.pinv(gram, 1e-12, hermitian=True)
-    value = inverse @ pull / scale
+    signed = any(one.candidate.upward.any() for one in fits)
+    value = (with_signs(gram, pull, fits) if signed else inverse @ pull) / scale
     sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
     cuts = np.cumsum([len(one.candidate.main) for one in fits])
     return tuple(zip(np.split(value, cuts)[:-1], np.split(sigma, cuts)[:-1], strict=True))

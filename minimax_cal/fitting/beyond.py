@@ -159,7 +159,10 @@ def pooled(every: Sequence[Accuracy]) -> float:
 
 
 def needed(poses: Poses, part: Array) -> bool:
-    """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,)."""
+    """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,).
+
+    What all poses hardly tell, as a gear's curve beside the joint's compliance, no part costs.
+    """
     gram = poses.bread
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     whole, rest = (
@@ -167,7 +170,8 @@ def needed(poses: Poses, part: Array) -> bool:
         for one in (gram, gram - poses.gram_of(part))
     )
     condition = whole[-1] / max(whole[0], 1e-300)
-    return bool(rest[0] <= RANK * rest[-1] or rest[-1] > WORSE * condition * rest[0])
+    had, kept = (int((one > RANK * one[-1]).sum()) for one in (whole, rest))
+    return bool(kept < had or rest[-1] > WORSE * condition * rest[0])
 
 
 def step_without(poses: Poses, part: Array) -> Array:

@@ -180,6 +180,8 @@ def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
     )
     assert bounded - plain > 100.0
     assert_allclose(against_signs(lib, fits, noise), bounded - plain, rtol=1e-5)
+    for c, (value, sigma) in zip(chosen_, selection.together(lib, fits, noise), strict=True):
+        assert (value >= -1e-9 * sigma)[c.upward].all()
 
 
 def test_a_line_is_found_by_its_frequency() -> None:

@@ -1,10 +1,14 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.fitting.beyond import RANK, needed
+from minimax_cal.fitting.uncertainty import Poses
+from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
@@ -63,3 +67,29 @@ def test_a_fit_that_extrapolates_badly_says_so(robot: mc.Robot) -> None:
     fit = mc.calibrate(robot, data, "sum")
     assert fit.beyond.worst_mm > 1.3 * fit.accuracy["holdout"].rms_mm
     assert "joint 2" in fit.beyond.worst.where
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Poses of two parameters, whose columns are (m, 2), beside a prior of these weights."""
+
+    rows: Array
+    weights: float
+
+    @property
+    def bread(self) -> Array:
+        return self.gram_of(np.ones(len(self.rows), dtype=bool)) + self.weights * np.eye(2)
+
+    def gram_of(self, part: Array) -> Array:
+        return cast(Array, self.rows[part].T @ self.rows[part])
+
+
+@pytest.mark.parametrize(
+    ("apart", "lost"),
+    [([1.0, 1.0, 1.0, 1.0], False), ([0.0, 0.0, 0.0, 0.0], False), ([1.0, 0.0, 0.0, 0.0], True)],
+)
+def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool) -> None:
+    """Of two parameters with nearly the same columns: told by all poses, by none, by the first."""
+    rows: Any = np.stack([np.ones(4), 1.0 + np.array(apart) * [1e-2, -1e-2, 1e-2, -1e-2]], axis=1)
+    poses = Rows(rows, 1e-2 * RANK**2)
+    assert needed(cast(Poses, poses), np.arange(4) == 0) is lost
