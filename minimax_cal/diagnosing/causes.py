@@ -23,6 +23,7 @@ from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
+from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 
@@ -166,7 +167,15 @@ def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     for number in by_weight(choice):
         term = choice.chosen[number].term
         out.setdefault((term.effect, term.place), []).append(term)
-    return [tuple(terms) for terms in out.values()]
+    return [entire(terms) for terms in out.values()]
+
+
+def entire(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """The whole of an effect's law, of which its terms may be what shows."""
+    first = terms[0]
+    found = [term.choice for term in terms]
+    whole = EFFECTS[first.effect].entire(found)
+    return tuple(terms) if whole is found else tuple(replace(first, choice=one) for one in whole)
 
 
 def finding(study: Study, choice: Choice, number: int) -> Finding:
@@ -203,6 +212,20 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
             for (other, rho2, power), text in zip(found, advice, strict=True)
         ),
         fixed=columns.fixed,
+    )
+
+
+def whole(finding: Finding, scene: Scene) -> Finding:
+    """A finding with the whole of its law, whose values are those of a fit that comes."""
+    terms = entire(finding.terms)
+    if terms == finding.terms:
+        return finding
+    columns = [term.columns(scene) for term in terms]
+    names = tuple(name for one in columns for name in one.names)
+    units = tuple(unit for one in columns for unit in one.units)
+    none = (0.0,) * len(names)
+    return replace(
+        finding, terms=terms, names=names, units=units, values=none, sigmas=none, fixed={}
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings
+from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings, whole
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
@@ -193,7 +193,8 @@ def in_rungs(
 ) -> tuple[Causes, Causes, Ladder]:
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
     progress("gap ladder")
-    spoken = replace(causes, effects=tuple(f for f in causes.effects if not f.again < WEAK))
+    often = [f for f in causes.effects if not f.again < WEAK]
+    spoken = replace(causes, effects=tuple(whole(f, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
     if JOINT_ERROR_MAP.name in exclude:
         return causes, spoken, ladder

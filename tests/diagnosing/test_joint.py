@@ -8,11 +8,16 @@ from problems_fit import study_of
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.causes import entire, whole
 from minimax_cal.diagnosing.gap import climbed, folds
 from minimax_cal.diagnosing.joint import at_bounds, bounds, joint
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.fitting.options import Options, silent
+from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.simulate import simulate
 
 PLAY = Term("backlash", "J2")
 SOFT = Term("joint_compliance", "J2", {"parts": 128.0})
@@ -130,3 +135,36 @@ def test_held_out_poses_stay_where_they_were_put() -> None:
     assert lines[0] <= lines[1]  # a row without a sound point is not in the data
     assert spoilt.ladder[-1].holdout.poses == clean.ladder[-1].holdout.poses
     assert spoilt.ladder[-1].trusted.rms_mm < 0.5 * spoilt.ladder[-1].holdout.rms_mm
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
+    """Joint 2 errs once and twice a turn, is measured in half of its sweep, and met in the other.
+
+    Twice a turn alone leaves the rest to geometry, which serves the measured half only.
+    """
+    robot = mc.load_robot("irb2600")
+    ideal = simulate(robot, 160, seed=seed)
+    q = ideal.data.q
+    turn = 2e-4 * np.cos(q[:, 1] + 0.5) + 2e-4 * np.cos(2.0 * q[:, 1] + 1.0 + seed)
+    noise = 2e-5 * np.random.default_rng(seed).normal(size=ideal.data.y.shape)
+    data = ideal.data.with_y(ideal.cell.predict(q + turn[:, None] * np.eye(6)[1]) + noise)
+    low = q[:, 1] < np.median(q[:, 1])
+    train, away = data.take(low), data.take(~low)
+    study = studied(robot, train, fit_cell(robot, train, Options(objective="sum"), silent))
+    twice = (Term("gear_error", "J2", {"turns": 2.0}),)
+    bare, part, full = (
+        accuracy(joint(study, terms).cell.error(away)).rms_mm
+        for terms in ((), twice, entire(twice))
+    )
+    assert full < 0.9 * min(bare, part)
+    told = whole(Finding(twice, ("cos", "sin"), ("rad",) * 2, (1.0,) * 2, (1.0,) * 2, 9.0, 0.0),
+                 study.scene)  # fmt: skip
+    assert [term.text for term in told.terms] == ["gear_error:J2:orders=2.0"]
+    assert told.names == ("cos 1/turn", "sin 1/turn", "cos 2/turn", "sin 2/turn")
+    assert len(told.values) == len(told.sigmas) == len(told.units) == 4
+
+
+def test_other_laws_are_already_whole(play: Study) -> None:
+    found = Finding((PLAY,), ("b2",), ("rad",), (1e-4,), (1e-5,), 9.0, 0.0)
+    assert whole(found, play.scene) is found

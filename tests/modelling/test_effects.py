@@ -391,6 +391,18 @@ def test_waves_repeat_so_many_times_a_turn() -> None:
     assert_allclose(again.turn, columns("gear_ripple", "J3", turns=101.0).turn, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("found", "orders"),
+    [([{"turns": 1.0}], 2.0), ([{"turns": 2.0}, {"turns": 3.0}], 3.0), ([{"orders": 2.0}], 2.0)],
+)
+def test_a_gear_error_has_all_orders_up_to_the_highest_found(
+    found: list[dict[str, float]], orders: float
+) -> None:
+    assert EFFECTS["gear_error"].entire(found) == [{"orders": orders}]
+    alike = [{**choice, "joints": 6.0} for choice in found]  # of several joints at once
+    assert EFFECTS["gear_error"].entire(alike) is alike
+
+
 def test_gain_and_coupling_turn_in_proportion() -> None:
     assert_allclose(columns("encoder_gain", "J3").turn[0, 2], -DATA.q[:, 2], rtol=0, atol=0)
     turn = columns("joint_coupling", "J5", source=4.0).turn

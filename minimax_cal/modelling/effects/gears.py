@@ -68,6 +68,18 @@ def waves(scene: Scene, place: str, choice: Choice) -> Columns:
     return Columns(names, ("rad",) * len(names), np.concatenate(parts), fixed=fixed)
 
 
+def every_order(found: Sequence[Choice]) -> Sequence[Choice]:
+    """All orders up to the highest found at a joint, and at least two.
+
+    Where a joint turns half of its sweep, once a turn is nearly geometry.  A fit of twice a turn
+    alone then makes geometry stand for the other, which poses beyond that half do not share.
+    """
+    if any("joints" in choice for choice in found):
+        return found
+    whole = [{"orders": max(2.0, *(v for choice in found for v in choice.values()))}]
+    return found if list(found) == whole else whole
+
+
 GEAR_ERROR = Effect(
     "gear_error",
     "a gear or encoder disc that runs out of true, one to three times a turn",
@@ -78,6 +90,7 @@ GEAR_ERROR = Effect(
         *(at_all(place, sweeping(scene), {"turns": turns}) for turns in (1.0, 2.0, 3.0)),
         *([] if place == "all" else [{"orders": 2.0}]),  # a joint may show none of them alone
     ],
+    entire=every_order,
     lines=True,
     typical=5e-4,
     follows="angle",
