@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from minimax_cal.diagnosing.harmful import harmful
 from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step
 from minimax_cal.diagnosing.study import Study
@@ -38,7 +39,7 @@ class Ladder:
     """Geometry, then with each effect that helps.
 
     taken: numbers of the effects that the ladder took.  With the others groups of poses that were
-    left out, or the training poses themselves, are met no better.
+    left out, or the training poses themselves, are met no better, or whole parts far worse.
     parts: masks (m,) of those groups.
     """
 
@@ -59,18 +60,25 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
-    """The ladder of a study's effects, in their order."""
+def climbed(
+    study: Study, effects: Sequence[Sequence[Term]], but: frozenset[int] = frozenset()
+) -> Ladder:
+    """The ladder of a study's effects, in their order.  but: numbers of those that it leaves."""
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
     for number, terms in enumerate(effects):
+        if number in but:
+            continue
         wide = joint(study, (*fits[-1].terms, *terms))
         told = wide.spared(spared)
         square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
             taken.append(number)
+    worst = harmful(fits[-1], [effects[number] for number in taken])
+    if worst is not None:
+        return climbed(study, effects, but | {taken[worst]})
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
 
 
