@@ -48,11 +48,16 @@ class Named:
 
 @dataclass(frozen=True)
 class Told:
-    """What a diagnosis says.  geometric, final: RMS held out [mm].  closed: share of the gap."""
+    """What a diagnosis says.
+
+    geometric, final: RMS held out; sound: of the points that do not stand out [mm].  closed: share
+    of the gap.
+    """
 
     verdict: str
     geometric: float
     final: float
+    sound: float
     closed: float
     causes: tuple[Named, ...]
 
@@ -77,7 +82,9 @@ def run(split: Split) -> Told:
     )
     steps = found.ladder
     closed = float("nan") if found.closed is None else float(found.closed)
-    return Told(found.verdict, steps[1].holdout.rms_mm, steps[-1].holdout.rms_mm, closed, causes)
+    first, last = steps[1].holdout, steps[-1]
+    accuracies = (first.rms_mm, last.holdout.rms_mm, last.trusted.rms_mm)
+    return Told(found.verdict, *accuracies, closed, causes)
 
 
 def arms_table(arms: Sequence[str], told: Sequence[Sequence[Told]]) -> Table:
@@ -87,16 +94,17 @@ def arms_table(arms: Sequence[str], told: Sequence[Sequence[Told]]) -> Table:
         said = Counter(one.verdict for one in own)
         verdicts = ", ".join(f"{verdict} {count}" for verdict, count in said.most_common())
         middles = (float(np.median([getattr(one, name) for one in own])) for name in (
-            "geometric", "final", "closed", "by_established"))  # fmt: skip
-        before, after, closed, sure = middles
+            "geometric", "final", "sound", "closed", "by_established"))  # fmt: skip
+        before, after, sound, closed, sure = middles
         most = max(one.final for one in own)
-        rows.append((arm, len(own), verdicts, before, after, most, 100.0 * closed, 100.0 * sure))
+        rows.append((arm, len(own), verdicts, before, after, most, sound, 100.0 * closed,
+                     100.0 * sure))  # fmt: skip
     return Table(
         "diagnoses of all poses, a fifth of them held out; medians",
-        ("arm", "splits", "verdicts", "geometry mm", "final mm", "at most mm", "closed %",
-         "by established causes %"),
+        ("arm", "splits", "verdicts", "geometry mm", "final mm", "at most mm",
+         "of sound points mm", "closed %", "by established causes %"),
         tuple(rows),
-        ("", "d", "", ".4f", ".4f", ".4f", ".0f", ".0f"),
+        ("", "d", "", ".4f", ".4f", ".4f", ".4f", ".0f", ".0f"),
     )  # fmt: skip
 
 
@@ -143,8 +151,8 @@ def main(study: Study, arms: str, splits: int) -> None:
     found = study.sweep(run, jobs, "diagnoses")
     told = [found[i : i + splits] for i in range(0, len(found), splits)]
     tables = [arms_table(named, told), names_table(named, told)]
-    keys = ("arm", "splits", "verdicts", "geometric_mm", "final_mm", "most_mm", "closed_percent",
-            "established_percent")  # fmt: skip
+    keys = ("arm", "splits", "verdicts", "geometric_mm", "final_mm", "most_mm", "sound_mm",
+            "closed_percent", "established_percent")  # fmt: skip
     causes = ("arm", "cause", "share_percent", "established", "listed", "turns")
     study.save(tables, {
         "arms": [dict(zip(keys, row, strict=True)) for row in tables[0].rows],

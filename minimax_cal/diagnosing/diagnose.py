@@ -142,11 +142,12 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     study, causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
-    steps = steps_of(asked, study, judges, spoken, ladder)
+    last, late = judges.marked(ladder.last.cell)
+    steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
         progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
-    share, interval = closed(ladder, judges, floor, options.seed)
+    share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
     progress("remainder")
@@ -159,7 +160,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     if not options.quick:
         beyond = beyond_of(study, causes, judges, progress)
     wrong = doubts(robot, study.fit, study.nominal.error(study.data))
-    told = (*asked.data.notices, *notices, *clean.remarks)
+    far = (f"beside what was found, {fault.text}" for fault in late)
+    told = (*asked.data.notices, *notices, *clean.remarks, *far)
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,

@@ -15,6 +15,7 @@ from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.faults import Fault, find_faults, mended
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
@@ -29,7 +30,8 @@ RESAMPLES = 1000
 FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
-FAULTS = ("outliers", "swapped_rows")
+OUTLIERS = "outliers"
+FAULTS = (OUTLIERS, "swapped_rows")
 
 Ends = tuple[float, float]
 
@@ -146,12 +148,29 @@ class Judges:
     far: Array
 
     @property
+    def sound(self) -> Measurements:
+        """The held-out poses without what stands out."""
+        return self.held.with_y(np.where(self.far.T[..., None], np.nan, self.held.y))
+
+    @property
     def everyone(self) -> Measurements:
         """All poses in the order of the file, held-out points that stand out left out."""
-        y = np.where(self.far.T[..., None], np.nan, self.held.y)
-        whole = both(self.train, self.held.with_y(y))
+        whole = both(self.train, self.sound)
         whole = whole.take(np.argsort(whole.line, kind="stable"))
         return whole.take(np.asarray(whole.seen.any(axis=1)))
+
+    def marked(self, cell: Cell) -> tuple[Judges, tuple[Fault, ...]]:
+        """With what stands out from a later fit marked too, and the faults that say so.
+
+        What geometry leaves may hide a point that is off by less.
+        """
+        whole = both(self.train, self.sound)
+        seen = find_faults(cell.placed(whole), cell.error(whole))
+        far = tuple(fault for fault in seen if fault.effect == OUTLIERS)
+        sound = dict(zip(whole.line, mended(whole, far).seen, strict=True))
+        nothing = np.zeros(len(self.far), dtype=bool)
+        kept = np.array([sound.get(line, nothing) for line in self.held.line]).T
+        return replace(self, far=self.held.seen.T & ~kept), far
 
     def step(self, name: str, cell: Cell) -> Step:
         """A rung: the accuracy of a cell."""

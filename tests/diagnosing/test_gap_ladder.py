@@ -183,6 +183,31 @@ def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:
 # ---- who judges --------------------------------------------------------------------------------
 
 
+def test_what_a_gap_hid_is_marked_once_it_is_closed() -> None:
+    """A pose that is off by less than geometry leaves elsewhere, and by more than effects do."""
+    long = study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 1e5),), seed=1)))
+    first, last = (joint(long, terms).cell for terms in ((), (PLAY,)))
+    limits = [
+        12.0 * float(np.median(np.linalg.norm(cell.error(long.data), axis=-1)))
+        for cell in (first, last)
+    ]
+    assert limits[0] > 2.0 * limits[1]
+    y = long.data.y.copy()
+    y[4] += np.sqrt(limits[0] * limits[1]) * np.array([0.6, 0.0, 0.8])  # distances stay
+    odd = np.arange(long.data.poses) % 2 > 0
+    held = long.data.with_y(y).take(~odd)
+    judges = Judges(long.data.take(odd), held, np.zeros_like(held.seen.T))
+    same, none = judges.marked(first)
+    assert_array_equal(same.far, judges.far)
+    assert none == ()
+    marked, found = judges.marked(last)
+    assert np.argwhere(marked.far.any(axis=0)).tolist() == [[2]]
+    assert marked.far[:, 2].all()
+    assert [fault.effect for fault in found] == ["outliers"]
+    step = marked.step("last", last)
+    assert step.holdout.max_mm > 5.0 * step.trusted.max_mm
+
+
 def test_everyone_is_both_parts_in_order_without_what_stands_out(play: Study) -> None:
     judges = judges_of(play)
     everyone = judges.everyone
