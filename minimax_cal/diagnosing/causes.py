@@ -9,7 +9,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import Named, Trace, chance_of, rest_of, structure
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -62,7 +62,7 @@ def causes_of(
     progress("effects")
     lib, choice = chosen(study, exclude)
     traces = left_by(study, choice)
-    left = any(trace.p * len(traces) < STRUCTURE for trace in traces)  # each joint would absorb it
+    left = chance_of(traces) < STRUCTURE  # each joint would absorb it
     plain, study = study, weighed_anew(study, choice.known, each=not left)
     if study is not plain:
         progress("effects beside noises that differ")
@@ -224,9 +224,8 @@ def whole(finding: Finding, scene: Scene) -> Finding:
     names = tuple(name for one in columns for name in one.names)
     units = tuple(unit for one in columns for unit in one.units)
     none = (0.0,) * len(names)
-    return replace(
-        finding, terms=terms, names=names, units=units, values=none, sigmas=none, fixed={}
-    )
+    new = replace(finding, terms=terms, names=names, units=units, values=none, sigmas=none)
+    return replace(new, fixed={}, shown=finding.terms)
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:

@@ -9,7 +9,7 @@ few functions a test: a small unknown effect of one joint is not to drown among 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -28,6 +28,8 @@ from minimax_cal.robots.kinematics import cross
 SHARE = 0.3  # of the degrees of freedom that a test may take at most
 FASTEST = 6  # waves a turn, of two joints together, that are looked for
 STEPS = 5  # joint values at which a joint may jump
+LEAST, MOST = 1e-300, 0.99  # chances as they are combined: one of 1 would outweigh all others
+SWINGS = 12  # half periods of a course, from the first visit to the last, that are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +81,11 @@ def probes(scene: Scene) -> Iterator[Probe]:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
         twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
-        fast = np.array([np.cos(np.pi * k * clock) for k in range(5, 13)])
-        yield Probe("the base to and fro", np.concatenate(twist[:2]), fast)
+        swings = np.array([np.cos(np.pi * k * clock) for k in range(1, SWINGS + 1)])
+        yield Probe("the base to and fro", np.concatenate(twist[:2]), swings[4:])
         yield Probe("the joints with time", scene.jacobian, np.array(course))
+        for j in range(scene.joints):
+            yield Probe(f"J{j + 1} to and fro with time", scene.jacobian[j : j + 1], swings)
     yield from at_targets(scene, np.array(course))
 
 
@@ -258,8 +262,23 @@ def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None
     explained: weighed square that the effects explain.  count: of rows.
     """
     least = max(MATTERS * explained, WORTH * count)
-    loud = [t for t in traces if t.p * len(traces) < STRUCTURE and t.excess > least]
-    return min(loud, key=lambda trace: trace.p, default=None)
+    loud = [t for t in traces if t.excess > least]
+    dumb = [replace(t, p=1.0) for t in traces if not t.excess > least]
+    if not chance_of([*loud, *dumb]) < STRUCTURE:
+        return None
+    return min(loud, key=lambda trace: trace.p)
+
+
+def chance_of(traces: Sequence[Trace]) -> float:
+    """Chance that noise alone shows so much in all traces together, in whatever way they depend.
+
+    The Cauchy combination of their chances [Liu and Xie 2020].  Several that each are rare count
+    together; the smallest times their number, by Bonferroni, would count one.
+    """
+    if not traces:
+        return 1.0
+    p = np.clip([trace.p for trace in traces], LEAST, MOST)
+    return float(stats.cauchy.sf(np.mean(stats.cauchy.isf(p))))
 
 
 def explained(rows: Rows, choice: Choice) -> float:

@@ -92,6 +92,7 @@ class Finding:
     was found again; NaN where poses are too few to ask.  dwarfed: whether it may be what the
     law of a far larger effect lacks.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
+    shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
 
     terms: tuple[Term, ...]
@@ -111,6 +112,7 @@ class Finding:
     again: float = 1.0
     dwarfed: bool = False
     curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
+    shown: tuple[Term, ...] = ()
 
     @property
     def established(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes
 from minimax_cal.diagnosing.gap import Ladder
-from minimax_cal.diagnosing.lack_of_fit import explained, heard
+from minimax_cal.diagnosing.lack_of_fit import chance_of, explained, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
@@ -30,7 +30,7 @@ def judged(
     """
     traces = causes.traces
     worst = min(traces, key=lambda trace: trace.p)
-    structure = (worst.name, min(1.0, worst.p * len(traces)))
+    structure = (worst.name, chance_of(traces))
     sure = [found for found in findings if found.established]
     loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
     if loud:
@@ -57,7 +57,8 @@ def patched(findings: Sequence[Finding], scene: Scene) -> bool:
     if not turns_by_angle(first, scene):
         return False
     several = EFFECTS[first.effect].lines and first.place != "all"
-    if several and len(largest.names) > 2 * ORDERS:
+    shown = sum(len(t.columns(scene).names) for t in largest.shown or largest.terms)
+    if several and shown > 2 * ORDERS:
         return True  # a series, as good for any curve
     others = [f.term for f in findings if f.term is not first and turns_by_angle(f.term, scene)]
     return any("all" in (first.place, t.place) or t.place == first.place for t in others)

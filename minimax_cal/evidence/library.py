@@ -15,7 +15,7 @@ from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
 
 GONE = 1e-8  # share of a field that poses must show
-SHAPES = FREE - {"turns", "since"}  # found by a search whose tries are counted
+SHAPES = FREE - {"turns"}  # found by a search whose tries are counted
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 
 

@@ -108,6 +108,7 @@ def select(
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), noise)
+    lib, fits = refined(lib, fits, level, last=True)  # weighed otherwise now
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
@@ -250,13 +251,19 @@ def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Adde
     return replace(lib, candidates=kept), replace(one, candidate=found)
 
 
-def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, list[Added]]:
-    """Replace each effect by any that does better, and drop what is no longer needed."""
-    if len(fits) <= 1:
+def refined(
+    lib: Library, fits: list[Added], level: float, *, last: bool = False
+) -> tuple[Library, list[Added]]:
+    """Replace each effect by any that does better, and drop what is no longer needed.
+
+    last: whether the last, too, which otherwise was just chosen beside the others.
+    """
+    count = len(fits) - (not last)
+    if count < 1:
         return lib, fits
     for _ in range(3):
         changed = False
-        for number in range(min(len(fits) - 1, REFINED)):  # the last was just chosen beside them
+        for number in range(min(count, REFINED)):
             chosen, others = without(fits, number)
             table = bench(lib, chosen, others)
             own = table.added(fits[number].candidate)
@@ -265,7 +272,7 @@ def refined(lib: Library, fits: list[Added], level: float) -> tuple[Library, lis
                 lib, stored = lib.stored(top.candidate)
                 fits[number], changed = replace(top, candidate=stored), True
             elif table.p_value(own) > level:
-                return refined(lib, others, level)
+                return refined(lib, others, level, last=last)
             else:
                 fits[number] = own
         if not changed:

@@ -163,6 +163,7 @@ def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
     assert [term.text for term in told.terms] == ["gear_error:J2:orders=2.0"]
     assert told.names == ("cos 1/turn", "sin 1/turn", "cos 2/turn", "sin 2/turn")
     assert len(told.values) == len(told.sigmas) == len(told.units) == 4
+    assert told.shown == twice
 
 
 def test_other_laws_are_already_whole(play: Study) -> None:

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from scipy.stats import norm
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import established
-from minimax_cal.diagnosing.lack_of_fit import Trace, heard
+from minimax_cal.diagnosing.lack_of_fit import Trace, chance_of, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import DWARFED, Finding
 from minimax_cal.diagnosing.verdict import patched
@@ -43,7 +45,25 @@ def test_structure_must_be_improbable_and_of_account() -> None:
     assert heard([Trace("a", rare, 500.0), Trace("b", 0.5, 900.0)], 1000.0, 900).name == "a"  # type: ignore[union-attr]
     assert heard([Trace("a", rare, small)], 0.0, 900) is None  # nothing beside the noise
     assert heard([Trace("a", rare, 100.0)], 1e5, 900) is None  # nothing beside what was explained
-    assert heard([Trace("a", limits.STRUCTURE, 500.0)] * 2, 0.0, 900) is None  # two were asked
+    asked = [Trace("a", limits.STRUCTURE, 500.0), Trace("b", 0.5, 500.0)]
+    assert heard(asked, 0.0, 900) is None  # two were asked
+    both = [Trace("a", 0.8 * limits.STRUCTURE, 500.0)] * 2
+    assert heard(both, 0.0, 900) is both[0]  # and both say so
+    small_too = [both[0], replace(both[0], excess=small)]
+    assert heard(small_too, 0.0, 900) is None  # only what matters says anything
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_chances_combine_however_they_depend(alike: float) -> None:
+    """Of normal scores that share a part, a level is undercut about as often as it says."""
+    rng = np.random.default_rng(5)
+    draws = np.sqrt(1.0 - alike) * rng.normal(size=(20000, 20))
+    draws += np.sqrt(alike) * rng.normal(size=(20000, 1))
+    chances = [chance_of([Trace("", p, 1.0) for p in row]) for row in norm.sf(draws)]
+    # 20,000 draws tell a hundredth to 7e-4; the combination is exact for small chances only
+    assert 0.005 < np.mean(np.array(chances) < 0.01) < 0.013
+    assert chance_of([]) == 1.0
+    assert_allclose(chance_of([Trace("", 1e-9, 1.0)]), 1e-9, rtol=1e-6)
 
 
 def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
@@ -66,10 +86,13 @@ def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:
     assert not unknown(("gear_error", "J2", 300.0), ("axis_wobble", "J2", 100.0))  # no turn
     assert not unknown(("gear_ripple", "J2", 300.0), gain)  # a fine wave is another thing
     assert not unknown(("link_bending", "L2", 900.0), ("gear_error", "J2", 100.0), gain)
+    one, two, three = (Term("gear_error", "J2", {"turns": k}) for k in (1.0, 2.0, 3.0))
     orders = finding("gear_error", "J2")
-    orders = replace(orders, terms=(replace(orders.term, choice={"turns": 1.0}),))
-    assert not patched([replace(orders, names=("a",) * 4)], scene)
-    assert patched([replace(orders, names=("a",) * 6)], scene)  # three are a series for any curve
+    assert not patched([replace(orders, terms=(one, two))], scene)
+    assert patched([replace(orders, terms=(one, two, three))], scene)  # a series for any curve
+    entire = (Term("gear_error", "J2", {"orders": 3.0}),)
+    assert patched([replace(orders, terms=entire)], scene)
+    assert not patched([replace(orders, terms=entire, shown=(three,))], scene)
 
 
 @pytest.fixture(scope="module")

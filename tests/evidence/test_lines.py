@@ -116,3 +116,17 @@ def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
     idle = next(c for c in lib.candidates if c.key == ("gear_error", "J4"))
     again = select(lib, first=(idle, right))
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
+
+
+def test_the_only_one_that_other_weights_chose_is_compared_anew() -> None:
+    made = opened("irb120", Cause("backlash", "J2", 500.0))
+    lib, _ = chosen(made, ())
+    alike = next(c for c in lib.candidates if c.key == ("settling", "J2"))
+    again = select(lib, first=(alike,))
+    assert [c.key for c in again.chosen] == [("backlash", "J2")]
+
+
+def test_a_moment_that_is_sought_costs_as_a_parameter_does() -> None:
+    lib, _ = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ())
+    seats = [c for c in lib.candidates if c.term.effect == "target_reseat"]
+    assert {c.shapes for c in seats} == {1}
