@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +22,21 @@ BESIDE = 1.0  # a strain wave gear turns by one more or less than its ratio tell
 
 
 def strongest_lines(
-    scene: Scene, rows: Rows, noise: Noise, known: Array, *, kept: Array | None = None
+    scene: Scene,
+    rows: Rows,
+    noise: Noise,
+    known: Array,
+    *,
+    kept: Array | None = None,
+    heard: Sequence[Term] = (),
 ) -> list[tuple[Term, float]]:
     """The strongest line of each joint near its gear's ratio, and any, if it stays.
 
+    A ratio is told by the robot, else by lines of other joints: arms have few kinds of gears.
+
     With the number of independent frequencies tried of such lines at all joints.  known: (N, q)
-    columns that are fitted already.  kept: (N,) rows that count, None for all.
+    columns that are fitted already.  kept: (N,) rows that count, None for all.  heard: lines that
+    were found.
     """
     weight = noise.weights(rows) * (1.0 if kept is None else kept)
     pull = weight * remaining(rows, weight, known)
@@ -38,10 +48,13 @@ def strongest_lines(
         score = (arms[:, j] * pull).reshape(scene.poses, -1).sum(axis=1)
         size = (arms[:, j] ** 2 * weight).reshape(scene.poses, -1).sum(axis=1)
         line, place = Line(scene.q[j], score, size), f"J{j + 1}"
-        for low, high in bands(abs(float(scene.robot.ratio[j]))):
+        told = bands(abs(float(scene.robot.ratio[j])))
+        others = [term.choice["turns"] for term in heard if term.place != place]
+        for low, high in told or alike(others):
             turns, tries = line.strongest(low, high)
-            near.append(Term("gear_ripple", place, {"turns": turns}))
             tried_near += tries
+            if told or line.stays(turns):
+                near.append(Term("gear_ripple", place, {"turns": turns}))
         turns, tries = line.strongest(SLOWEST, FASTEST)
         tried += tries
         if line.stays(turns):
@@ -52,6 +65,19 @@ def strongest_lines(
 def bands(ratio: float) -> list[tuple[float, float]]:
     """Where lines of a gear may be, whose ratio is told; none for NaN."""
     return [(k * (ratio - BESIDE), k * (ratio + BESIDE)) for k in TIMES if ratio > SLOWEST]
+
+
+def alike(heard: Sequence[float]) -> list[tuple[float, float]]:
+    """Where lines of a gear may be that is of the kind of others, whose lines were heard."""
+    ratios = {one / k for one in heard for k in TIMES}
+    wide = sorted(band for ratio in ratios for band in bands(ratio) if band[1] <= FASTEST)
+    out: list[tuple[float, float]] = []
+    for low, high in wide:
+        if out and low <= out[-1][1]:
+            out[-1] = (out[-1][0], max(high, out[-1][1]))
+        else:
+            out.append((low, high))
+    return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,7 +112,10 @@ def select(
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
-            found = strongest_lines(lib.scene, lib.rows, noise, known, kept=lib.products.kept)
+            heard = [one.candidate.term for one in fits if one.candidate.is_line]
+            found = strongest_lines(
+                lib.scene, lib.rows, noise, known, kept=lib.products.kept, heard=heard
+            )
             lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:

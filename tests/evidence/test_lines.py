@@ -13,7 +13,7 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import Line, bands, strongest_lines
+from minimax_cal.evidence.periodogram import Line, alike, bands, strongest_lines
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
@@ -130,3 +130,26 @@ def test_a_moment_that_is_sought_costs_as_a_parameter_does() -> None:
     lib, _ = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ())
     seats = [c for c in lib.candidates if c.term.effect == "target_reseat"]
     assert {c.shapes for c in seats} == {1}
+
+
+@pytest.mark.parametrize(
+    ("heard", "expected"),
+    [
+        ([], []),
+        ([100.2], [(49.1, 51.1), (98.2, 102.2), (198.4, 202.4)]),
+        ([100.2, 50.3], [(24.15, 26.15), (48.3, 52.3), (98.2, 102.6), (198.4, 202.4)]),
+        ([9.0], [(8.0, 10.0), (16.0, 20.0)]),  # of half as many no gear has teeth
+    ],
+)
+def test_gears_of_a_kind_are_sought_at_their_ratio(
+    heard: list[float], expected: list[tuple[float, float]]
+) -> None:
+    assert_allclose(np.array(alike(heard)).reshape(-1, 2), np.array(expected).reshape(-1, 2))
+
+
+@pytest.mark.parametrize("strong", [20.0, 2000.0])
+def test_a_faint_line_is_found_where_another_joint_has_the_like(strong: float) -> None:
+    faint, loud = Cause("gear_ripple", "J1", 24.0, 1), Cause("gear_ripple", "J2", strong, 1)
+    _, choice = chosen(opened("irb120", faint, loud, seed=5, told=False), ())
+    found = {c.key for c in choice.chosen}
+    assert (("gear_ripple", "J1") in found) == (strong > 100.0)
