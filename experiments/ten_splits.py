@@ -76,7 +76,9 @@ def run(split: Split) -> Told:
             f"{one.term.effect} {one.term.place}",
             one.established,
             float(np.nan_to_num(one.share)),
-            tuple(term.choice["turns"] for term in one.terms if "turns" in term.choice),
+            tuple(
+                term.choice["turns"] for term in one.shown or one.terms if "turns" in term.choice
+            ),
         )
         for one in found.findings
     )

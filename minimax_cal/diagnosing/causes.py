@@ -23,7 +23,7 @@ from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
-from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 
@@ -167,14 +167,21 @@ def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     for number in by_weight(choice):
         term = choice.chosen[number].term
         out.setdefault((term.effect, term.place), []).append(term)
-    return [entire(terms) for terms in out.values()]
+    chosen = [candidate.term for candidate in choice.chosen]
+    return [entire(terms, chosen) for terms in out.values()]
 
 
-def entire(terms: Sequence[Term]) -> tuple[Term, ...]:
-    """The whole of an effect's law, of which its terms may be what shows."""
-    first = terms[0]
-    found = [term.choice for term in terms]
-    whole = EFFECTS[first.effect].entire(found)
+def entire(terms: Sequence[Term], chosen: Sequence[Term]) -> tuple[Term, ...]:
+    """The whole of an effect's law, of which its terms may be what shows.
+
+    chosen: all that was.
+    """
+    first, found = terms[0], [term.choice for term in terms]
+    wide = [t.choice for t in chosen if t.effect == first.effect and "joints" in t.choice]
+    beside = [
+        c for c in wide if first.place[:1] == "J" and joint_of(first.place) in unmasked(c["joints"])
+    ]
+    whole = EFFECTS[first.effect].entire(found, beside)
     return tuple(terms) if whole is found else tuple(replace(first, choice=one) for one in whole)
 
 
@@ -215,17 +222,25 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
     )
 
 
-def whole(finding: Finding, scene: Scene) -> Finding:
-    """A finding with the whole of its law, whose values are those of a fit that comes."""
-    terms = entire(finding.terms)
+def whole(finding: Finding, chosen: Sequence[Term], scene: Scene) -> Finding:
+    """A finding with the whole of its law, whose values are those of a fit that comes.
+
+    chosen: the terms of all that was.
+    """
+    terms = entire(finding.terms, chosen)
     if terms == finding.terms:
         return finding
     columns = [term.columns(scene) for term in terms]
-    names = tuple(name for one in columns for name in one.names)
+    apart = len(terms) > 1  # then each is called by its waves
+    names = tuple(
+        f"{name} {term.choice['turns']:g}/turn" if apart else name
+        for term, one in zip(terms, columns, strict=True)
+        for name in one.names
+    )
     units = tuple(unit for one in columns for unit in one.units)
     none = (0.0,) * len(names)
     new = replace(finding, terms=terms, names=names, units=units, values=none, sigmas=none)
-    return replace(new, fixed={}, shown=finding.terms)
+    return replace(new, shown=finding.terms)
 
 
 def merged(findings: Sequence[Finding]) -> list[Finding]:

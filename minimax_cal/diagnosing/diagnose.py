@@ -46,6 +46,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
+from minimax_cal.measuring.faults.fault import listed
 from minimax_cal.measuring.floor import Floor, floor_of
 from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
@@ -142,7 +143,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     study, causes = causes_of(study, clean.faults, options.exclude, progress)
     noise = causes.choice.noise
     causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
-    last, late = judges.marked(ladder.last.cell)
+    last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
         progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
@@ -160,7 +161,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     if not options.quick:
         beyond = beyond_of(study, causes, judges, progress)
     wrong = doubts(robot, study.fit, study.nominal.error(study.data))
-    far = (f"beside what was found, {fault.text}" for fault in late)
+    far = (
+        (f"points that stand out beside all that was found: {listed(list(late))}",) if late else ()
+    )
     told = (*asked.data.notices, *notices, *clean.remarks, *far)
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
@@ -196,7 +199,8 @@ def in_rungs(
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
     progress("gap ladder")
     often = [f for f in causes.effects if not f.again < WEAK]
-    spoken = replace(causes, effects=tuple(whole(f, study.scene) for f in often))
+    chosen = [term for finding in often for term in finding.terms]
+    spoken = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
     if JOINT_ERROR_MAP.name in exclude:
         return causes, spoken, ladder

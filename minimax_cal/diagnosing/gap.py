@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.harmful import harmful
 from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step
 from minimax_cal.diagnosing.study import Study
@@ -15,7 +14,7 @@ from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.faults import Fault, find_faults, mended
+from minimax_cal.measuring.faults import find_faults, mended
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
@@ -31,6 +30,7 @@ FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
 OUTLIERS = "outliers"
+ALIKE = 0.5  # of a point's error, which geometry alone must see too if the point is wrong
 FAULTS = (OUTLIERS, "swapped_rows")
 
 Ends = tuple[float, float]
@@ -41,7 +41,7 @@ class Ladder:
     """Geometry, then with each effect that helps.
 
     taken: numbers of the effects that the ladder took.  With the others groups of poses that were
-    left out, or the training poses themselves, are met no better, or whole parts far worse.
+    left out, or the training poses themselves, are met no better.
     parts: masks (m,) of those groups.
     """
 
@@ -62,25 +62,18 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(
-    study: Study, effects: Sequence[Sequence[Term]], but: frozenset[int] = frozenset()
-) -> Ladder:
-    """The ladder of a study's effects, in their order.  but: numbers of those that it leaves."""
+def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
+    """The ladder of a study's effects, in their order."""
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
     for number, terms in enumerate(effects):
-        if number in but:
-            continue
         wide = joint(study, (*fits[-1].terms, *terms))
         told = wide.spared(spared)
         square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
         if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
             fits.append(wide)
             taken.append(number)
-    worst = harmful(fits[-1], [effects[number] for number in taken])
-    if worst is not None:
-        return climbed(study, effects, but | {taken[worst]})
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
 
 
@@ -159,18 +152,24 @@ class Judges:
         whole = whole.take(np.argsort(whole.line, kind="stable"))
         return whole.take(np.asarray(whole.seen.any(axis=1)))
 
-    def marked(self, cell: Cell) -> tuple[Judges, tuple[Fault, ...]]:
-        """With what stands out from a later fit marked too, and the faults that say so.
+    def marked(self, first: Cell, last: Cell) -> tuple[Judges, tuple[str, ...]]:
+        """With what stands out from the last fit marked too, and the points, of all poses.
 
-        What geometry leaves may hide a point that is off by less.
+        What geometry leaves may hide a point that is off by less.  Of one that is wrong the first
+        fit, of geometry alone, says nearly the same: one that only the last misses is its own.
         """
         whole = both(self.train, self.sound)
-        seen = find_faults(cell.placed(whole), cell.error(whole))
-        far = tuple(fault for fault in seen if fault.effect == OUTLIERS)
-        sound = dict(zip(whole.line, mended(whole, far).seen, strict=True))
+        whole = whole.take(np.argsort(whole.line, kind="stable"))  # as it was visited
+        before, error = (cell.error(whole) for cell in (first, last))
+        seen = find_faults(last.placed(whole), error)
+        sound = mended(whole, tuple(fault for fault in seen if fault.effect == OUTLIERS)).seen
+        alike = (before * error).sum(axis=-1) > ALIKE * (error**2).sum(axis=-1)
+        far = whole.seen & ~sound & alike.T
+        points = [f"line {whole.line[row]} {whole.target_names[i]}" for row, i in np.argwhere(far)]
+        lost = dict(zip(whole.line, far, strict=True))
         nothing = np.zeros(len(self.far), dtype=bool)
-        kept = np.array([sound.get(line, nothing) for line in self.held.line]).T
-        return replace(self, far=self.held.seen.T & ~kept), far
+        more = np.array([lost.get(line, nothing) for line in self.held.line]).T
+        return replace(self, far=self.far | more), tuple(points)
 
     def step(self, name: str, cell: Cell) -> Step:
         """A rung: the accuracy of a cell."""

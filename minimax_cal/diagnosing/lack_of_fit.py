@@ -81,9 +81,10 @@ def probes(scene: Scene) -> Iterator[Probe]:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
         twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
+        yield Probe("the joints with time", scene.jacobian, np.array(course))
+    if np.ptp(clock) > 0.0:
         swings = np.array([np.cos(np.pi * k * clock) for k in range(1, SWINGS + 1)])
         yield Probe("the base to and fro", np.concatenate(twist[:2]), swings[4:])
-        yield Probe("the joints with time", scene.jacobian, np.array(course))
         for j in range(scene.joints):
             yield Probe(f"J{j + 1} to and fro with time", scene.jacobian[j : j + 1], swings)
     yield from at_targets(scene, np.array(course))
@@ -263,8 +264,8 @@ def heard(traces: Sequence[Trace], explained: float, count: int) -> Trace | None
     """
     least = max(MATTERS * explained, WORTH * count)
     loud = [t for t in traces if t.excess > least]
-    dumb = [replace(t, p=1.0) for t in traces if not t.excess > least]
-    if not chance_of([*loud, *dumb]) < STRUCTURE:
+    quiet = [replace(t, p=max(t.p, 0.5)) for t in traces if not t.excess > least]
+    if not chance_of([*loud, *quiet]) < STRUCTURE:
         return None
     return min(loud, key=lambda trace: trace.p)
 
@@ -273,11 +274,13 @@ def chance_of(traces: Sequence[Trace]) -> float:
     """Chance that noise alone shows so much in all traces together, in whatever way they depend.
 
     The Cauchy combination of their chances [Liu and Xie 2020].  Several that each are rare count
-    together; the smallest times their number, by Bonferroni, would count one.
+    together; the smallest times their number, by Bonferroni, would count one.  A chance of 1 is of
+    a question that these data cannot be asked.
     """
-    if not traces:
+    asked = [trace.p for trace in traces if trace.p < 1.0]
+    if not asked:
         return 1.0
-    p = np.clip([trace.p for trace in traces], LEAST, MOST)
+    p = np.clip(asked, LEAST, MOST)
     return float(stats.cauchy.sf(np.mean(stats.cauchy.isf(p))))
 
 

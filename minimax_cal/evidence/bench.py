@@ -392,17 +392,19 @@ def with_signs(gram: Array, pull: Array, fits: Sequence[Added]) -> Array:
     return bounded(gram, pull, low, high)
 
 
-def together(lib: Library, fits: Sequence[Added], noise: Noise) -> tuple[tuple[Array, Array], ...]:
+def together(
+    lib: Library, fits: Sequence[Added], noise: Noise, *, free: bool = False
+) -> tuple[tuple[Array, Array], ...]:
     """Values and sigmas (d,) of the parameters of effects, estimated together.
 
-    No value has a sign that no body has; sigmas are those of free values.
+    No value has a sign that no body has, unless it is free; sigmas are those of free values.
     fits: the effects; their values are the sizes of their doubts.
     """
     if not fits:
         return ()
     gram, pull, scale = normal_equations(lib, fits, noise)
     inverse = np.linalg.pinv(gram, 1e-12, hermitian=True)
-    signed = any(one.candidate.upward.any() for one in fits)
+    signed = not free and any(one.candidate.upward.any() for one in fits)
     value = (with_signs(gram, pull, fits) if signed else inverse @ pull) / scale
     sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
     cuts = np.cumsum([len(one.candidate.main) for one in fits])

@@ -108,7 +108,9 @@ def select(
     noise = noise_beside(lib, fits)
     if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), noise)
-    lib, fits = refined(lib, fits, level, last=True)  # weighed otherwise now
+    if fits:  # weighed otherwise now
+        lib, fits = refined(lib, fits, level, last=True)
+        noise = noise_beside(lib, fits)
     for _ in range(most):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
@@ -137,7 +139,7 @@ def select(
 def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
     """The effects without those that the others made needless, the weakest first."""
     while fits:
-        values = together(lib, fits, noise_beside(lib, fits))
+        values = together(lib, fits, noise_beside(lib, fits), free=True)
         weakest = int(np.argmin([np.mean((v / np.maximum(s, 1e-300)) ** 2) for v, s in values]))
         chosen, others = without(fits, weakest)
         table = bench(lib, chosen, others)

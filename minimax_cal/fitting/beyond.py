@@ -169,9 +169,8 @@ def needed(poses: Poses, part: Array) -> bool:
         np.sqrt(np.maximum(np.linalg.eigvalsh(one / np.outer(scale, scale)), 0.0))
         for one in (gram, gram - poses.gram_of(part))
     )
-    condition = whole[-1] / max(whole[0], 1e-300)
     had, kept = (int((one > RANK * one[-1]).sum()) for one in (whole, rest))
-    return bool(kept < had or rest[-1] > WORSE * condition * rest[0])
+    return bool(kept < had or rest[-1] * whole[-had] > WORSE * whole[-1] * rest[-had])
 
 
 def step_without(poses: Poses, part: Array) -> Array:

@@ -290,3 +290,25 @@ def test_another_robots_file_is_said() -> None:
     found = mc.diagnose(made.robot.with_mdh(longer), made.data, quick=True)
     assert any("is the robot" in note for note in found.notices)
     assert not any("is the robot" in note for note in diagnosed().notices)
+
+
+def test_the_whole_law_is_told_and_a_point_that_the_gap_hid() -> None:
+    """A gear that errs by far more than what is left, and a held-out pose off by less than that."""
+    made = make(Case("irb2600", "single", (Cause("gear_error", "J3", 5e4),), seed=3))
+    bare = mc.diagnose(made.robot, made.data, quick=True)
+    held, size = bare.data.line[bare.held], [step.holdout.rms_mm for step in bare.ladder[1:]]
+    assert size[0] > 6.0 * size[-1]
+    row = int(np.flatnonzero(made.data.line == held[3])[0])
+    y = made.data.y.copy()
+    y[row] += 1e-3 * np.sqrt(size[0] * size[-1]) * np.array([8.0, 0.0, 0.0])
+    found = mc.diagnose(made.robot, made.data.with_y(y), quick=True)
+    (gear,) = found.findings
+    assert [term.text for term in gear.terms] == ["gear_error:J3:orders=2.0"]
+    assert [term.text for term in gear.shown] == ["gear_error:J3:turns=1.0"]
+    assert len(gear.names) == len(gear.values) == len(gear.sigmas) == 4
+    assert all(sigma > 0.0 for sigma in gear.sigmas)
+    (said,) = [notice for notice in found.notices if "beside all that was found" in notice]
+    assert f"line {held[3]} smr1" in said
+    last = found.ladder[-1]
+    assert sum(last.holdout.counts) - sum(last.trusted.counts) == len(made.data.target_names)
+    assert last.holdout.max_mm > 3.0 * last.trusted.max_mm

@@ -97,3 +97,12 @@ def test_a_fold_is_sought_and_fitted_on_its_rows_alone(play: Study) -> None:
     other = replace(play, data=play.data.with_y(spoilt))
     again = fold_of(other, causes, rows, play.fit.state)
     assert_allclose(again.last.state.effects, found.last.state.effects, rtol=1e-12)
+
+
+def test_a_fold_fits_the_whole_of_a_law() -> None:
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J3", 2000.0),), seed=3)))
+    study, causes = causes_of(study, (), (), silent)
+    assert [c.term.text for c in causes.choice.chosen] == ["gear_error:J3:turns=1.0"]
+    rows = np.arange(study.data.poses) % 6 > 0
+    fold = fold_of(study, causes, rows, study.fit.state)
+    assert [term.text for term in fold.last.terms] == ["gear_error:J3:orders=2.0"]

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from problems_fit import study_of
 
+import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import gap
 from minimax_cal.diagnosing.gap import (
@@ -40,6 +41,7 @@ from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.effects.maps import curve_of, usual
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.simulate import simulate
 
 PLAY = Term("backlash", "J2")
 SOFT = Term("joint_compliance", "J3", {"parts": 128.0})
@@ -197,15 +199,40 @@ def test_what_a_gap_hid_is_marked_once_it_is_closed() -> None:
     odd = np.arange(long.data.poses) % 2 > 0
     held = long.data.with_y(y).take(~odd)
     judges = Judges(long.data.take(odd), held, np.zeros_like(held.seen.T))
-    same, none = judges.marked(first)
+    same, none = judges.marked(first, first)
     assert_array_equal(same.far, judges.far)
     assert none == ()
-    marked, found = judges.marked(last)
+    marked, found = judges.marked(first, last)
     assert np.argwhere(marked.far.any(axis=0)).tolist() == [[2]]
     assert marked.far[:, 2].all()
-    assert [fault.effect for fault in found] == ["outliers"]
+    assert found == tuple(f"line {held.line[2]} {name}" for name in held.target_names)
     step = marked.step("last", last)
     assert step.holdout.max_mm > 5.0 * step.trusted.max_mm
+    mine, _ = judges.marked(last, first)  # what only a model misses is its own
+    assert not (mine.far & ~marked.far).any()
+
+
+def test_what_only_the_last_fit_misses_is_its_own() -> None:
+    made = study_of(make(Case("irb2600", "single", (Cause("backlash", "J2", 300.0),), seed=1)))
+    first = joint(made, ()).cell
+    bent = replace(first, target_positions=first.target_positions + 5e-3)
+    data = made.data
+    judges = Judges(data.take(np.arange(1, data.poses)), data.take(np.arange(1)),
+                    np.zeros((len(data.target_names), 1), dtype=bool))  # fmt: skip
+    assert judges.marked(first, bent)[1] == ()
+
+
+@pytest.mark.parametrize("column", ["order", "time"])
+def test_a_nest_that_moved_makes_no_points_stand_out(column: str) -> None:
+    """Whichever poses are held out: rows are looked at as they were visited."""
+    made = simulate(mc.load_robot("irb2600"), 120, seed=4).data
+    away = made.y[60:, 1] - made.y[60:, 0]
+    y = made.y.copy()
+    y[60:, 1] += 1e-3 * away / np.linalg.norm(away, axis=1, keepdims=True)  # on the flange
+    data = replace(made.with_y(y), columns={column: np.arange(120.0)})
+    found = mc.diagnose("irb2600", data, quick=True)
+    assert not [notice for notice in found.notices if "beside all that was found" in notice]
+    assert found.ladder[-1].trusted.counts == found.ladder[-1].holdout.counts
 
 
 def test_everyone_is_both_parts_in_order_without_what_stands_out(play: Study) -> None:

@@ -16,6 +16,7 @@ from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.modelling.effects.scene import mask_of
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import simulate
 
@@ -155,17 +156,26 @@ def test_a_gear_is_fitted_in_all_its_orders(seed: int) -> None:
     twice = (Term("gear_error", "J2", {"turns": 2.0}),)
     bare, part, full = (
         accuracy(joint(study, terms).cell.error(away)).rms_mm
-        for terms in ((), twice, entire(twice))
+        for terms in ((), twice, entire(twice, twice))
     )
     assert full < 0.9 * min(bare, part)
-    told = whole(Finding(twice, ("cos", "sin"), ("rad",) * 2, (1.0,) * 2, (1.0,) * 2, 9.0, 0.0),
-                 study.scene)  # fmt: skip
+    found = Finding(twice, ("cos", "sin"), ("rad",) * 2, (1.0,) * 2, (1.0,) * 2, 9.0, 0.0)
+    told = whole(found, twice, study.scene)
     assert [term.text for term in told.terms] == ["gear_error:J2:orders=2.0"]
     assert told.names == ("cos 1/turn", "sin 1/turn", "cos 2/turn", "sin 2/turn")
     assert len(told.values) == len(told.sigmas) == len(told.units) == 4
     assert told.shown == twice
+    every = Term("gear_error", "all", {"turns": 1.0, "joints": mask_of(range(6))})
+    kept = whole(found, (*twice, every), study.scene)  # once a turn is known of all joints
+    assert [term.text for term in kept.terms] == ["gear_error:J2:turns=2.0"]
+    third = (Term("gear_error", "J2", {"turns": 3.0}),)
+    told = whole(replace(found, terms=third), (*third, every), study.scene)
+    assert [term.choice for term in told.terms] == [{"turns": 2.0}, {"turns": 3.0}]
+    assert told.names == ("cos 2/turn", "sin 2/turn", "cos 3/turn", "sin 3/turn")
+    elsewhere = Term("gear_error", "all", {"turns": 1.0, "joints": mask_of([3, 4])})
+    assert [t.choice for t in entire(twice, (*twice, elsewhere))] == [{"orders": 2.0}]
 
 
 def test_other_laws_are_already_whole(play: Study) -> None:
     found = Finding((PLAY,), ("b2",), ("rad",), (1e-4,), (1e-5,), 9.0, 0.0)
-    assert whole(found, play.scene) is found
+    assert whole(found, (PLAY,), play.scene) is found

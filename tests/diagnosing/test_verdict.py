@@ -63,6 +63,9 @@ def test_chances_combine_however_they_depend(alike: float) -> None:
     # 20,000 draws tell a hundredth to 7e-4; the combination is exact for small chances only
     assert 0.005 < np.mean(np.array(chances) < 0.01) < 0.013
     assert chance_of([]) == 1.0
+    unasked = [Trace("", 1.0, 0.0), Trace("", float("nan"), 0.0)]  # what cannot be asked says none
+    assert chance_of(unasked) == 1.0
+    assert_allclose(chance_of([Trace("", 1e-3, 1.0), *unasked]), 1e-3)
     assert_allclose(chance_of([Trace("", 1e-9, 1.0)]), 1e-9, rtol=1e-6)
 
 

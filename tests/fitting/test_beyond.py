@@ -84,12 +84,13 @@ class Rows:
         return cast(Array, self.rows[part].T @ self.rows[part])
 
 
+@pytest.mark.parametrize("weight", [0.0, 1e-2 * RANK**2])
 @pytest.mark.parametrize(
     ("apart", "lost"),
     [([1.0, 1.0, 1.0, 1.0], False), ([0.0, 0.0, 0.0, 0.0], False), ([1.0, 0.0, 0.0, 0.0], True)],
 )
-def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool) -> None:
+def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool, weight: float) -> None:
     """Of two parameters with nearly the same columns: told by all poses, by none, by the first."""
     rows: Any = np.stack([np.ones(4), 1.0 + np.array(apart) * [1e-2, -1e-2, 1e-2, -1e-2]], axis=1)
-    poses = Rows(rows, 1e-2 * RANK**2)
+    poses = Rows(rows, weight)
     assert needed(cast(Poses, poses), np.arange(4) == 0) is lost

@@ -398,9 +398,19 @@ def test_waves_repeat_so_many_times_a_turn() -> None:
 def test_a_gear_error_has_all_orders_up_to_the_highest_found(
     found: list[dict[str, float]], orders: float
 ) -> None:
-    assert EFFECTS["gear_error"].entire(found) == [{"orders": orders}]
+    assert EFFECTS["gear_error"].entire(found, ()) == [{"orders": orders}]
     alike = [{**choice, "joints": 6.0} for choice in found]  # of several joints at once
-    assert EFFECTS["gear_error"].entire(alike) is alike
+    assert EFFECTS["gear_error"].entire(alike, ()) is alike
+    beside = [{"turns": 1.0, "joints": 6.0}]
+    rest = [{"turns": float(k)} for k in range(2, int(orders) + 1)]
+    assert list(EFFECTS["gear_error"].entire(found, beside)) == rest
+
+
+def test_the_whole_of_a_law_can_be_asked_for() -> None:
+    (term,) = terms(SCENE, ["gear_error:J2:orders=3"])
+    assert term.choice == {"orders": 3.0}
+    with pytest.raises(mc.CalibrationError, match="no orders 4; choose 2, 3"):
+        terms(SCENE, ["gear_error:J2:orders=4"])
 
 
 def test_gain_and_coupling_turn_in_proportion() -> None:

@@ -68,15 +68,18 @@ def waves(scene: Scene, place: str, choice: Choice) -> Columns:
     return Columns(names, ("rad",) * len(names), np.concatenate(parts), fixed=fixed)
 
 
-def every_order(found: Sequence[Choice]) -> Sequence[Choice]:
-    """All orders up to the highest found at a joint, and at least two.
+def every_order(found: Sequence[Choice], beside: Sequence[Choice]) -> Sequence[Choice]:
+    """All orders up to the highest found at a joint, and at least two, but those found of `all`.
 
     Where a joint turns half of its sweep, once a turn is nearly geometry.  A fit of twice a turn
     alone then makes geometry stand for the other, which poses beyond that half do not share.
     """
     if any("joints" in choice for choice in found):
         return found
-    whole = [{"orders": max(2.0, *(v for choice in found for v in choice.values()))}]
+    highest = int(max(2.0, *(v for choice in found for v in choice.values())))
+    had = {choice["turns"] for choice in beside}
+    orders = [{"turns": float(k)} for k in range(1, highest + 1) if k not in had]
+    whole: list[Choice] = [{"orders": float(highest)}] if len(orders) == highest else [*orders]
     return found if list(found) == whole else whole
 
 

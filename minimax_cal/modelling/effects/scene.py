@@ -273,8 +273,8 @@ class Effect:
     columns: its `Columns` at a place, for a choice.  needs: what the data lack, '' if nothing.
     choices: the variants of the law at a place that are worth trying.
     finer: variants near one that was chosen, to try afterwards.
-    entire: of the variants found at a place those that are estimated instead, where what shows may
-    be but a part of it.
+    entire: of the variants found at a place, beside others of `all` places that hold it too, those
+    that are estimated instead, where what shows may be but a part of it.
     positive: whether its parameters are compliances, which cannot be negative, but for those that
     its columns say may have either sign.
     lines: whether several of its variants at one place are one cause: waves of one gear.
@@ -298,7 +298,9 @@ class Effect:
     needs: Callable[[Scene], str] = lambda scene: ""
     choices: Callable[[Scene, str], Sequence[Choice]] = lambda scene, place: PLAIN
     finer: Callable[[Scene, Choice], Sequence[Choice]] = lambda scene, choice: ()
-    entire: Callable[[Sequence[Choice]], Sequence[Choice]] = lambda found: found
+    entire: Callable[[Sequence[Choice], Sequence[Choice]], Sequence[Choice]] = (
+        lambda found, beside: found
+    )
     positive: bool = False
     lines: bool = False
     typical: float = np.inf

@@ -179,7 +179,10 @@ def terms(
         if place not in places:
             here = ", ".join(places) or "none with these data"
             raise OptionError(f"effect {name}: no place {place!r}; choose {here}")
-        choices = variants(text, effect.choices(scene, place), given)
+        choices = effect.choices(scene, place)
+        if given:  # what a diagnosis writes may be the whole of what it found
+            choices = [*choices, *(one for c in choices for one in effect.entire([c], ()))]
+        choices = variants(text, choices, given)
         several = [Term(name, place, choice) for choice in choices]
         try:
             term = pick(out, several) if len(several) > 1 else several[0]
