@@ -25,7 +25,7 @@ from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as Entry
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.faults import find_faults, mended
+from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.history import clock, numbered, with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -140,8 +140,7 @@ def run(job: Job) -> Claim | None:
 
 def sound(cell: Cell, data: Measurements) -> Measurements:
     """Measurements without the points that stand out from a fit."""
-    found = find_faults(cell.placed(data), cell.error(data))
-    return mended(data, tuple(fault for fault in found if fault.effect == "outliers"))
+    return mended(data, standing_out(cell.placed(data), cell.error(data)))
 
 
 def rows_of(jobs: Sequence[Job], claims: Sequence[Claim | None]) -> list[tuple[Entry, ...]]:

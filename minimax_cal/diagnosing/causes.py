@@ -167,22 +167,20 @@ def effects_of(choice: Choice) -> list[tuple[Term, ...]]:
     for number in by_weight(choice):
         term = choice.chosen[number].term
         out.setdefault((term.effect, term.place), []).append(term)
-    chosen = [candidate.term for candidate in choice.chosen]
-    return [entire(terms, chosen) for terms in out.values()]
+    every = [candidate.term for candidate in choice.chosen]
+    return [entire(terms, every) for terms in out.values()]
 
 
-def entire(terms: Sequence[Term], chosen: Sequence[Term]) -> tuple[Term, ...]:
+def entire(terms: Sequence[Term], every: Sequence[Term]) -> tuple[Term, ...]:
     """The whole of an effect's law, of which its terms may be what shows.
 
-    chosen: all that was.
+    every: the terms of all effects.
     """
     first, found = terms[0], [term.choice for term in terms]
-    wide = [t.choice for t in chosen if t.effect == first.effect and "joints" in t.choice]
-    beside = [
-        c for c in wide if first.place[:1] == "J" and joint_of(first.place) in unmasked(c["joints"])
-    ]
-    whole = EFFECTS[first.effect].entire(found, beside)
-    return tuple(terms) if whole is found else tuple(replace(first, choice=one) for one in whole)
+    joint = joint_of(first.place) if first.place[:1] == "J" else None
+    wide = [t.choice for t in every if t.effect == first.effect and "joints" in t.choice]
+    law = EFFECTS[first.effect].entire(found, [c for c in wide if joint in unmasked(c["joints"])])
+    return tuple(terms) if law is found else tuple(replace(first, choice=one) for one in law)
 
 
 def finding(study: Study, choice: Choice, number: int) -> Finding:
@@ -222,21 +220,20 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
     )
 
 
-def whole(finding: Finding, chosen: Sequence[Term], scene: Scene) -> Finding:
+def whole(finding: Finding, every: Sequence[Term], scene: Scene) -> Finding:
     """A finding with the whole of its law, whose values are those of a fit that comes.
 
-    chosen: the terms of all that was.
+    every: the terms of all effects.
     """
-    terms = entire(finding.terms, chosen)
+    terms = entire(finding.terms, every)
     if terms == finding.terms:
         return finding
     columns = [term.columns(scene) for term in terms]
-    apart = len(terms) > 1  # then each is called by its waves
-    names = tuple(
-        f"{name} {term.choice['turns']:g}/turn" if apart else name
+    named = [
+        by_waves(one.names, term.choice["turns"]) if len(terms) > 1 else one.names
         for term, one in zip(terms, columns, strict=True)
-        for name in one.names
-    )
+    ]
+    names = tuple(name for part in named for name in part)
     units = tuple(unit for one in columns for unit in one.units)
     none = (0.0,) * len(names)
     new = replace(finding, terms=terms, names=names, units=units, values=none, sigmas=none)
@@ -250,7 +247,7 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
     for key, found in zip(keys, findings, strict=True):
         turns = found.fixed.get("waves_per_turn")
         if turns and (EFFECTS[key[0]].follows == "wave" or keys.count(key) > 1):
-            names = tuple(f"{name} {turns:.4g}/turn" for name in found.names)
+            names = by_waves(found.names, turns)
             found = replace(found, names=names, fixed={f"waves_per_turn {turns:.4g}": turns})
         if key not in out:
             out[key] = found
@@ -270,6 +267,11 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
             fixed={**first.fixed, **found.fixed},
         )
     return list(out.values())
+
+
+def by_waves(names: Sequence[str], turns: float) -> tuple[str, ...]:
+    """Parameters of one of several lines, called by its waves a turn."""
+    return tuple(f"{name} {turns:.4g}/turn" for name in names)
 
 
 def fault_findings(faults: Sequence[Fault]) -> list[Finding]:

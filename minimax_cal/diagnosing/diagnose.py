@@ -20,6 +20,7 @@ from minimax_cal.diagnosing.gap import (
     Ladder,
     climbed,
     closed,
+    of_lines,
     shaky,
     valued,
     with_shares,
@@ -45,7 +46,14 @@ from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring import checks
-from minimax_cal.measuring.faults import Fault, find_faults, in_lines, mended, session_jumps
+from minimax_cal.measuring.faults import (
+    Fault,
+    find_faults,
+    in_lines,
+    mended,
+    session_jumps,
+    standing_out,
+)
 from minimax_cal.measuring.faults.fault import listed
 from minimax_cal.measuring.floor import Floor, floor_of
 from minimax_cal.measuring.grouping import held_out, split, with_groups
@@ -161,10 +169,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     if not options.quick:
         beyond = beyond_of(study, causes, judges, progress)
     wrong = doubts(robot, study.fit, study.nominal.error(study.data))
-    far = (
-        (f"points that stand out beside all that was found: {listed(list(late))}",) if late else ()
-    )
-    told = (*asked.data.notices, *notices, *clean.remarks, *far)
+    told = (*asked.data.notices, *notices, *clean.remarks)
+    if late:
+        told = (*told, f"points that stand out beside all that was found: {listed(late)}")
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
@@ -253,10 +260,8 @@ def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
     held = asked.data.take(asked.held)
     right = dict(zip(clean.given.line, clean.given.y, strict=True))
     held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
-    sound = dict(zip(clean.data.line, clean.data.seen, strict=True))
-    nothing = np.zeros(len(held.target_names), dtype=bool)
-    kept = np.array([sound.get(line, nothing) for line in held.line]).T
-    return Judges(train, held, held.seen.T & ~kept)
+    sound = of_lines(held.line, clean.data.line, clean.data.seen).T
+    return Judges(train, held, held.seen.T & ~sound)
 
 
 def noise_mm(rows: Rows, noise: Noise) -> float:
@@ -310,8 +315,7 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     fit = fit_cell(robot, asked.train(sound), SUM, progress)
     cell = fit.cell(robot, sound)
     error = cell.error(sound)
-    seen = find_faults(cell.placed(sound), error)
-    more = tuple(fault for fault in seen if fault.effect == "outliers")
+    more = standing_out(cell.placed(sound), error)
     wrong = wrong_rows(data, cell.error(data))
     points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (

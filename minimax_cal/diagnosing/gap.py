@@ -14,7 +14,7 @@ from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.faults import find_faults, mended
+from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
@@ -29,9 +29,8 @@ RESAMPLES = 1000
 FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
-OUTLIERS = "outliers"
 ALIKE = 0.5  # of a point's error, which geometry alone must see too if the point is wrong
-FAULTS = (OUTLIERS, "swapped_rows")
+FAULTS = ("outliers", "swapped_rows")
 
 Ends = tuple[float, float]
 
@@ -141,15 +140,16 @@ class Judges:
     far: Array
 
     @property
-    def sound(self) -> Measurements:
-        """The held-out poses without what stands out."""
-        return self.held.with_y(np.where(self.far.T[..., None], np.nan, self.held.y))
+    def whole(self) -> Measurements:
+        """All poses in the order of the file, held-out points that stand out NaN."""
+        y = np.where(self.far.T[..., None], np.nan, self.held.y)
+        every = both(self.train, self.held.with_y(y))
+        return every.take(np.argsort(every.line, kind="stable"))
 
     @property
     def everyone(self) -> Measurements:
-        """All poses in the order of the file, held-out points that stand out left out."""
-        whole = both(self.train, self.sound)
-        whole = whole.take(np.argsort(whole.line, kind="stable"))
+        """The same without poses of which nothing is left."""
+        whole = self.whole
         return whole.take(np.asarray(whole.seen.any(axis=1)))
 
     def marked(self, first: Cell, last: Cell) -> tuple[Judges, tuple[str, ...]]:
@@ -158,17 +158,13 @@ class Judges:
         What geometry leaves may hide a point that is off by less.  Of one that is wrong the first
         fit, of geometry alone, says nearly the same: one that only the last misses is its own.
         """
-        whole = both(self.train, self.sound)
-        whole = whole.take(np.argsort(whole.line, kind="stable"))  # as it was visited
+        whole = self.whole
         before, error = (cell.error(whole) for cell in (first, last))
-        seen = find_faults(last.placed(whole), error)
-        sound = mended(whole, tuple(fault for fault in seen if fault.effect == OUTLIERS)).seen
+        sound = mended(whole, standing_out(last.placed(whole), error)).seen
         alike = (before * error).sum(axis=-1) > ALIKE * (error**2).sum(axis=-1)
         far = whole.seen & ~sound & alike.T
         points = [f"line {whole.line[row]} {whole.target_names[i]}" for row, i in np.argwhere(far)]
-        lost = dict(zip(whole.line, far, strict=True))
-        nothing = np.zeros(len(self.far), dtype=bool)
-        more = np.array([lost.get(line, nothing) for line in self.held.line]).T
+        more = of_lines(self.held.line, whole.line, far).T
         return replace(self, far=self.far | more), tuple(points)
 
     def step(self, name: str, cell: Cell) -> Step:
@@ -179,6 +175,15 @@ class Judges:
     def errors(self, cell: Cell) -> Array:
         """(k, m, 3) of a cell at the held-out poses, NaN for what stands out [m]."""
         return np.where(self.far[..., None], np.nan, cell.error(self.held))
+
+
+def of_lines(wanted: Array, line: Array, rows: Array) -> Array:
+    """(w, k) of some lines of the file their rows, False for those that are not there.
+
+    line: (m,) of the rows (m, k).
+    """
+    known, nothing = dict(zip(line, rows, strict=True)), np.zeros(rows.shape[1], dtype=bool)
+    return np.array([known.get(one, nothing) for one in wanted])
 
 
 def both(one: Measurements, other: Measurements) -> Measurements:

@@ -7,7 +7,7 @@ or two targets, the residual of a fit must stand out grossly.
 
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.faults.fault import Amount, Fault
-from minimax_cal.measuring.faults.find import find_faults, in_lines, mended
+from minimax_cal.measuring.faults.find import find_faults, in_lines, mended, standing_out
 from minimax_cal.measuring.faults.joints import looks_read_back, read_back, unsettled
 from minimax_cal.measuring.faults.nests import target_shifts
 from minimax_cal.measuring.faults.outliers import outlying
@@ -27,6 +27,7 @@ __all__ = [
     "outlying",
     "read_back",
     "session_jumps",
+    "standing_out",
     "swapped_rows",
     "target_shifts",
     "unsettled",

@@ -36,6 +36,11 @@ def find_faults(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...
     return (*swapped, *shifts, *outliers, *unsettled(data), *notices)
 
 
+def standing_out(data: Measurements, error: Array) -> tuple[Fault, ...]:
+    """Of everything found, beside a fit of these errors, the points that are elsewhere."""
+    return tuple(fault for fault in find_faults(data, error) if fault.effect == "outliers")
+
+
 def mended(data: Measurements, faults: tuple[Fault, ...]) -> Measurements:
     """Swapped rows put right, outlying points NaN; the rows stay, and so does a shifted nest."""
     y = data.y.copy()
