@@ -60,7 +60,6 @@ from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.effects.maps import JOINT_ERROR_MAP
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.robots.robot import Robot, load_robot
@@ -209,16 +208,14 @@ def in_rungs(
     chosen = [term for finding in often for term in finding.terms]
     spoken = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in spoken.effects])
-    if JOINT_ERROR_MAP.name in exclude:
-        return causes, spoken, ladder
     progress("error maps of joints")
-    spoken, ladder = with_maps(spoken, ladder)
+    spoken, ladder = with_maps(spoken, ladder, exclude)
     return spoken if spoken.maps.terms else causes, spoken, ladder
 
 
-def with_maps(causes: Causes, ladder: Ladder) -> tuple[Causes, Ladder]:
-    """The causes and the ladder with the error maps that joints have besides."""
-    maps, study = error_maps(ladder.last), ladder.last.study
+def with_maps(causes: Causes, ladder: Ladder, exclude: Sequence[str]) -> tuple[Causes, Ladder]:
+    """The causes and the ladder with the error maps, and fine waves, that joints have besides."""
+    maps, study = error_maps(ladder.last, exclude), ladder.last.study
     if not maps.terms:
         return causes, ladder
     effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)

@@ -4,6 +4,10 @@ A map enters where groups of poses that are left out tell that it helps, beside 
 effects that were named, and more than slow laws of the same joint do: a gain, one to three waves.
 Where its curve is one wave, that wave is named instead.  Laws of the same angle that the map makes
 needless leave: lines of a free frequency are a series for such a curve.
+
+Lines of gears are sought once more in the same way, near ratios that the robot tells or lines of
+other joints have shown: where all that a model lacks passes for noise of the joints, the weights by
+which effects are sought hide fine waves of the first ones, which move the targets most.
 """
 
 from __future__ import annotations
@@ -24,8 +28,9 @@ from minimax_cal.diagnosing.remainder import (
     gain_chance,
 )
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.evidence.periodogram import Line, alike, bands
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
+from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
 from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
 from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -73,35 +78,96 @@ class Mapped:
 NO_MAPS = Mapped()
 
 
-def error_maps(fit: Joint) -> Mapped:
-    """The error maps that a fit of geometry and named effects lacks."""
+def error_maps(fit: Joint, exclude: Sequence[str] = ()) -> Mapped:
+    """The error maps, and lines of gears, that a fit of geometry and named effects lacks.
+
+    exclude: effects that are not sought.
+    """
     left = Left.of(fit)
     if not len(left.parts):
         return Mapped()
     usual = begun(left).usual
-    found = chosen(fit, left.take(usual))
-    if not found:
+    lines = fine_waves(fit, left.take(usual)) if GEAR_RIPPLE.name not in exclude else []
+    maps: list[Found] = []
+    if JOINT_ERROR_MAP.name not in exclude:
+        maps = chosen(fit, left.take(usual), [found.block for found in lines])
+    if not (lines or maps):
         return Mapped()
-    blocks = [block for block, _ in found]
-    needless = replaced(fit, left, usual, blocks)
+    needless = replaced(fit, left, usual, lines, maps)
     at = begun(without(fit, left, needless).take(usual))
     terms, gains, again = [], [], []
-    for block in blocks:
-        wide = at.with_block(block)
-        terms.append(term_of(fit, block, wide, at.variance))
+    for found in (*lines, *maps):
+        wide = at.with_block(found.block)
+        terms.append(found.term or term_of(fit, found.block, wide, at.variance))
         gains.append((at.square - wide.square) / wide.variance)
         fell = (at.error**2 - wide.error**2).sum(axis=1)
         again.append(float(np.mean([fell[part].sum() > 0.0 for part in at.parts])))
         at = wide
-    chances = tuple(chance for _, chance in found)
+    chances = tuple(found.chance for found in (*lines, *maps))
     return Mapped(tuple(terms), chances, tuple(gains), tuple(again), needless)
 
 
-def chosen(fit: Joint, left: Left) -> list[tuple[Block, float]]:
-    """Blocks of the joints that have a map, the weightiest first, and the chance of each."""
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Functions that groups left out call for.  chance: of that by accident.
+
+    term: what they are, None where the curve will tell.
+    """
+
+    block: Block
+    chance: float
+    term: Term | None = None
+
+
+def fine_waves(fit: Joint, left: Left) -> list[Found]:
+    """Lines of gears that a fit lacks, near their ratios, one a joint."""
+    heard = [t for t in fit.terms if t.effect == GEAR_RIPPLE.name]
+    waiting = [
+        line
+        for j in sweeping(fit.study.scene)
+        if f"J{j + 1}" not in {term.place for term in heard}
+        for line in strongest(fit, left, j, heard)
+    ]
+    at, out = begun(left), []
+    for block, turns, tries in waiting:
+        wide = at.with_block(block)
+        chance = len(waiting) * tries * gain_chance(at, wide, left.group)
+        if chance < LEVEL:
+            out.append(Found(block, chance, Term(GEAR_RIPPLE.name, block.place, {"turns": turns})))
+            at = wide
+    return out
+
+
+def strongest(
+    fit: Joint, left: Left, joint: int, heard: Sequence[Term]
+) -> list[tuple[Block, float, float]]:
+    """The strongest line of a joint near its gear's ratio, its waves a turn, and how many were
+    tried; none if the halves of the sweep do not agree on it.
+    """
+    arm, at = left.arm[:, :, joint], begun(left)
+    score, size = ((arm * other).sum(axis=1) / at.variance for other in (at.error, arm))
+    line = Line(left.q[:, joint], score, size)
+    told = bands(abs(float(fit.study.scene.robot.ratio[joint])))
+    others = told or alike([term.choice["turns"] for term in heard])
+    if not others:
+        return []
+    found = [line.strongest(*band) for band in others]
+    gains = [float(line.gain(turns + np.array([0.0, 1e-3]))[0]) for turns, _ in found]
+    turns = found[int(np.argmax(gains))][0]
+    if not line.stays(turns):
+        return []
+    wave = np.stack([f(turns * left.q[:, joint]) for f in (np.cos, np.sin)], axis=1)
+    block = Block(f"J{joint + 1}", arm[:, :, None] * wave[:, None], np.full((1, 2), USUAL))
+    return [(block, turns, sum(tries for _, tries in found))]
+
+
+def chosen(fit: Joint, left: Left, beside: Sequence[Block]) -> list[Found]:
+    """The joints that have a map beside some blocks, the weightiest first."""
     sliding, at = fit.study.scene.robot.prismatic, begun(left)
+    for block in beside:
+        at = at.with_block(block)
     waiting = [block for block in by_joint(left) if not sliding[joint_of(block.place)]]
-    out: list[tuple[Block, float]] = []
+    out: list[Found] = []
     tries = len(waiting)
     while waiting:
         tried = [at.with_block(block) for block in waiting]
@@ -111,7 +177,7 @@ def chosen(fit: Joint, left: Left) -> list[tuple[Block, float]]:
             chance = tries * max(each)
             if chance < LEVEL:
                 at = tried[number]
-                out.append((waiting.pop(number), chance))
+                out.append(Found(waiting.pop(number), chance))
                 break
         else:
             return out
@@ -159,9 +225,12 @@ def strongest_wave(x: Array, curve: Array) -> tuple[float, float]:
 # ---- laws that a map makes needless ------------------------------------------------------------
 
 
-def replaced(fit: Joint, left: Left, usual: Array, blocks: Sequence[Block]) -> tuple[Term, ...]:
-    """Named laws of the same angles without which groups left out are met as well."""
-    places = {block.place for block in blocks}
+def replaced(
+    fit: Joint, left: Left, usual: Array, lines: Sequence[Found], maps: Sequence[Found]
+) -> tuple[Term, ...]:
+    """Named laws of the same angles as maps, without which groups left out are met as well."""
+    blocks = [found.block for found in (*lines, *maps)]
+    places = {found.block.place for found in maps}
     own = [t for t in fit.terms if t.place in places and is_series(EFFECTS[t.effect])]
     least = squared(left, usual, blocks)
     bare = begun(without(fit, left, own).take(usual)).square
@@ -196,5 +265,7 @@ def without(fit: Joint, left: Left, gone: Sequence[Term]) -> Left:
     names = np.concatenate([np.zeros(count, dtype=bool), owner])
     own = names[fit.estimator.model.active]
     value = np.concatenate([np.zeros(count), fit.state.effects])[fit.estimator.model.active]
-    back = left.columns[..., own] @ value[own]
-    return replace(left, y=left.y + back, columns=left.columns[..., ~own])
+    held = left.prior > 0.0  # of which nothing was taken away
+    back = left.columns[..., own] @ np.where(held, 0.0, value)[own]
+    kept = left.columns[..., ~own]
+    return replace(left, y=left.y + back, columns=kept, prior=left.prior[~own])

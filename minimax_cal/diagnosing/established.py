@@ -85,9 +85,19 @@ def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
         alike = {candidate.key for candidate in choice.chosen}
         wide = any(name == effect and "all" in (place, other) for name, other in alike)
         return wide or bool(alike & rivals) or is_rival(finding, choice)
-    if own.keys() != before.keys():
-        return True  # another variant of the law, or another of its lines
+    if own.keys() != before.keys() or laws_there(finding, choice) != laws_there(finding, whole):
+        return True  # another variant of the law, or another of its lines, takes its share
     return all(agree(own[text], before[text]) for text in own)
+
+
+def laws_there(finding: Finding, choice: Choice) -> set[str]:
+    """What a choice has of an effect at its place and at all places, or at any if it is at all."""
+    effect, place = finding.term.key
+    return {
+        c.term.text
+        for c in choice.chosen
+        if c.term.effect == effect and (place == "all" or c.term.place in (place, "all"))
+    }
 
 
 def is_rival(finding: Finding, choice: Choice) -> bool:

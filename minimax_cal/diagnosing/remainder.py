@@ -95,7 +95,8 @@ class Left:
     """What a fit leaves at its poses, linear there.
 
     y: (m, r) errors, columns: (m, r, p) their derivatives by what was fitted, arm: (m, r, n) motion
-    of the points by the joints, root: (m, r) root of each weight [m, rad].  q: (m, n) joints, of a
+    of the points by the joints, root: (m, r) root of each weight [m, rad].  prior: (p,) weights
+    that hold what was fitted near 0, of which y has then what it took away.  q: (m, n) joints, of a
     slide its place in the arm's reach [rad].  group: (m,).  parts: (f, m) masks, left out in turn.
     """
 
@@ -103,6 +104,7 @@ class Left:
     columns: Array
     arm: Array
     root: Array
+    prior: Array
     q: Array
     group: Array
     parts: Array
@@ -113,11 +115,13 @@ class Left:
         scene, poses, data = last.study.scene, last.poses, last.study.data
         part, unit = folds(data, FOLDS), joint_units(scene)
         parts = np.array(last.spared([part == number for number in range(FOLDS)]))
+        held = np.where(poses.prior > 0.0, poses.off, 0.0)
         return Left(
-            y=poses.error,
+            y=poses.error - poses.jacobian @ held,
             columns=poses.jacobian,
             arm=poses.arm * unit,
             root=np.repeat(np.sqrt(last.model.weight), 3, axis=0).T,
+            prior=poses.prior,
             q=(scene.q / unit[:, None]).T,
             group=clusters(data),
             parts=parts.reshape(-1, data.poses),
@@ -131,6 +135,7 @@ class Left:
             columns=self.columns[rows],
             arm=self.arm[rows],
             root=self.root[rows],
+            prior=self.prior,
             q=self.q[rows],
             group=self.group[rows],
             parts=parts[parts.any(axis=1)],
@@ -149,7 +154,7 @@ def joint_units(scene: Scene) -> Array:
 
 def begun(left: Left) -> Beside:
     """The fit as it is."""
-    return Beside.of(left.parts, left.y, left.columns)
+    return Beside.of(left.parts, left.y, left.columns, left.prior)
 
 
 def climbed(left: Left) -> tuple[list[Beside], list[str]]:
@@ -268,10 +273,12 @@ class Beside:
     picked: int = 0
 
     @staticmethod
-    def of(parts: Array, y: Array, columns: Array) -> Beside:
-        """Columns that are fitted freely."""
-        nothing = Beside(parts, y, columns[..., :0], np.zeros(0), y)
-        return nothing.with_free(columns)
+    def of(parts: Array, y: Array, columns: Array, prior: Array) -> Beside:
+        """Columns that are fitted freely, but for weights (p,) that hold them near 0."""
+        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
+        size = np.maximum(size, 1e-300)
+        bare = Beside(parts, y, columns / size, RIDGE + prior / size**2, y)
+        return replace(bare, error=bare.cleared(y[..., None])[0][..., 0])
 
     @property
     def variance(self) -> float:
@@ -335,14 +342,6 @@ class Beside:
         columns = np.concatenate([self.columns, block.columns], axis=-1)
         ridge = np.append(self.ridge, ridge[best])
         return Beside(self.parts, self.y, columns, ridge, error[best], best)
-
-    def with_free(self, columns: Array) -> Beside:
-        """The fit with columns (m, r, c) besides that nothing holds."""
-        size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
-        both = np.concatenate([self.columns, columns / np.maximum(size, 1e-300)], axis=-1)
-        ridge = np.append(self.ridge, np.full(len(size), RIDGE))
-        bare = Beside(self.parts, self.y, both, ridge, self.y)
-        return replace(bare, error=bare.cleared(self.y[..., None])[0][..., 0])
 
 
 def product_of(one: Array, other: Array) -> Array:

@@ -43,6 +43,8 @@ def judged(
         return "unknown", ("names that change with the poses", structure[1])
     if not closes_enough(sure, ladder, rest):
         return "unknown", ("a curve of the joints that has no name", structure[1])
+    if not sure and wavers(ladder, rest):
+        return "unknown", ("names that change with the poses", structure[1])
     if not sure:
         return "none", structure
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
@@ -75,9 +77,19 @@ def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> b
     """Whether what is established closes half of what groups left out show to be predictable."""
     if rest.predictable_mm**2 <= WORTH * rest.unpredictable_mm**2:
         return True
+    closed = closed_by(ladder) if sure else 0.0
+    return bool(closed >= HALF * (closed + rest.predictable_mm**2))
+
+
+def wavers(ladder: Ladder, rest: Remainder) -> bool:
+    """Whether effects of which none is established tell what no noise does."""
+    return closed_by(ladder) > WORTH * rest.unpredictable_mm**2
+
+
+def closed_by(ladder: Ladder) -> float:
+    """By how much the ladder's last fit meets groups left out better than geometry [mm^2]."""
     fit, geometric = ladder.last, ladder.fits[0]
     count = float(fit.model.weight.sum())
     told = fit.spared(ladder.parts)
-    both = [1e6 * one.cross_validated(told) / count for one in (geometric, fit)]  # [mm^2]
-    closed = both[0] - both[1] if sure else 0.0
-    return bool(closed >= HALF * (closed + rest.predictable_mm**2))
+    before, after = (1e6 * one.cross_validated(told) / count for one in (geometric, fit))
+    return before - after

@@ -244,6 +244,9 @@ def kept(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """Joints that give way; one torque a joint, or of groups of links that share a spring."""
+    if "within" in term.choice:  # no spring of a simulator stiffens
+        parts.mapped.append((term, values))
+        return
     places = unmasked(term.choice["parts"])
     grouped = any(part % 4 != WHOLE for part in places)
     if grouped:
@@ -262,9 +265,9 @@ def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 
 def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """A link that bends, or the base."""
+    """A link that bends, or the base; under all weights, or groups of them that share a spring."""
     value = float(values[0])
-    if value <= 0.0:  # no spring does that; others may take over what it does
+    if "weights" in term.choice or value <= 0.0:
         parts.grouped = True
     elif EFFECTS[term.effect].moves == "foot":
         parts.put(base=parts.arm.base + value)

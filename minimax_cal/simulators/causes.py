@@ -111,9 +111,11 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
 def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
     """Terms for a robot whose masses may be known: then each joint has one torque."""
     return tuple(
-        replace(term, choice={}) if "parts" in term.choice and not assumed(robot) else term
+        replace(term, choice={})
+        if {"parts", "weights"} & term.choice.keys() and not assumed(robot)
+        else term
         for term in terms
-    )  # fmt: skip
+    )
 
 
 def fitted(fit: Fit, terms: Sequence[Term]) -> Fit:

@@ -89,6 +89,21 @@ def test_lines_that_a_map_makes_needless_leave(robot: Robot) -> None:
     assert [term.label for term in found.needless] == ["gear_ripple:J2"]
 
 
+def test_a_fine_wave_is_found_at_a_ratio_that_another_joint_shows(robot: Robot) -> None:
+    sim = rigid(robot, 240, 3, 8)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 0] = 1e-4 * np.sin(200.0 * sim.data.q[:, 0])
+    turn[:, 1] = 2e-5 * np.cos(199.6 * sim.data.q[:, 1] + 1.0)
+    bare = geometric(robot, sim, turn)
+    heard = joint(bare.study, [Term("gear_ripple", "J1", {"turns": 200.0})])
+    found = error_maps(heard)
+    assert [term.label for term in found.terms] == ["gear_ripple:J2"]
+    assert abs(found.terms[0].choice["turns"] - 199.6) < 0.2
+    assert found.chances[0] < 1e-3
+    assert not error_maps(heard, exclude=["gear_ripple"]).terms
+    assert "gear_ripple:J2" not in [term.label for term in error_maps(bare).terms]  # no ratio known
+
+
 def test_the_strongest_wave_of_a_curve() -> None:
     x = np.linspace(-2.0, 1.5, 400)
     turns, share = strongest_wave(x, 0.3 + 0.1 * x + np.sin(21.3 * x + 0.4))

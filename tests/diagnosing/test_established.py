@@ -95,3 +95,19 @@ def test_an_effect_is_found_where_its_rival_is_named(geared: tuple[Study, Librar
     assert is_rival(effect, replace(other, library=lib))
     assert is_found(effect, replace(other, library=lib), whole)
     assert not is_found(effect, other, whole)
+
+
+def test_an_effect_that_shares_its_joint_with_another_variant_need_not_agree(
+    geared: tuple[Study, Library],
+) -> None:
+    """What of a joint's wave another name holds in a part is not in its own parameters."""
+    _, lib = geared
+    whole = select(lib)
+    effect = replace(named(whole, "gear_error", "J1"), alternatives=())
+    far = replace(whole)
+    object.__setattr__(far, "estimates", tuple((3.0 * v, s) for v, s in whole.estimates))
+    assert not is_found(effect, far, whole)
+    (wide,) = lib.with_terms([(Term("gear_error", "all", {"turns": 1.0, "joints": 63.0}), 1.0)])
+    more = replace(far, found=(*far.found, replace(far.found[0], candidate=wide)))
+    object.__setattr__(more, "estimates", (*far.estimates, (np.ones(12), np.ones(12))))
+    assert is_found(effect, more, whole)

@@ -6,15 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from problems_fit import study_of
 from scipy.stats import norm
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import established
+from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.lack_of_fit import Trace, chance_of, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import DWARFED, Finding
-from minimax_cal.diagnosing.verdict import patched
+from minimax_cal.diagnosing.verdict import closed_by, patched, wavers
 from minimax_cal.evidence import limits
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell, still
@@ -67,6 +69,20 @@ def test_chances_combine_however_they_depend(alike: float) -> None:
     assert chance_of(unasked) == 1.0
     assert_allclose(chance_of([Trace("", 1e-3, 1.0), *unasked]), 1e-3)
     assert_allclose(chance_of([Trace("", 1e-9, 1.0)]), 1e-9, rtol=1e-6)
+
+
+def test_effects_of_which_none_is_established_leave_it_unknown_where_they_tell_much() -> None:
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 300.0),), seed=4)))
+    ladder = climbed(study, [[Term("gear_error", "J1", {"turns": 1.0})]])
+    assert len(ladder.taken) == 1
+    nothing = Remainder(0.0, (), ladder.last.train.rms_mm, None)
+    assert wavers(ladder, nothing)
+    assert not wavers(climbed(study, []), nothing)
+    assert_allclose(
+        closed_by(ladder),
+        ladder.fits[0].train.rms_mm ** 2 - ladder.last.train.rms_mm ** 2,
+        rtol=0.3,  # parts left out tell about as much as the poses of the fit
+    )
 
 
 def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:

@@ -56,6 +56,16 @@ def test_a_plain_effect_is_named_and_sized(law: str, place: str) -> None:
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
 
 
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
+    """By a machine whose law is not ours: tau / (1 + 2 |tau| / most)."""
+    _, choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=seed), ())
+    (one,) = choice.chosen
+    assert one.key == ("joint_compliance", "J3")
+    assert one.term.choice["within"] > 0.0
+    assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
+
+
 def test_no_name_without_an_effect() -> None:
     for seed in range(8):
         _, choice = chosen(opened(seed=100 + seed), ())

@@ -12,6 +12,7 @@ import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects import EFFECTS, Scene, Term
+from minimax_cal.modelling.effects.compliance import taken_up
 from minimax_cal.modelling.effects.scene import Columns
 from minimax_cal.modelling.effects.table import Fitted, fitted_from_list, terms
 from minimax_cal.modelling.effects.time import ROOM
@@ -215,11 +216,37 @@ def test_torque_is_the_one_of_pinocchio() -> None:
 
 def test_compliant_joints_turn_with_their_torque() -> None:
     for j in range(1, 6):
-        (choice,) = EFFECTS["joint_compliance"].choices(SCENE, f"J{j + 1}")
+        choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, f"J{j + 1}")
         found = columns("joint_compliance", f"J{j + 1}", **choice)
         assert found.names == (f"c{j + 1}",)
         assert_allclose(found.turn[0, j], SCENE.gravity[j], rtol=EXACT)
         assert not np.delete(found.turn[0], j, axis=0).any()
+
+
+def test_a_joint_that_stiffens_gives_way_to_the_first_of_its_torque() -> None:
+    """As its compliance tells where the torque is small; never by more than at the torque told."""
+    effect, tau = EFFECTS["joint_compliance"], SCENE.gravity[1]
+    _, *stiffening = effect.choices(SCENE, "J2")
+    assert [choice["within"] / np.abs(tau).max() for choice in stiffening] == [0.15, 0.5]
+    for choice in stiffening:
+        within = choice["within"]
+        found = columns("joint_compliance", "J2", **choice)
+        assert (found.names, dict(found.fixed)) == (("c2",), {"within_Nm": within})
+        assert_allclose(found.turn[0, 1], within * np.tanh(tau / within), rtol=EXACT)
+        assert effect.upward(found).all()
+        ends = [c["within"] / np.abs(tau).max() for c in effect.finer(SCENE, choice)]
+        assert min(ends) >= 0.03
+        assert max(ends) <= 1.5
+    assert not any("within" in choice for choice in effect.choices(SCENE, "all"))
+    (plain,) = effect.choices(SCENE, "all")
+    assert effect.finer(SCENE, plain) == ()
+
+
+def test_the_doubts_of_a_joint_that_stiffens_are_those_of_its_torque_there() -> None:
+    """Against a central difference, whose error is of second order in the step."""
+    torque, other = np.linspace(-40.0, 60.0, 25), np.linspace(5.0, -3.0, 25)
+    up, down = (taken_up(torque + sign * 1e-4 * other, 12.0)[0] for sign in (1.0, -1.0))
+    assert_allclose(taken_up(torque, 12.0)[1] * other, (up - down) / 2e-4, rtol=0, atol=1e-8)
 
 
 def test_payload_adds_its_torque_even_where_it_never_changes() -> None:
@@ -245,13 +272,13 @@ def test_measured_torques_replace_computed_ones() -> None:
 
 def test_unknown_masses_give_torques_of_parts() -> None:
     scene = SCENES["no masses"]
-    (choice,) = EFFECTS["joint_compliance"].choices(scene, "J2")
+    choice, *_ = EFFECTS["joint_compliance"].choices(scene, "J2")
     found = columns("joint_compliance", "J2", scene, **choice)
     assert found.names == ("c2 (upper arm)", "c2 (forearm)", "c2 (wrist)")
     # the parts add up to the torque of all links, and none follows from the others
     assert_allclose(found.turn[:, 1].sum(axis=0), scene.gravity[1], rtol=0, atol=EXACT * 1e4)
     assert np.linalg.matrix_rank(found.turn[:, 1]) == 3
-    (choice,) = EFFECTS["joint_compliance"].choices(SCENE, "J2")
+    choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, "J2")
     assert len(columns("joint_compliance", "J2", **choice).names) == 1
 
 
@@ -283,7 +310,7 @@ def test_doubt_is_the_change_of_torque_for_other_masses() -> None:
     heavier[1] *= 1.2
     expected = SCENE.torque(heavier, ROBOT.com)[1] - SCENE.torque(ROBOT.mass, ROBOT.com)[1]
     assert_allclose(parts[0], expected, rtol=0, atol=EXACT * 1e4)
-    (choice,) = EFFECTS["joint_compliance"].choices(SCENE, "J2")
+    choice, *_ = EFFECTS["joint_compliance"].choices(SCENE, "J2")
     (kept,) = columns("joint_compliance", "J2", **choice).doubt
     whole, told = (part.T @ part for part in (parts, kept[:, 1]))
     left = np.linalg.eigvalsh(whole - told)
@@ -319,6 +346,28 @@ def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
     farther = replace(scene, points=scene.points + np.array([[0.25], [0.0], [0.0]]))
     found = -columns("link_bending", "L1", farther).displacement(farther)[0, 0, 2, 0]
     assert_allclose(found, expected + 0.25 * jacobian, rtol=EXACT)
+
+
+@pytest.mark.parametrize(("effect", "place"), [("link_bending", "L2"), ("base_flex", "frame")])
+def test_weights_that_nobody_tells_bend_by_themselves(effect: str, place: str) -> None:
+    """Their motions add up to that of all links; the tool's is that of a payload of 1 kg."""
+    empty, one = (
+        scene_of(NO_MASSES, replace(DATA, columns={**DATA.columns, "payload": np.full(40, mass)}))
+        for mass in (0.0, 1.0)
+    )
+    plain, apart = EFFECTS[effect].choices(empty, place)
+    assert plain == {}
+    found = columns(effect, place, empty, **apart)
+    assert len(set(found.units)) == 1
+    assert EFFECTS[effect].upward(found).all()
+    links = [("tool" not in name) for name in found.names]
+    every = columns(effect, place, empty, weights=15.0).displacement(empty)
+    whole, loaded = (columns(effect, place, s).displacement(s)[0] for s in (empty, one))
+    scale = np.abs(whole).max()
+    assert_allclose(every[:-1].sum(axis=0), whole, rtol=0, atol=EXACT * scale)
+    assert_allclose(every[-1], loaded - whole, rtol=0, atol=EXACT * scale)
+    assert np.count_nonzero(links) >= 1
+    assert len(EFFECTS[effect].choices(SCENE, place)) == 1  # masses are told
 
 
 def test_links_that_carry_nothing_do_not_bend() -> None:

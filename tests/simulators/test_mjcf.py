@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.correcting.export import exported, written
-from minimax_cal.correcting.exporters.job import job_of, origins
+from minimax_cal.correcting.exporters.job import compliance_of, job_of, origins
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import Fitted, terms
@@ -207,6 +207,25 @@ def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
     made = exported(cell, "mjcf")
     with pytest.raises(mc.OptionError, match="beside it"):
         written(made, None)
+
+
+def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs() -> None:
+    robot = with_masses(robot_called("irb2600"))
+    cell = cell_with(robot, "joint_compliance:J2:within=20", joint_compliance=[3e-6])
+    arm = arm_of(cell)
+    assert [term.label for term in arm.mapped.terms] == ["joint_compliance:J2"]
+    assert not arm.turn.any()
+    assert np.isnan(compliance_of(cell)[1])  # one number does not tell it
+    plain = cell_with(robot, "joint_compliance:J2", joint_compliance=[3e-6])
+    assert compliance_of(plain)[1] == 3e-6
+
+
+def test_links_that_bend_under_weights_nobody_told_have_one_spring() -> None:
+    robot = robot_called("irb2600")
+    cell = cell_with(robot, "link_bending:L2:weights=6", link_bending=[1e-6, 2e-6])
+    arm = arm_of(cell)
+    assert list(arm.bend) == [1]
+    assert arm.remainder < IMITATED
 
 
 def test_what_changes_with_time_is_named() -> None:

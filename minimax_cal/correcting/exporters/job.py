@@ -14,6 +14,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
 from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
@@ -100,14 +101,21 @@ def job_of(known: Opened) -> Job:
 
 
 def compliance_of(cell: Cell) -> Array:
-    """(n,) turn per torque of each joint's whole load, NaN where none was fitted [rad/(N m)]."""
+    """(n,) turn per torque of each joint's whole load [rad/(N m)].
+
+    NaN where none was fitted, or where the joint stiffens.
+    """
     out = np.full(cell.robot.joints, np.nan)
     scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
-    for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
-        if term.effect == JOINT_COMPLIANCE.name:
-            for name, value in zip(term.columns(scene).names, values, strict=True):
-                if name[1:].isdigit():
-                    out[int(name[1:]) - 1] = value
+    laws = zip(cell.effects.terms, cell.effects.values, strict=True)
+    compliances = [(term, values) for term, values in laws if term.effect == JOINT_COMPLIANCE.name]
+    for term, values in compliances:
+        for name, value in zip(term.columns(scene).names, values, strict=True):
+            if name[1:].isdigit():
+                out[int(name[1:]) - 1] = value
+    for term, _ in compliances:
+        if "within" in term.choice:
+            out[joint_of(term.place)] = np.nan
     return out
 
 

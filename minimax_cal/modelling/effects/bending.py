@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.compliance import GROUPS
 from minimax_cal.modelling.effects.scene import (
+    PLAIN,
     Choice,
     Columns,
     Effect,
     Scene,
     joint_of,
+    mask_of,
     principal,
+    unmasked,
 )
 from minimax_cal.robots.gravity import G, centres
 from minimax_cal.robots.kinematics import cross
 
 SHORT = 0.1  # of the reach: shorter links are stiff
+UNLIKE = 0.1  # share of a weight's motion that others must leave for it to count by itself
 
 
 def turned_about(scene: Scene, turn: Array, centre: Array) -> Array:
@@ -66,13 +71,64 @@ def link_columns(scene: Scene, place: str, choice: Choice) -> Columns:
 
     theta = (L^2/2 l x F + L M) / EI,  delta = (L^3/3 F_across + L^2/2 M x l) / EI, l along it.
     """
-    link = joint_of(place)
+    return under_weight(scene, choice, "1/EI", "1/(N m^2)", of_link(scene, place))
 
-    def shift(mass: Array, com: Array) -> Array:
-        return bent(scene, link, mass, com)
 
-    whole, doubt = shift(*scene.masses)[None], differing(scene, shift)
-    return Columns(("1/EI",), ("1/(N m^2)",), shift=whole, doubt_shift=(doubt,))
+Shift = Callable[[Array, Array], Array]  # (k, 3, m) per unit, of masses and centres of gravity
+
+
+def under_weight(scene: Scene, choice: Choice, name: str, unit: str, shift: Shift) -> Columns:
+    """What gives way to weights: to all together, or to those that a choice takes apart."""
+    if "weights" not in choice:
+        whole, doubt = shift(*scene.masses), differing(scene, shift)
+        return Columns((name,), (unit,), shift=whole[None], doubt_shift=(doubt,))
+    kept = unmasked(choice["weights"])
+    fields = apart(scene, shift)[kept]
+    names = tuple(f"{name} ({(*GROUPS, 'tool')[part]})" for part in kept)
+    return Columns(names, (unit,) * len(kept), shift=fields)
+
+
+def apart(scene: Scene, shift: Shift) -> Array:
+    """(4, k, 3, m) motion of the targets by upper arm, forearm, wrist, and a kilogram amid them.
+
+    The payload, which nobody guesses, pulls with the wrist.
+    """
+    mass, com = scene.masses
+    group = np.minimum(np.arange(scene.joints) // 2, len(GROUPS) - 1)
+    nothing = shift(np.zeros(scene.joints), com)
+    links = [shift(np.where(group == g, mass, 0.0), com) - nothing for g in range(len(GROUPS))]
+    one, spot = np.zeros(scene.joints), np.zeros((scene.joints, 3))
+    one[-1], spot[-1] = 1.0, scene.target_positions.mean(axis=0)
+    tool = shift(one, spot) - nothing
+    return np.stack([*links[:-1], links[-1] + nothing, tool])
+
+
+def weights_of(scene: Scene, shift: Shift) -> Sequence[Choice]:
+    """All weights together; where the robot file tells none, also those that differ, apart.
+
+    One that others explain as well is left out.
+    """
+    if scene.known_masses:
+        return PLAIN
+    kept: list[int] = []
+    fields = apart(scene, shift).reshape(len(GROUPS) + 1, -1)
+    basis = np.zeros((fields.shape[1], 0))
+    for part, field in enumerate(fields):
+        rest = field - basis @ (basis.T @ field)
+        if np.linalg.norm(rest) > UNLIKE * np.linalg.norm(field) + 1e-12:
+            kept.append(part)
+            basis = np.linalg.qr(fields[kept].T)[0]
+    return (*PLAIN, {"weights": mask_of(kept)}) if len(kept) > 1 else PLAIN
+
+
+def of_link(scene: Scene, place: str) -> Shift:
+    """What a link does."""
+    return lambda mass, com: bent(scene, joint_of(place), mass, com)
+
+
+def of_base(scene: Scene) -> Shift:
+    """What the base does."""
+    return lambda mass, com: tilted(scene, mass, com)
 
 
 LINK_BENDING = Effect(
@@ -81,6 +137,7 @@ LINK_BENDING = Effect(
     "theta = (L^2/2 l x F + L M)/EI, delta = (L^3/3 F + L^2/2 M x l)/EI",
     long_links,
     link_columns,
+    choices=lambda scene, place: weights_of(scene, of_link(scene, place)),
     positive=True,
     follows="load",
 )
@@ -96,12 +153,7 @@ def tilted(scene: Scene, mass: Array, com: Array) -> Array:
 
 def base_columns(scene: Scene, place: str, choice: Choice) -> Columns:
     """The base turns by C times the overturning moment."""
-
-    def shift(mass: Array, com: Array) -> Array:
-        return tilted(scene, mass, com)
-
-    whole, doubt = shift(*scene.masses)[None], differing(scene, shift)
-    return Columns(("C",), ("rad/(N m)",), shift=whole, doubt_shift=(doubt,))
+    return under_weight(scene, choice, "C", "rad/(N m)", of_base(scene))
 
 
 BASE_FLEX = Effect(
@@ -110,6 +162,7 @@ BASE_FLEX = Effect(
     "omega = C M",
     lambda scene: ("frame",),
     base_columns,
+    choices=lambda scene, place: weights_of(scene, of_base(scene)),
     positive=True,
     moves="foot",
     follows="load",

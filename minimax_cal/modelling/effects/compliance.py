@@ -26,6 +26,8 @@ FELT = 1e-3  # share of the largest torque's variation below which a joint carri
 GROUPS = ("upper arm", "forearm", "wrist")  # two links each
 ALIKE = 0.2  # share of a neighbour's torque that must differ from a joint's own
 WHOLE = 3  # stands for all links together
+SOFT = (0.15, 0.5)  # of its largest torque, to which a joint gives way more than beyond
+SOFTEST, STIFFEST = 0.03, 1.5  # the same, least and most: play that a load takes up, no end seen
 BESIDE_AXIS = 0.1  # lever of the kilogram that stands for a tool beside the flange's axis [m]
 
 
@@ -54,10 +56,12 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
     upper arm, forearm and wrist are taken apart, because their masses are free; one that another
     explains as well is left out.  Nobody tells the tool's weight then either, and it may hang
     beside the flange's axis: all joints together are tried with that too (`tool`: `beside_axis`).
+    A single joint is also tried as one that stiffens (`within`).
     """
     joints = loaded(scene) if place == "all" else [joint_of(place)]
     if scene.known_masses or scene.measured_torques:
-        return ({"parts": mask_of([4 * j + WHOLE for j in joints])},)
+        plain = {"parts": mask_of([4 * j + WHOLE for j in joints])}
+        return (plain, *stiffening(scene, place, (WHOLE,)))
     chosen = []
     for j in joints:
         kept = np.ones((1, scene.poses))
@@ -72,7 +76,37 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
         return ()
     parts = {"parts": mask_of(chosen)}
     tool = beside_axis(scene) if place == "all" else 0.0
-    return (parts, {**parts, "tool": tool}) if tool else (parts,)
+    wider = ({**parts, "tool": tool},) if tool else ()
+    last = len(GROUPS) - 1
+    groups = (last,) if joints[0] // 2 >= last else (last, WHOLE)
+    return (parts, *wider, *stiffening(scene, place, groups))
+
+
+def stiffening(scene: Scene, place: str, groups: Sequence[int]) -> Sequence[Choice]:
+    """A single joint that gives way most to the first of the torque of some links."""
+    if place == "all":
+        return ()
+    parts = [4 * joint_of(place) + group for group in groups]
+    return [
+        {"parts": mask_of([part]), "within": share * most}
+        for part in parts
+        if (most := largest_torque(scene, part)) > 0.0
+        for share in SOFT
+    ]
+
+
+def largest_torque(scene: Scene, part: int) -> float:
+    """The largest torque of some links about a joint [N m].  part: 4 j + g, as in `parts_of`."""
+    return float(np.abs(torque_of(scene, *divmod(part, 4))).max())
+
+
+def other_ends(scene: Scene, choice: Choice) -> Sequence[Choice]:
+    """Torques near that one to which a joint was found to give way most."""
+    if "within" not in choice:
+        return ()
+    most = largest_torque(scene, unmasked(choice["parts"])[0])
+    ends = [part * choice["within"] for part in (0.6, 0.8, 1.25, 1.6)]
+    return [{**choice, "within": end} for end in ends if SOFTEST <= end / most <= STIFFEST]
 
 
 def beside_axis(scene: Scene) -> float:
@@ -103,14 +137,21 @@ def torque_of(scene: Scene, joint: int, group: int) -> Array:
 
 
 def columns(scene: Scene, place: str, choice: Choice) -> Columns:
-    """dq_j = c_j tau_j; and c_j times the torque of a tool on either side of the flange's axis."""
+    """dq_j = c_j tau_j; and c_j times the torque of a tool on either side of the flange's axis.
+
+    Or dq_j = c_j t tanh(tau_j / t), t = within: a gear that is soft while its teeth take the load
+    up, and stiff beyond.
+    """
     turns, names, doubts = [], [], []
+    within = choice.get("within", np.inf)
     for part in unmasked(choice["parts"]):
         j, group = divmod(part, 4)
-        turns.append(one_joint(scene, j, torque_of(scene, j, group)[None]))
+        torque, slope = taken_up(torque_of(scene, j, group), within)
+        turns.append(one_joint(scene, j, torque[None]))
         whole = group == WHOLE
         names.append(f"c{j + 1}" + ("" if whole else f" ({GROUPS[group]})"))
-        shapes = principal(scene.gravity_parts[:, j]) if whole else np.zeros((0, scene.poses))
+        shapes = scene.gravity_parts[:, j] * slope if whole else np.zeros((0, scene.poses))
+        shapes = principal(shapes)
         one = [one_joint(scene, j, shape[None]) for shape in shapes]
         nothing = np.zeros((0, scene.joints, scene.poses))
         doubts.append(np.concatenate([nothing, *one]))
@@ -128,16 +169,26 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         np.concatenate(turns),
         doubt=tuple(doubts),
         either=np.arange(len(names)) >= positive,
+        fixed={"within_Nm": within} if np.isfinite(within) else {},
     )
+
+
+def taken_up(torque: Array, within: float) -> tuple[Array, Array]:
+    """(m,) t tanh(tau / t) of torques (m,), t = within, and its slopes; infinite: the torques."""
+    if not np.isfinite(within):
+        return torque, np.ones_like(torque)
+    course = np.tanh(torque / within)
+    return within * course, 1.0 - course**2
 
 
 JOINT_COMPLIANCE = Effect(
     "joint_compliance",
     "gearboxes wind up under gravity",
-    "dq_j = c_j tau_j(q)",
+    "dq_j = c_j tau_j(q), or c_j t tanh(tau_j / t) of a joint that stiffens",
     places,
     columns,
     choices=parts_of,
+    finer=other_ends,
     positive=True,
     follows="load",
 )
