@@ -83,14 +83,14 @@ def causes_of(
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
-    """Traces of what the effects leave."""
-    return structure(study.scene, study.rows, choice.noise, choice.known, named_in(choice))
+    """Traces of what the effects leave, whatever the masses are that they were told with."""
+    return structure(study.scene, study.rows, choice.noise, choice.doubted, named_in(choice))
 
 
 def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
     """Traces of what effects and maps leave together."""
     maps = [term.columns(study.scene).displacement(study.scene) for term in causes.maps.terms]
-    known = np.concatenate([causes.choice.known, *map(study.rows.of, maps)], axis=1)
+    known = np.concatenate([causes.choice.doubted, *map(study.rows.of, maps)], axis=1)
     noise = restricted(study.rows, known)
     return structure(study.scene, study.rows, noise, known, named_in(causes.choice))
 

@@ -78,6 +78,12 @@ class Choice:
         return self.library.columns[:, columns_of(self.chosen)[0]]
 
     @property
+    def doubted(self) -> Array:
+        """(N, q + r) their columns, and those by which their laws may differ."""
+        main, loose, _ = columns_of(self.chosen, self.found)
+        return self.library.columns[:, np.concatenate([main, loose])]
+
+    @property
     def left(self) -> Array:
         """(N,) what geometry and effects, fitted to the poses that count, leave of all rows [m].
 

@@ -80,7 +80,7 @@ def test_effects_of_which_none_is_established_leave_it_unknown_where_they_tell_m
     assert not wavers(climbed(study, []), nothing)
     assert_allclose(
         closed_by(ladder),
-        ladder.fits[0].train.rms_mm ** 2 - ladder.last.train.rms_mm ** 2,
+        ladder.fits[0].train.rms_mm ** 2 - ladder.last.train.rms_mm**2,
         rtol=0.3,  # parts left out tell about as much as the poses of the fit
     )
 
