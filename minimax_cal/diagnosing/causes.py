@@ -9,7 +9,15 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import judged_again
-from minimax_cal.diagnosing.lack_of_fit import Named, Trace, chance_of, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import (
+    Named,
+    Trace,
+    chance_of,
+    explained,
+    heard,
+    rest_of,
+    structure,
+)
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -38,8 +46,9 @@ class Causes:
     faults: of the data.  library: what could be tested, and ripple:
     whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
     weightiest first.
-    traces: of what they leave.  untestable: effects, and what the data lack for them.  maps: of
-    joints, sought beside the effects, once there is a ladder.
+    traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
+    whether structure is left that matters.  maps: of joints, sought beside the effects, once there
+    is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -49,6 +58,7 @@ class Causes:
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
+    wary: bool
     maps: Mapped = NO_MAPS
 
 
@@ -78,8 +88,9 @@ def causes_of(
     effects = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = GEAR_RIPPLE.name not in exclude
     effects = judged_again(effects, choice, study.data, lib, ripple)
-    every = (*faults, *read_back)
-    return study, Causes(every, lib, ripple, choice, tuple(effects), traces, lib.untestable)
+    every, told = (*faults, *read_back), lib.untestable
+    wary = heard(traces, explained(study.rows, choice), study.rows.count) is not None
+    return study, Causes(every, lib, ripple, choice, tuple(effects), traces, told, wary)
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:

@@ -207,7 +207,7 @@ def in_rungs(
     often = [f for f in causes.effects if not f.again < WEAK]
     chosen = [term for finding in often for term in finding.terms]
     spoken = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
-    ladder = climbed(study, [finding.terms for finding in spoken.effects])
+    ladder = climbed(study, [finding.terms for finding in spoken.effects], wary=causes.wary)
     progress("error maps of joints")
     spoken, ladder = with_maps(spoken, ladder, exclude)
     return spoken if spoken.maps.terms else causes, spoken, ladder
@@ -221,7 +221,7 @@ def with_maps(causes: Causes, ladder: Ladder, exclude: Sequence[str]) -> tuple[C
     effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
     causes = replace(causes, effects=tuple(effects), maps=maps)
     causes = replace(causes, traces=beside_maps(study, causes))
-    return causes, climbed(study, [finding.terms for finding in effects])
+    return causes, climbed(study, [finding.terms for finding in effects], wary=causes.wary)
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -27,7 +27,7 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = select(causes.library.only(rows), ripple=causes.ripple, seldom=MOST)
-    return climbed(small, causes.maps.beside(effects_of(choice)))
+    return climbed(small, causes.maps.beside(effects_of(choice)), wary=causes.wary)
 
 
 def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:

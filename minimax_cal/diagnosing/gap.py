@@ -29,6 +29,7 @@ RESAMPLES = 1000
 FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
+END = 0.2  # of the poses at an end of what drives an effect
 ALIKE = 0.5  # of a point's error, which geometry alone must see too if the point is wrong
 FAULTS = ("outliers", "swapped_rows")
 
@@ -61,8 +62,13 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
-    """The ladder of a study's effects, in their order."""
+def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = False) -> Ladder:
+    """The ladder of a study's effects, in their order.
+
+    wary: where structure is left, names are a best guess.  Laws of a joint's angle, or of the time,
+    are then believed only if the ends of what drives them, left out, are met no worse either: there
+    a law that is not the machine's goes astray.
+    """
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
@@ -70,10 +76,35 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
         wide = joint(study, (*fits[-1].terms, *terms))
         told = wide.spared(spared)
         square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
-        if new < (1.0 - HELPS) * square and wide.no_worse(fits[-1]):
-            fits.append(wide)
-            taken.append(number)
+        if not (new < (1.0 - HELPS) * square and wide.no_worse(fits[-1])):
+            continue
+        if wary and astray(fits[-1], wide, terms):
+            continue
+        fits.append(wide)
+        taken.append(number)
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
+
+
+def astray(before: Joint, wide: Joint, terms: Sequence[Term]) -> bool:
+    """Whether the ends of what drives an effect are met worse with it, when they are left out."""
+    told = wide.spared(before.spared(ends_of(wide.study.scene, terms[0])))
+    return wide.cross_validated(told) > before.cross_validated(told)
+
+
+def ends_of(scene: Scene, term: Term) -> list[Array]:
+    """Poses (m,) at both ends of the angle or the time that a law follows; none of other laws.
+
+    A map is nothing beyond the angles that were measured.
+    """
+    effect, driver = EFFECTS[term.effect], np.zeros(0)
+    if effect.follows == "time":
+        driver = scene.column("clock")
+    elif effect.of_angle and not effect.is_map and term.place != "all":
+        driver = scene.q[joint_of(term.place)]
+    if not driver.size or np.ptp(driver) == 0.0:
+        return []
+    low, high = np.quantile(driver, (END, 1.0 - END))
+    return [driver <= low, driver >= high]
 
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:
