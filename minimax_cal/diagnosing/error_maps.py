@@ -28,6 +28,7 @@ from minimax_cal.diagnosing.remainder import (
     gain_chance,
 )
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.evidence.limits import NEARLY
 from minimax_cal.evidence.periodogram import Line, alike, bands
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
@@ -154,7 +155,7 @@ def strongest(
     found = [line.strongest(*band) for band in others]
     gains = [float(line.gain(turns + np.array([0.0, 1e-3]))[0]) for turns, _ in found]
     turns = found[int(np.argmax(gains))][0]
-    if not line.stays(turns):
+    if not line.stays(turns, NEARLY):
         return []
     wave = np.stack([f(turns * left.q[:, joint]) for f in (np.cos, np.sin)], axis=1)
     block = Block(f"J{joint + 1}", arm[:, :, None] * wave[:, None], np.full((1, 2), USUAL))

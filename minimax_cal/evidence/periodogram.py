@@ -107,8 +107,11 @@ class Line:
         near = turns[int(np.argmax(self.gain(turns)))] + step * np.linspace(-1.0, 1.0, 41)
         return float(near[int(np.argmax(self.gain(near)))]), len(turns) / DENSITY * 2.0
 
-    def stays(self, turns: float) -> bool:
-        """Whether both halves of the sweep show a wave, of the same frequency, size and phase."""
+    def stays(self, turns: float, apart: float = APART) -> bool:
+        """Whether both halves of the sweep show a wave, of the same frequency, size and phase.
+
+        apart: of its gain, by which they may differ in any case.
+        """
         low = self.q < np.median(self.q)
         if not low.any():  # most poses stand at one end: there are no two halves
             return False
@@ -118,7 +121,7 @@ class Line:
             own = Line(self.q[half], self.score[half], self.size[half])
             near = turns + np.linspace(-1.0, 1.0, 41) / own.sweep
             more += float(own.gain(near).max())
-        return bool(chdtrc(4, more) > UNSTEADY or more < APART * whole)
+        return bool(chdtrc(4, more) > UNSTEADY or more < apart * whole)
 
 
 def sums(turns: Array, q: Array, score: Array, size: Array) -> tuple[Array, Array, float]:
