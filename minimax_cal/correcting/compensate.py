@@ -281,7 +281,10 @@ def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
         )
     scene = arm.scene(data.take(np.arange(1)))
     whole = any(
-        part % 4 == WHOLE for term in terms for part in unmasked(term.choice.get("parts", 0.0))
+        part % 4 == WHOLE
+        for term in terms
+        if "assumed" not in term.choice
+        for part in unmasked(term.choice.get("parts", 0.0))
     )
     if whole and not (scene.known_masses or scene.measured_torques):
         out.append(

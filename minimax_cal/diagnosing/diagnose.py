@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.diagnosing.causes import Causes, beside_maps, causes_of, fault_findings, whole
+from minimax_cal.diagnosing.causes import (
+    Causes,
+    beside_maps,
+    causes_of,
+    fault_findings,
+    merged,
+    whole,
+)
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
@@ -218,7 +225,7 @@ def with_maps(causes: Causes, ladder: Ladder, exclude: Sequence[str]) -> tuple[C
     maps, study = error_maps(ladder.last, exclude), ladder.last.study
     if not maps.terms:
         return causes, ladder
-    effects = maps.findings([causes.effects[i] for i in ladder.taken], study.scene)
+    effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
     causes = replace(causes, effects=tuple(effects), maps=maps)
     causes = replace(causes, traces=beside_maps(study, causes))
     return causes, climbed(study, [finding.terms for finding in effects], wary=causes.wary)

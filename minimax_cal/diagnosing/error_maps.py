@@ -61,7 +61,8 @@ class Mapped:
         """The effects of a ladder with the maps, without what these replace."""
         gone = {term.key for term in self.needless}
         kept = [terms for terms in effects if terms[0].key not in gone]
-        return [*kept, *((term,) for term in self.terms)]
+        had = {terms[0].key for terms in kept}
+        return [*kept, *((term,) for term in self.terms if term.key not in had)]
 
     def findings(self, named: Sequence[Finding], scene: Scene) -> list[Finding]:
         """`beside` for findings; values are those of a fit that comes."""
@@ -88,18 +89,24 @@ def error_maps(fit: Joint, exclude: Sequence[str] = ()) -> Mapped:
     if not len(left.parts):
         return Mapped()
     usual = begun(left).usual
-    lines = fine_waves(fit, left.take(usual)) if GEAR_RIPPLE.name not in exclude else []
+    some = left.take(usual)
+    if not len(some.parts):
+        return Mapped()
+    lines = fine_waves(fit, some) if GEAR_RIPPLE.name not in exclude else []
     maps: list[Found] = []
     if JOINT_ERROR_MAP.name not in exclude:
-        maps = chosen(fit, left.take(usual), [found.block for found in lines])
+        maps = chosen(fit, some, [found.block for found in lines])
     if not (lines or maps):
         return Mapped()
+    rippled = {term.place for term in fit.terms if term.effect == GEAR_RIPPLE.name}
+    rippled |= {found.block.place for found in lines}
     needless = replaced(fit, left, usual, lines, maps)
     at = begun(without(fit, left, needless).take(usual))
     terms, gains, again = [], [], []
     for found in (*lines, *maps):
         wide = at.with_block(found.block)
-        terms.append(found.term or term_of(fit, found.block, wide, at.variance))
+        wave = GEAR_RIPPLE.name not in exclude and found.block.place not in rippled
+        terms.append(found.term or term_of(fit, found.block, wide, at.variance, wave=wave))
         gains.append((at.square - wide.square) / wide.variance)
         fell = (at.error**2 - wide.error**2).sum(axis=1)
         again.append(float(np.mean([fell[part].sum() > 0.0 for part in at.parts])))
@@ -123,16 +130,14 @@ class Found:
 def fine_waves(fit: Joint, left: Left) -> list[Found]:
     """Lines of gears that a fit lacks, near their ratios, one a joint."""
     heard = [t for t in fit.terms if t.effect == GEAR_RIPPLE.name]
-    waiting = [
-        line
-        for j in sweeping(fit.study.scene)
-        if f"J{j + 1}" not in {term.place for term in heard}
-        for line in strongest(fit, left, j, heard)
+    silent = [
+        j for j in sweeping(fit.study.scene) if f"J{j + 1}" not in {term.place for term in heard}
     ]
+    waiting = [line for j in silent for line in strongest(fit, left, j, heard)]
     at, out = begun(left), []
     for block, turns, tries in waiting:
         wide = at.with_block(block)
-        chance = len(waiting) * tries * gain_chance(at, wide, left.group)
+        chance = len(silent) * tries * gain_chance(at, wide, left.group)
         if chance < LEVEL:
             out.append(Found(block, chance, Term(GEAR_RIPPLE.name, block.place, {"turns": turns})))
             at = wide
@@ -194,8 +199,8 @@ def slow(left: Left, place: str) -> Block:
     return Block(place, columns, np.full((1, laws.shape[1]), USUAL))
 
 
-def term_of(fit: Joint, block: Block, at: Beside, variance: float) -> Term:
-    """The map of a block that was just fitted, or the wave that it is.
+def term_of(fit: Joint, block: Block, at: Beside, variance: float, *, wave: bool) -> Term:
+    """The map of a block that was just fitted, or the wave that it is, where that may be its name.
 
     variance: of a coordinate, with which its prior was weighed [m^2].
     """
@@ -204,7 +209,7 @@ def term_of(fit: Joint, block: Block, at: Beside, variance: float) -> Term:
     x = np.linspace(q.min(), q.max(), 8 * block.columns.shape[-1])
     curve = at.value[-block.columns.shape[-1] :] @ sines(x, low, high, block.columns.shape[-1])
     turns, share = strongest_wave(x, curve)
-    if share > ONE_WAVE:
+    if wave and share > ONE_WAVE:
         return Term(GEAR_RIPPLE.name, block.place, {"turns": turns})
     size *= BESIDE / float(np.sqrt(variance))
     choice = {"low": low, "high": high, "length": length, "size": size}

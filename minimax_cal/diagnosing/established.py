@@ -90,11 +90,14 @@ def is_found(finding: Finding, choice: Choice, whole: Choice) -> bool:
     return all(agree(own[text], before[text]) for text in own)
 
 
-def laws_there(finding: Finding, choice: Choice) -> set[str]:
-    """What a choice has of an effect at its place and at all places, or at any if it is at all."""
+def laws_there(finding: Finding, choice: Choice) -> set[tuple[str, frozenset[str]]]:
+    """What a choice has of an effect at its place and at all places, or at any if it is at all.
+
+    As places, and what their variants are told by, whatever the numbers.
+    """
     effect, place = finding.term.key
     return {
-        c.term.text
+        (c.term.place, frozenset(c.term.choice))
         for c in choice.chosen
         if c.term.effect == effect and (place == "all" or c.term.place in (place, "all"))
     }

@@ -75,9 +75,13 @@ def remainder(last: Joint, floor: Floor) -> Remainder:
     if not len(left.parts):
         return Remainder(0.0, (), last.train.rms_mm, floor.ends)
     left = left.take(begun(left).usual)
+    if not len(left.parts):
+        return Remainder(0.0, (), last.train.rms_mm, floor.ends)
     rungs, places = climbed(left)
     if not rungs[-1].usual.all():  # what stands out now spoils what is fitted and judged
         left = left.take(rungs[-1].usual)
+        if not len(left.parts):
+            return Remainder(0.0, (), last.train.rms_mm, floor.ends)
         rungs, places = climbed(left)
     squares, points = [rung.square for rung in rungs], float((left.root**2).sum()) / 3.0
     gains = -np.diff(squares)
@@ -276,7 +280,7 @@ class Beside:
     def of(parts: Array, y: Array, columns: Array, prior: Array) -> Beside:
         """Columns that are fitted freely, but for weights (p,) that hold them near 0."""
         size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
-        size = np.maximum(size, 1e-300)
+        size = np.where(size > 0.0, size, 1.0)  # of what no pose shows 0 is left
         bare = Beside(parts, y, columns / size, RIDGE + prior / size**2, y)
         return replace(bare, error=bare.cleared(y[..., None])[0][..., 0])
 

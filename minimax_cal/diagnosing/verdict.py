@@ -16,6 +16,8 @@ from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
+UNSURE = "names that change with the poses"
+UNASKED = "names that so few poses cannot confirm"
 ORDERS = 2  # waves a turn that one gear shows at once
 
 Structure = tuple[str, float]
@@ -35,16 +37,19 @@ def judged(
     loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
     if loud:
         return "unknown", (loud.name, structure[1])
-    if patched([found for found in sure if np.isfinite(found.size)], study.scene):
+    named = [found for found in sure if np.isfinite(found.size)]  # no fault of the data
+    if patched(named, study.scene):
         return "unknown", ("two laws for one joint may stand for one that is not known",
                            structure[1])  # fmt: skip
     loose = sum(f.size for f in causes.effects if not f.established and f.p_value < CERTAIN)
-    if loose > HALF * (loose + sum(f.size for f in sure if np.isfinite(f.size))):
-        return "unknown", ("names that change with the poses", structure[1])
-    if not closes_enough(sure, ladder, rest):
+    asked = any(np.isfinite(found.again) for found in causes.effects)
+    unsure = UNSURE if asked else UNASKED
+    if loose > HALF * (loose + sum(found.size for found in named)):
+        return "unknown", (unsure, structure[1])
+    if not closes_enough(named, ladder, rest):
         return "unknown", ("a curve of the joints that has no name", structure[1])
-    if not sure and wavers(ladder, rest):
-        return "unknown", ("names that change with the poses", structure[1])
+    if not named and wavers(ladder, rest):
+        return "unknown", (unsure, structure[1])
     if not sure:
         return "none", structure
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure

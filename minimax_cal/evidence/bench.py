@@ -195,7 +195,7 @@ class Bench:
         """
         d = len(one.candidate.main) + one.candidate.shapes
         free = max(self.dof - d, 1)
-        ratio = np.expm1(min(one.gain / self.dof, 50.0)) * free / d / wide
+        ratio = np.expm1(min(one.gain / max(self.dof, 1), 50.0)) * free / d / wide
         return float(min(1.0, fdtrc(d, free, ratio) * self.looked_at(one.candidate)))
 
     def looked_at(self, c: Candidate) -> float:

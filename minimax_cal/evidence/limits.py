@@ -20,7 +20,9 @@ LINES = 0.1  # share of the level for lines near a told ratio, and as much for a
 UNSTEADY = 1e-3  # chance that halves of a joint's sweep differ so much in a line
 APART = 0.1  # of a line's gain, by which they may differ however sure they are: those of gears do
 # by less than 0.09 on the Meca500 and the IRB 120, a curve's by 0.1 to 1.1 on the UR10
-NEARLY = 0.5  # the same of waves near a gear's ratio, which groups left out must call for besides: at
+NEARLY = (
+    0.5  # the same of waves near a gear's ratio, which groups left out must call for besides: at
+)
 # 241 a turn of the IRB 120's second joint, by 0.05 to 0.30
 UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed anew
 

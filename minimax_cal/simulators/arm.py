@@ -244,7 +244,7 @@ def kept(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """Joints that give way; one torque a joint, or of groups of links that share a spring."""
-    if "within" in term.choice:  # no spring of a simulator stiffens
+    if np.isfinite(term.choice.get("within", np.inf)):  # no spring of a simulator stiffens
         parts.mapped.append((term, values))
         return
     places = unmasked(term.choice["parts"])

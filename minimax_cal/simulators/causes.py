@@ -18,6 +18,8 @@ from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.compliance import WHOLE
+from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.arm import ELEMENTS, assumed
@@ -109,12 +111,21 @@ def established(told: Diagnosis) -> tuple[Term, ...]:
 
 
 def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
-    """Terms for a robot whose masses may be known: then each joint has one torque."""
-    return tuple(
-        replace(term, choice={})
-        if {"parts", "weights"} & term.choice.keys() and not assumed(robot)
-        else term
-        for term in terms
+    """Terms for a robot whose masses may be known: then each joint has one torque.
+
+    Those of all joints come first: what one of them has besides is chosen beside it.
+    """
+    if assumed(robot) or not any(rests_on_guesses(term) for term in terms):
+        return tuple(terms)
+    new = [replace(term, choice={}) if rests_on_guesses(term) else term for term in terms]
+    return tuple(sorted(new, key=lambda term: term.place != "all"))
+
+
+def rests_on_guesses(term: Term) -> bool:
+    """Whether its law was chosen for masses that nobody told."""
+    parts = unmasked(term.choice.get("parts", 0.0))
+    return bool({"weights", "assumed"} & term.choice.keys()) or any(
+        part % 4 != WHOLE for part in parts
     )
 
 

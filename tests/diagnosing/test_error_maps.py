@@ -67,6 +67,8 @@ def test_a_single_wave_is_told_as_one(robot: Robot) -> None:
     (term,) = error_maps(geometric(robot, sim, turn)).terms
     assert term.label == "gear_ripple:J1"
     assert abs(term.choice["turns"] - 17.0) < 0.2
+    (curve,) = error_maps(geometric(robot, sim, turn), exclude=["gear_ripple"]).terms
+    assert curve.label == "joint_error_map:J1"
 
 
 def test_slow_laws_of_the_same_angle_need_no_map(robot: Robot) -> None:
@@ -101,6 +103,8 @@ def test_a_fine_wave_is_found_at_a_ratio_that_another_joint_shows(robot: Robot) 
     assert abs(found.terms[0].choice["turns"] - 199.6) < 0.2
     assert found.chances[0] < 1e-3
     assert not error_maps(heard, exclude=["gear_ripple"]).terms
+    own = [(Term("gear_ripple", "J2", {"turns": 199.5}),)]
+    assert found.beside(own) == own  # a joint has its line already
     assert "gear_ripple:J2" not in [term.label for term in error_maps(bare).terms]  # no ratio known
 
 

@@ -6,7 +6,14 @@ from problems_fit import study_of
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.established import dwarfs, is_found, is_rival, share, shows
+from minimax_cal.diagnosing.established import (
+    dwarfs,
+    is_found,
+    is_rival,
+    laws_there,
+    share,
+    shows,
+)
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.library import Library, library
@@ -107,6 +114,9 @@ def test_an_effect_that_shares_its_joint_with_another_variant_need_not_agree(
     far = replace(whole)
     object.__setattr__(far, "estimates", tuple((3.0 * v, s) for v, s in whole.estimates))
     assert not is_found(effect, far, whole)
+    (close,) = lib.with_terms([(Term("gear_error", "J1", {"turns": 2.1}), 1.0)])
+    tuned = replace(far, found=(replace(far.found[0], candidate=close),))
+    assert laws_there(effect, tuned) == laws_there(effect, whole)  # whatever the number
     (wide,) = lib.with_terms([(Term("gear_error", "all", {"turns": 1.0, "joints": 63.0}), 1.0)])
     more = replace(far, found=(*far.found, replace(far.found[0], candidate=wide)))
     object.__setattr__(more, "estimates", (*far.estimates, (np.ones(12), np.ones(12))))

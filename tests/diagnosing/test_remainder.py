@@ -120,3 +120,15 @@ def test_what_holds_a_fit_holds_it_without_a_part(robot: Robot) -> None:
     assert_allclose(at.square, fit.cross_validated(list(left.parts)), rtol=1e-6)
     free = Beside.of(left.parts, left.y, left.columns, np.zeros(left.columns.shape[-1]))
     assert free.square > 1.5 * at.square  # as it would be without
+
+
+def test_what_no_pose_shows_is_nothing(rng: np.random.Generator) -> None:
+    """As a session's frame, once its poses stand out."""
+    y, columns = rng.normal(size=(20, 3)), rng.normal(size=(20, 3, 4))
+    columns[..., 2] = 0.0
+    parts = np.arange(20) % 4 == np.arange(4)[:, None]
+    some, whole = (
+        Beside.of(parts, y, columns[..., kept], np.zeros(np.count_nonzero(kept)))
+        for kept in (np.arange(4) != 2, np.ones(4, dtype=bool))
+    )
+    assert_allclose(whole.error, some.error, atol=1e-12)

@@ -114,7 +114,7 @@ def compliance_of(cell: Cell) -> Array:
             if name[1:].isdigit():
                 out[int(name[1:]) - 1] = value
     for term, _ in compliances:
-        if "within" in term.choice:
+        if np.isfinite(term.choice.get("within", np.inf)):
             out[joint_of(term.place)] = np.nan
     return out
 

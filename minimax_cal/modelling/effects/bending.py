@@ -78,20 +78,24 @@ Shift = Callable[[Array, Array], Array]  # (k, 3, m) per unit, of masses and cen
 
 
 def under_weight(scene: Scene, choice: Choice, name: str, unit: str, shift: Shift) -> Columns:
-    """What gives way to weights: to all together, or to those that a choice takes apart."""
-    if "weights" not in choice:
+    """What gives way to weights: to all together, or to those that a choice takes apart.
+
+    The payload, which nobody guesses, pulls with the last of these links.
+    """
+    kept = [part for part in unmasked(choice.get("weights", 0.0)) if part <= len(GROUPS)]
+    if not set(kept) & set(range(len(GROUPS))):  # none apart
         whole, doubt = shift(*scene.masses), differing(scene, shift)
         return Columns((name,), (unit,), shift=whole[None], doubt_shift=(doubt,))
-    kept = unmasked(choice["weights"])
-    fields = apart(scene, shift)[kept]
+    fields, nothing = apart(scene, shift)
+    fields[max(part for part in kept if part < len(GROUPS))] += nothing
     names = tuple(f"{name} ({(*GROUPS, 'tool')[part]})" for part in kept)
-    return Columns(names, (unit,) * len(kept), shift=fields)
+    return Columns(names, (unit,) * len(kept), shift=fields[kept])
 
 
-def apart(scene: Scene, shift: Shift) -> Array:
+def apart(scene: Scene, shift: Shift) -> tuple[Array, Array]:
     """(4, k, 3, m) motion of the targets by upper arm, forearm, wrist, and a kilogram amid them.
 
-    The payload, which nobody guesses, pulls with the wrist.
+    And (k, 3, m) by the payload.
     """
     mass, com = scene.masses
     group = np.minimum(np.arange(scene.joints) // 2, len(GROUPS) - 1)
@@ -100,7 +104,7 @@ def apart(scene: Scene, shift: Shift) -> Array:
     one, spot = np.zeros(scene.joints), np.zeros((scene.joints, 3))
     one[-1], spot[-1] = 1.0, scene.target_positions.mean(axis=0)
     tool = shift(one, spot) - nothing
-    return np.stack([*links[:-1], links[-1] + nothing, tool])
+    return np.stack([*links, tool]), nothing
 
 
 def weights_of(scene: Scene, shift: Shift) -> Sequence[Choice]:
@@ -111,7 +115,7 @@ def weights_of(scene: Scene, shift: Shift) -> Sequence[Choice]:
     if scene.known_masses:
         return PLAIN
     kept: list[int] = []
-    fields = apart(scene, shift).reshape(len(GROUPS) + 1, -1)
+    fields = apart(scene, shift)[0].reshape(len(GROUPS) + 1, -1)
     basis = np.zeros((fields.shape[1], 0))
     for part, field in enumerate(fields):
         rest = field - basis @ (basis.T @ field)

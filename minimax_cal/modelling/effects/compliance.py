@@ -56,7 +56,8 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
     upper arm, forearm and wrist are taken apart, because their masses are free; one that another
     explains as well is left out.  Nobody tells the tool's weight then either, and it may hang
     beside the flange's axis: all joints together are tried with that too (`tool`: `beside_axis`).
-    A single joint is also tried as one that stiffens (`within`).
+    A single joint is also tried as one that stiffens (`within`): under the wrist's torque, or under
+    that of all links with masses that are `assumed`.
     """
     joints = loaded(scene) if place == "all" else [joint_of(place)]
     if scene.known_masses or scene.measured_torques:
@@ -77,9 +78,10 @@ def parts_of(scene: Scene, place: str) -> Sequence[Choice]:
     parts = {"parts": mask_of(chosen)}
     tool = beside_axis(scene) if place == "all" else 0.0
     wider = ({**parts, "tool": tool},) if tool else ()
-    last = len(GROUPS) - 1
-    groups = (last,) if joints[0] // 2 >= last else (last, WHOLE)
-    return (parts, *wider, *stiffening(scene, place, groups))
+    last, own = len(GROUPS) - 1, 4 * joints[0]
+    several = sum(largest_torque(scene, own + group) > 0.0 for group in range(len(GROUPS))) > 1
+    whole = [{**choice, "assumed": 1.0} for choice in stiffening(scene, place, (WHOLE,))]
+    return (parts, *wider, *stiffening(scene, place, (last,)), *(whole if several else ()))
 
 
 def stiffening(scene: Scene, place: str, groups: Sequence[int]) -> Sequence[Choice]:
@@ -104,7 +106,7 @@ def other_ends(scene: Scene, choice: Choice) -> Sequence[Choice]:
     """Torques near that one to which a joint was found to give way most."""
     if "within" not in choice:
         return ()
-    most = largest_torque(scene, unmasked(choice["parts"])[0])
+    most = largest_torque(scene, unmasked(choice["parts"])[0])  # measured ones have no `assumed`
     ends = [part * choice["within"] for part in (0.6, 0.8, 1.25, 1.6)]
     return [{**choice, "within": end} for end in ends if SOFTEST <= end / most <= STIFFEST]
 
@@ -126,8 +128,13 @@ def tool_torques(scene: Scene) -> Array:
     return np.stack([along_x - amid, along_y - amid])
 
 
-def torque_of(scene: Scene, joint: int, group: int) -> Array:
-    """(m,) gravity's torque of some of the links about a joint [N m]."""
+def torque_of(scene: Scene, joint: int, group: int, *, assumed: bool = False) -> Array:
+    """(m,) gravity's torque of some of the links about a joint [N m].
+
+    assumed: computed in any case, also where torques are measured.
+    """
+    if group == WHOLE and assumed:
+        return np.asarray((scene.torque(*scene.masses) + scene.payload)[joint])
     if group == WHOLE:
         return np.asarray(scene.gravity[joint])
     mass, com = scene.masses
@@ -146,7 +153,7 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
     within = choice.get("within", np.inf)
     for part in unmasked(choice["parts"]):
         j, group = divmod(part, 4)
-        torque, slope = taken_up(torque_of(scene, j, group), within)
+        torque, slope = taken_up(torque_of(scene, j, group, assumed="assumed" in choice), within)
         turns.append(one_joint(scene, j, torque[None]))
         whole = group == WHOLE
         names.append(f"c{j + 1}" + ("" if whole else f" ({GROUPS[group]})"))
@@ -169,13 +176,19 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         np.concatenate(turns),
         doubt=tuple(doubts),
         either=np.arange(len(names)) >= positive,
-        fixed={"within_Nm": within} if np.isfinite(within) else {},
+        fixed={told_as(scene): within} if np.isfinite(within) else {},
     )
+
+
+def told_as(scene: Scene) -> str:
+    """What the torque is called to which a joint gives way most: N m that somebody told, or not."""
+    told = scene.known_masses or scene.measured_torques
+    return "within_Nm" if told else "within_assumed_Nm"
 
 
 def taken_up(torque: Array, within: float) -> tuple[Array, Array]:
     """(m,) t tanh(tau / t) of torques (m,), t = within, and its slopes; infinite: the torques."""
-    if not np.isfinite(within):
+    if not 0.0 < within < np.inf:
         return torque, np.ones_like(torque)
     course = np.tanh(torque / within)
     return within * course, 1.0 - course**2
