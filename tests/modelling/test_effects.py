@@ -1,5 +1,6 @@
 """Every effect's law against an independent expectation, and its columns against finite changes."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +112,30 @@ def test_columns_have_names_units_and_finite_fields(which: str) -> None:
             assert 0 <= owner < len(found.names), term
             assert doubt.shape[1:] == scene.points.shape, term
             assert np.all(np.isfinite(doubt)), term
+
+
+@pytest.mark.parametrize("which", SCENES)
+def test_the_text_of_a_variant_means_that_variant(which: str) -> None:
+    """And leaves nothing to be picked, unless the law's plain form has nothing to write."""
+    scene = SCENES[which]
+
+    def never(chosen: Sequence[Term], several: Sequence[Term]) -> Term:
+        raise AssertionError([term.text for term in several])
+
+    for term in all_terms(scene):
+        if term.choice:
+            (found,) = terms(scene, [term.text], never)
+            assert found.text == term.text or dict(found.choice) == dict(term.choice), term
+
+
+def test_what_one_variant_has_does_not_go_with_another() -> None:
+    scene = SCENES["no masses"]
+    plain, *_, last = EFFECTS["joint_compliance"].choices(scene, "J2")
+    assert "assumed" in last
+    with pytest.raises(mc.OptionError, match="no variant has"):
+        terms(scene, [f"joint_compliance:J2:parts={plain['parts']}:within=3"])
+    (found,) = terms(scene, ["link_bending:L2:weights=0"])  # all links together
+    assert len(found.columns(scene).names) == 1
 
 
 @pytest.mark.parametrize("which", SCENES)
@@ -268,6 +293,18 @@ def test_measured_torques_replace_computed_ones() -> None:
         expected = TAU[f"tau{j + 1}"] * ROBOT.sign[j]
         assert_allclose(scene.gravity[j], expected, rtol=0, atol=0)
     assert not len(scene.gravity_parts)  # what is measured is not doubted
+
+
+def test_torques_of_guessed_masses_stay_so_where_torques_are_measured() -> None:
+    guessed, measured = (
+        scene_of(NO_MASSES, data) for data in (DATA, replace(DATA, columns={**DATA.columns, **TAU}))
+    )
+    *_, choice = EFFECTS["joint_compliance"].choices(guessed, "J2")
+    assert choice["assumed"] == 1.0
+    one, other = (columns("joint_compliance", "J2", s, **choice) for s in (guessed, measured))
+    assert_allclose(one.turn, other.turn, rtol=0, atol=0)
+    assert dict(one.fixed) == {"within_assumed_Nm": choice["within"]}
+    assert not any("assumed" in c for c in EFFECTS["joint_compliance"].choices(measured, "J2"))
 
 
 def test_unknown_masses_give_torques_of_parts() -> None:

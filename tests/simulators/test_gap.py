@@ -1,6 +1,7 @@
 """The gap in a simulator: rung by rung what the fit says, and the corrected file keeps it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.robots.gravity import tubes
 from minimax_cal.simulators.result import SimulatorGap, load_simulator_gap
 from tests.conftest import run, shared
 from tests.problems_mjcf import published_like
@@ -15,6 +18,7 @@ from tests.problems_mjcf import published_like
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
+from minimax_cal.simulators.causes import carried_over  # noqa: E402
 from minimax_cal.simulators.chain import chain_of  # noqa: E402
 from minimax_cal.simulators.given import read_model  # noqa: E402
 
@@ -136,3 +140,20 @@ def test_real_arms_end_where_effects_with_an_element_end(name: str, tmp_path: Pa
     assert gap.rungs[-1].holdout_rms_mm < WITHIN * gap.rungs[-1].predicted_rms_mm
     ladder = load_diagnosis(tmp_path / "diagnosis.json").ladder
     assert np.isclose(gap.rungs[2].predicted_rms_mm, ladder[1].holdout.rms_mm, rtol=0.02)
+
+
+def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones() -> None:
+    told = mc.load_robot("irb2600")
+    mass, com = tubes(told.mdh)
+    told = replace(told, mass=np.maximum(mass, 1.0), com=com)
+    soft = Term("joint_compliance", "J2", {"parts": 128.0, "within": 9.0, "assumed": 1.0})
+    every = Term("joint_compliance", "all", {"parts": 112.0})
+    sag = Term("link_bending", "L2", {"weights": 6.0})
+    known = Term("joint_compliance", "J3", {"parts": 2048.0, "within": 9.0})
+    new = carried_over((soft, every, sag, known), told)
+    assert [(t.label, dict(t.choice)) for t in new] == [
+        ("joint_compliance:all", {}), ("joint_compliance:J2", {}), ("link_bending:L2", {}),
+        (known.label, dict(known.choice)),
+    ]  # fmt: skip
+    assert carried_over((known, soft), mc.load_robot("irb2600")) == (known, soft)
+    assert carried_over((known,), told) == (known,)
