@@ -206,8 +206,9 @@ def test_what_the_first_example_says_is_what_it_prints(site: Path) -> None:
 def test_what_the_second_example_says_is_what_it_prints(site: Path) -> None:
     page = re.sub(r"<[^>]+>", "", (site / "examples" / "diagnose_a_gap.html").read_text())
     found = re.findall(r"verdict (\w+), held-out RMS ([\d.]+) mm, ([\w:, ]+)", page)
-    (named, left, which), (_, more, _) = found
+    (named, left, which), (without, more, _) = found
     assert (named, which.strip()) == ("named", "joint_compliance:all")
+    assert without != "named"
     assert float(more) > 1.5 * float(left)
     follows = [float(one) for one in re.findall(r"still following the pose: ([\d.]+) mm", page)]
     assert follows[0] < 0.2 * follows[1]

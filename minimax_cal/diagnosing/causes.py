@@ -89,13 +89,18 @@ def causes_of(
     ripple = GEAR_RIPPLE.name not in exclude
     effects = judged_again(effects, choice, study.data, lib, ripple)
     every, told = (*faults, *read_back), lib.untestable
-    wary = heard(traces, explained(study.rows, choice), study.rows.count) is not None
+    wary = loudest(study, choice, traces) is not None
     return study, Causes(every, lib, ripple, choice, tuple(effects), traces, told, wary)
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
     """Traces of what the effects leave, whatever the masses are that they were told with."""
     return structure(study.scene, study.rows, choice.noise, choice.doubted, named_in(choice))
+
+
+def loudest(study: Study, choice: Choice, traces: Sequence[Trace]) -> Trace | None:
+    """The structure that matters, beside what the effects explain and beside the noise."""
+    return heard(traces, explained(study.rows, choice), study.rows.count)
 
 
 def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:

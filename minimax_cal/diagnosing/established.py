@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -52,8 +51,6 @@ def judged_again(
         for one, known in zip(findings, told, strict=True):
             found = is_found(one, choice, whole)
             known += [found] if found or shows(one, choice, whole) else []
-        del rest, choice
-        gc.collect()  # products of a part are large, few objects, and refer to each other
     return [
         replace(
             one,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +47,4 @@ def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) 
         fits = fold_of(study, causes, ~mask, state).fits
         rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
-        del fits
-        gc.collect()  # products of a part are large, few objects, and refer to each other
     return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")

@@ -71,17 +71,18 @@ def remainder(last: Joint, floor: Floor) -> Remainder:
 
     floor: what noise alone would leave.
     """
+    nothing = Remainder(0.0, (), last.train.rms_mm, floor.ends)
     left = Left.of(last)
     if not len(left.parts):
-        return Remainder(0.0, (), last.train.rms_mm, floor.ends)
+        return nothing
     left = left.take(begun(left).usual)
     if not len(left.parts):
-        return Remainder(0.0, (), last.train.rms_mm, floor.ends)
+        return nothing
     rungs, places = climbed(left)
     if not rungs[-1].usual.all():  # what stands out now spoils what is fitted and judged
         left = left.take(rungs[-1].usual)
         if not len(left.parts):
-            return Remainder(0.0, (), last.train.rms_mm, floor.ends)
+            return nothing
         rungs, places = climbed(left)
     squares, points = [rung.square for rung in rungs], float((left.root**2).sum()) / 3.0
     gains = -np.diff(squares)

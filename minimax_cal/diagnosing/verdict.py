@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import Causes
+from minimax_cal.diagnosing.causes import Causes, loudest
 from minimax_cal.diagnosing.gap import Ladder
-from minimax_cal.diagnosing.lack_of_fit import chance_of, explained, heard
+from minimax_cal.diagnosing.lack_of_fit import chance_of
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
@@ -34,7 +34,7 @@ def judged(
     worst = min(traces, key=lambda trace: trace.p)
     structure = (worst.name, chance_of(traces))
     sure = [found for found in findings if found.established]
-    loud = heard(traces, explained(study.rows, causes.choice), study.rows.count)
+    loud = loudest(study, causes.choice, traces)
     if loud:
         return "unknown", (loud.name, structure[1])
     named = [found for found in sure if np.isfinite(found.size)]  # no fault of the data

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import fdtrc
 
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
-from minimax_cal.evidence.limits import LINES
+from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
 from minimax_cal.evidence.products import LEAST, At, within
 from minimax_cal.ground.arrays import Array
@@ -409,6 +409,16 @@ def together(
     sigma = np.sqrt(np.maximum(np.diag(inverse), 0.0) * noise.variance) / scale
     cuts = np.cumsum([len(one.candidate.main) for one in fits])
     return tuple(zip(np.split(value, cuts)[:-1], np.split(sigma, cuts)[:-1], strict=True))
+
+
+def credible(lib: Library, fits: Sequence[Added], noise: Noise) -> bool:
+    """Whether what the laws of effects must differ by, to explain most, is what they may."""
+    main, _, ridge = columns_of([one.candidate for one in fits], fits)
+    if not len(ridge):
+        return True
+    gram, pull, scale = normal_equations(lib, fits, noise)
+    value = np.linalg.pinv(gram, 1e-12, hermitian=True) @ pull / scale
+    return bool((value[len(main) :] ** 2 * ridge < CREDIBLE**2).all())
 
 
 def columns_of(

@@ -20,10 +20,8 @@ LINES = 0.1  # share of the level for lines near a told ratio, and as much for a
 UNSTEADY = 1e-3  # chance that halves of a joint's sweep differ so much in a line
 APART = 0.1  # of a line's gain, by which they may differ however sure they are: those of gears do
 # by less than 0.09 on the Meca500 and the IRB 120, a curve's by 0.1 to 1.1 on the UR10
-NEARLY = (
-    0.5  # the same of waves near a gear's ratio, which groups left out must call for besides: at
-)
-# 241 a turn of the IRB 120's second joint, by 0.05 to 0.30
+NEARLY = 0.5  # the same of waves near a gear's ratio, which groups left out must call for besides:
+# at 241 a turn of the IRB 120's second joint they differ by 0.05 to 0.30
 UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed anew
 
 # ---- what else it could be -----------------------------------------------------------------------
@@ -51,6 +49,8 @@ STRUCTURE = 0.005  # chance that noise alone is called structure: the other half
 MATTERS = 0.015  # share of what was explained below which structure is of no account: laws of
 # machines are not quite ours (study, saturating and loaded forms), real arms leave 1 %
 WORTH = 0.02  # of the noise: structure that would lower the RMS by less than 1 % is of no account
+CREDIBLE = 3.0  # sigmas by which masses may be off to explain what a name leaves: with the true law
+# they are by up to 2, without it by 3.3 to 9 (simulated UR10s, twelve of each)
 CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
 HALF = 0.5  # of the predictable gap, which what is established must close; of an effect, below
 # which a part of the poses is no test of it

@@ -77,16 +77,16 @@ Formed = Callable[[Array, int, int], Array]  # products (f, g, d) of columns (f,
 class Lines:
     """Products of some columns with all, at g ratios, each formed when it is first asked for.
 
-    form: of columns (f,), with those from a first to before a last, (f, g, d).
+    Whoever asks brings what forms them, and is not held here: two that hold each other stay in
+    memory, which these fill, until someone looks for such pairs.
     """
 
-    def __init__(self, form: Formed, depth: int) -> None:
-        self.form = form
+    def __init__(self, depth: int) -> None:
         self.held = np.empty((0, depth, 0))
         self.place: dict[int, int] = {}
         self.width = 0
 
-    def places(self, index: Array, width: int) -> Array:
+    def places(self, form: Formed, index: Array, width: int) -> Array:
         """(f,) where the products of columns are held, with so many others at least."""
         known = len(self.place)
         new = np.array([i for i in dict.fromkeys(index.tolist()) if i not in self.place], dtype=int)
@@ -94,21 +94,21 @@ class Lines:
         if width > self.width:
             if known:
                 old = np.array(list(self.place))
-                self.held[:known, :, self.width : width] = self.form(old, self.width, width)
+                self.held[:known, :, self.width : width] = form(old, self.width, width)
             self.width = width
         if len(new):
-            self.held[known : known + len(new), :, : self.width] = self.form(new, 0, self.width)
+            self.held[known : known + len(new), :, : self.width] = form(new, 0, self.width)
             self.place.update(zip(new.tolist(), range(known, known + len(new)), strict=True))
         return np.array([self.place[i] for i in index.tolist()], dtype=int)
 
-    def across(self, index: Array, start: int, stop: int) -> Array:
+    def across(self, form: Formed, index: Array, start: int, stop: int) -> Array:
         """(f, g, d) products of columns with those from a first to before a last."""
-        at = self.places(index, stop)
+        at = self.places(form, index, stop)
         return np.asarray(self.held[at, :, start:stop])
 
-    def square(self, index: Array, width: int) -> Array:
+    def square(self, form: Formed, index: Array, width: int) -> Array:
         """(g, f, f) products among columns."""
-        at = self.places(index, width)
+        at = self.places(form, index, width)
         return np.moveaxis(self.held[at[:, None], :, index[None]], -1, 0)
 
 
@@ -124,7 +124,7 @@ class Sums:
         self.columns, self.ratios, self.out, self.total = columns, ratios, out, total
         spread = columns.rows.variance_ratio
         self.weights = 1.0 / (1.0 + np.outer(ratios, spread if out is None else spread[out]))
-        self.lines = Lines(self.weighed, len(ratios))
+        self.lines = Lines(len(ratios))
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
         self.here = np.empty((0, self.weights.shape[1]))
@@ -144,7 +144,7 @@ class Sums:
     def products(self, index: Array, start: int, stop: int) -> Array:
         """(f, g, d) of columns with those from a first to before a last."""
         if self.total is None:
-            return self.lines.across(index, start, stop)
+            return self.lines.across(self.weighed, index, start, stop)
         return self.total.products(index, start, stop) - self.weighed(index, start, stop)
 
     def weighed(self, index: Array, start: int, stop: int) -> Array:
@@ -213,7 +213,7 @@ class Beside:
         self.inverse = np.linalg.inv(self.factor)
         self.logs = 2.0 * np.log(np.einsum("grr->gr", self.factor)).sum(axis=1)
         self.error = sums.products(np.array([p]), p, p + 1)[0, :, 0]
-        self.lines = Lines(self.left, depth)
+        self.lines = Lines(depth)
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.held = np.empty((depth, r, 0))
         self.known = 0
@@ -243,11 +243,11 @@ class Beside:
 
     def across(self, index: Array) -> Array:
         """(f, g, p + 1 + D) products of columns with all."""
-        return self.lines.across(index, 0, self.width)
+        return self.lines.across(self.left, index, 0, self.width)
 
     def square(self, index: Array) -> Array:
         """(g, f, f) products among columns."""
-        return self.lines.square(index, self.width)
+        return self.lines.square(self.left, index, self.width)
 
     def among(self, index: Array) -> Array:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""

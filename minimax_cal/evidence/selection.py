@@ -14,7 +14,15 @@ from itertools import combinations
 
 import numpy as np
 
-from minimax_cal.evidence.bench import Added, Bench, against_signs, bench, columns_of, together
+from minimax_cal.evidence.bench import (
+    Added,
+    Bench,
+    against_signs,
+    bench,
+    columns_of,
+    credible,
+    together,
+)
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
@@ -79,7 +87,12 @@ class Choice:
 
     @property
     def doubted(self) -> Array:
-        """(N, q + r) their columns, and those by which their laws may differ."""
+        """(N, q + r) their columns, and those by which their laws may differ, if that is enough.
+
+        r = 0 where the laws would have to differ by more than anybody doubts.
+        """
+        if not credible(self.library, self.found, self.noise):
+            return self.known
         main, loose, _ = columns_of(self.chosen, self.found)
         return self.library.columns[:, np.concatenate([main, loose])]
 

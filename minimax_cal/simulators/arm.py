@@ -16,7 +16,12 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
-from minimax_cal.modelling.effects.compliance import GRAVITY_COMPENSATOR, JOINT_COMPLIANCE, WHOLE
+from minimax_cal.modelling.effects.compliance import (
+    GRAVITY_COMPENSATOR,
+    JOINT_COMPLIANCE,
+    WHOLE,
+    stiffens,
+)
 from minimax_cal.modelling.effects.gears import BACKLASH, ENCODER_GAIN, JOINT_COUPLING, joints_at
 from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
@@ -244,7 +249,7 @@ def kept(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
     """Joints that give way; one torque a joint, or of groups of links that share a spring."""
-    if np.isfinite(term.choice.get("within", np.inf)):  # no spring of a simulator stiffens
+    if stiffens(term.choice):  # no spring of a simulator stiffens
         parts.mapped.append((term, values))
         return
     places = unmasked(term.choice["parts"])
@@ -265,9 +270,9 @@ def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
 
 
 def softness(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
-    """A link that bends, or the base; under all weights, or groups of them that share a spring."""
+    """A link that bends, or the base; under a tool of its own weight, which shares the spring."""
     value = float(values[0])
-    if "weights" in term.choice or value <= 0.0:
+    if len(values) > 1 or value <= 0.0:  # no spring does that; others may take over what it does
         parts.grouped = True
     elif EFFECTS[term.effect].moves == "foot":
         parts.put(base=parts.arm.base + value)

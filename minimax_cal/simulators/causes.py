@@ -124,7 +124,7 @@ def carried_over(terms: Sequence[Term], robot: Robot) -> tuple[Term, ...]:
 def rests_on_guesses(term: Term) -> bool:
     """Whether its law was chosen for masses that nobody told."""
     parts = unmasked(term.choice.get("parts", 0.0))
-    return bool({"weights", "assumed"} & term.choice.keys()) or any(
+    return bool({"assumed", "tool"} & term.choice.keys()) or any(
         part % 4 != WHOLE for part in parts
     )
 

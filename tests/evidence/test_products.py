@@ -1,5 +1,7 @@
 """Products formed once: the same as sums over the rows that count, for any ratio of the noises."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -237,3 +239,30 @@ def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None
     part = whole.only(since)
     assert shift not in part.candidates
     select(part)  # and no warning
+
+
+def test_parts_leave_no_memory_behind(lib: Library, poses: Array) -> None:
+    """Products are large: they go with the last name for them, not when a collector comes."""
+    part = lib.only(poses)
+    choice = select(part)
+    assert choice.benches
+    held = [weakref.ref(part.products), *map(weakref.ref, part.products.formed.values())]
+    gc.disable()
+    try:
+        del part, choice
+        assert [one() for one in held] == [None] * len(held)
+    finally:
+        gc.enable()
+
+
+def test_laws_leave_no_scene_behind(rough: Study) -> None:
+    """A scene keeps its laws, and its laws not the scene: it goes with the last name for it."""
+    scene = replace(rough.scene)
+    Term("link_bending", "L2").columns(scene).doubts(scene)
+    held = weakref.ref(scene)
+    gc.disable()
+    try:
+        del scene
+        assert held() is None
+    finally:
+        gc.enable()

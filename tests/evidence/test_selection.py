@@ -7,13 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
 
+import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.causes import chosen
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import Added, against_signs, bench
+from minimax_cal.evidence.bench import Added, against_signs, bench, columns_of, credible
 from minimax_cal.evidence.library import Kind, library
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.noise import restricted
@@ -24,13 +25,18 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots.gravity import masses_of
 
 
 def opened(*causes: Cause, seed: int = 0, robot: str = "irb2600", poses: int = 100) -> Study:
     sealed = make(Case(robot, "single", causes, seed=seed, poses=poses))
     train, _, _ = split(with_history(sealed.data), 0.2, 0)
-    fit = fit_cell(sealed.robot, train, Options(objective="sum"), silent)
-    return studied(sealed.robot, train, fit)
+    return study_of(sealed.robot, train)
+
+
+def study_of(robot: mc.Robot, data: mc.Measurements) -> Study:
+    return studied(robot, data, fit_cell(robot, data, Options(objective="sum"), silent))
 
 
 @pytest.mark.parametrize(
@@ -64,6 +70,23 @@ def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_masses_in_doubt_excuse_what_little_they_explain(seed: int) -> None:
+    """And not a law that is missing, for which they would have to be many sigma off."""
+    robot = mc.load_robot("ur10")
+    mass, com = masses_of(robot)
+    robot = replace(robot, mass=mass, com=com)
+    made = simulate(robot, poses=150, seed=seed, truth=Truth(compliance=2e-6))
+    off = replace(robot, mass=mass * [1.0, 1.15, 0.9, 1.2, 1.0, 0.85])
+    told = study_of(off, with_history(made.data))
+    for exclude, excused in (((), True), (("joint_compliance",), False)):
+        _, choice = chosen(told, exclude)
+        main, loose, _ = columns_of(choice.chosen, choice.found)
+        assert len(loose)
+        assert credible(choice.library, choice.found, choice.noise) == excused
+        assert choice.doubted.shape[1] == len(main) + excused * len(loose)
 
 
 def test_no_name_without_an_effect() -> None:
@@ -168,7 +191,7 @@ def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
     made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), -SOFT)
     lib = library(made.scene, made.rows)
     terms = ["joint_compliance:all", "backlash:J1", "link_bending:L2"]
-    found = {c.term.label: c for c in lib.candidates if "tool" not in c.term.choice}
+    found = {c.term.label: c for c in lib.candidates if not c.term.choice.get("tool")}
     fits, chosen_ = [], []
     for text in terms:
         fits.append(selection.bench(lib, chosen_, fits).added(found[text]))

@@ -134,8 +134,6 @@ def test_what_one_variant_has_does_not_go_with_another() -> None:
     assert "assumed" in last
     with pytest.raises(mc.OptionError, match="no variant has"):
         terms(scene, [f"joint_compliance:J2:parts={plain['parts']}:within=3"])
-    (found,) = terms(scene, ["link_bending:L2:weights=0"])  # all links together
-    assert len(found.columns(scene).names) == 1
 
 
 @pytest.mark.parametrize("which", SCENES)
@@ -386,28 +384,28 @@ def test_a_level_link_bends_as_the_cantilever_of_the_textbook() -> None:
 
 
 @pytest.mark.parametrize(("effect", "place"), [("link_bending", "L2"), ("base_flex", "frame")])
-def test_weights_that_nobody_tells_bend_by_themselves(effect: str, place: str) -> None:
-    """Their motions add up to that of all links; the tool's is that of a payload of 1 kg."""
+def test_a_tool_that_nobody_told_bends_as_a_payload_of_a_kilogram(effect: str, place: str) -> None:
     empty, one = (
         scene_of(NO_MASSES, replace(DATA, columns={**DATA.columns, "payload": np.full(40, mass)}))
         for mass in (0.0, 1.0)
     )
-    plain, apart = EFFECTS[effect].choices(empty, place)
-    assert plain == {}
-    found = columns(effect, place, empty, **apart)
-    assert len(set(found.units)) == 1
+    assert [dict(c) for c in EFFECTS[effect].choices(empty, place)] == [
+        {"tool": 0.0},
+        {"tool": 1.0},
+    ]
+    assert [dict(c) for c in EFFECTS[effect].choices(SCENE, place)] == [{}]  # masses are told
+    found, plain = (columns(effect, place, empty, tool=t) for t in (1.0, 0.0))
     assert EFFECTS[effect].upward(found).all()
-    every = columns(effect, place, empty, weights=15.0).displacement(empty)
     whole, loaded = (columns(effect, place, s).displacement(s)[0] for s in (empty, one))
+    links, tool = found.displacement(empty)
     scale = np.abs(whole).max()
-    assert_allclose(every[:-1].sum(axis=0), whole, rtol=0, atol=EXACT * scale)
-    assert_allclose(every[-1], loaded - whole, rtol=0, atol=EXACT * scale)
-    for weights in (11.0, 9.0, 7.0):  # the payload pulls with the last link that is told apart
-        sag = [columns(effect, place, s, weights=weights).displacement(s) for s in (empty, one)]
-        assert_allclose((sag[1] - sag[0]).sum(axis=0), loaded - whole, rtol=0, atol=EXACT * scale)
-    plain = columns(effect, place, empty, weights=0.0)
-    assert_allclose(plain.displacement(empty)[0], whole, rtol=0, atol=0)
-    assert len(EFFECTS[effect].choices(SCENE, place)) == 1  # masses are told
+    assert_allclose(links, whole, rtol=0, atol=0)
+    assert_allclose(plain.displacement(empty), whole[None], rtol=0, atol=0)
+    assert_allclose(tool, loaded - whole, rtol=0, atol=EXACT * scale)
+    with_payload = columns(effect, place, one, tool=1.0).displacement(one)
+    assert_allclose(with_payload, np.stack([loaded, tool]), rtol=0, atol=EXACT * scale)
+    owners = [owner for owner, _ in found.doubts(empty)]
+    assert owners == [0]  # of the links' masses; the tool's is free
 
 
 def test_links_that_carry_nothing_do_not_bend() -> None:

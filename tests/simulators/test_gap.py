@@ -148,7 +148,7 @@ def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones() -> None:
     told = replace(told, mass=np.maximum(mass, 1.0), com=com)
     soft = Term("joint_compliance", "J2", {"parts": 128.0, "within": 9.0, "assumed": 1.0})
     every = Term("joint_compliance", "all", {"parts": 112.0})
-    sag = Term("link_bending", "L2", {"weights": 6.0})
+    sag = Term("link_bending", "L2", {"tool": 1.0})
     known = Term("joint_compliance", "J3", {"parts": 2048.0, "within": 9.0})
     new = carried_over((soft, every, sag, known), told)
     assert [(t.label, dict(t.choice)) for t in new] == [

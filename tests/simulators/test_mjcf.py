@@ -220,9 +220,9 @@ def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs() -> 
     assert compliance_of(plain)[1] == 3e-6
 
 
-def test_links_that_bend_under_weights_nobody_told_have_one_spring() -> None:
+def test_links_that_bend_under_a_tool_nobody_told_have_one_spring() -> None:
     robot = robot_called("irb2600")
-    cell = cell_with(robot, "link_bending:L2:weights=6", link_bending=[1e-6, 2e-6])
+    cell = cell_with(robot, "link_bending:L2:tool=1", link_bending=[1e-6, 2e-6])
     arm = arm_of(cell)
     assert list(arm.bend) == [1]
     assert arm.remainder < IMITATED

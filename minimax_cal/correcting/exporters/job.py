@@ -13,7 +13,7 @@ from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
-from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE, stiffens
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
@@ -114,7 +114,7 @@ def compliance_of(cell: Cell) -> Array:
             if name[1:].isdigit():
                 out[int(name[1:]) - 1] = value
     for term, _ in compliances:
-        if np.isfinite(term.choice.get("within", np.inf)):
+        if stiffens(term.choice):
             out[joint_of(term.place)] = np.nan
     return out
 

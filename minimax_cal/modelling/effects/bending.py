@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.compliance import GROUPS
 from minimax_cal.modelling.effects.scene import (
     PLAIN,
     Choice,
@@ -15,15 +14,13 @@ from minimax_cal.modelling.effects.scene import (
     Effect,
     Scene,
     joint_of,
-    mask_of,
     principal,
-    unmasked,
 )
 from minimax_cal.robots.gravity import G, centres
 from minimax_cal.robots.kinematics import cross
 
 SHORT = 0.1  # of the reach: shorter links are stiff
-UNLIKE = 0.1  # share of a weight's motion that others must leave for it to count by itself
+UNLIKE = 0.1  # share of the tool's motion that the links' must leave for it to be told apart
 
 
 def turned_about(scene: Scene, turn: Array, centre: Array) -> Array:
@@ -56,12 +53,15 @@ def bent(scene: Scene, link: int, mass: Array, com: Array) -> Array:
     return np.asarray(sag + turned_about(scene, turn, links.after[link]))
 
 
-def differing(scene: Scene, shift: Callable[[Array, Array], Array]) -> Callable[[], Array]:
+Shift = Callable[[Scene, Array, Array], Array]  # (k, 3, m) per unit, of masses and their centres
+
+
+def differing(shift: Shift) -> Callable[[Scene], Array]:
     """How the displacement that a law gives for the masses told may differ: asked for rarely."""
 
-    def doubt() -> Array:
-        whole = shift(*scene.masses)
-        return principal(np.array([shift(*other) - whole for other in scene.other_masses]))
+    def doubt(scene: Scene) -> Array:
+        whole = shift(scene, *scene.masses)
+        return principal(np.array([shift(scene, *other) - whole for other in scene.other_masses]))
 
     return doubt
 
@@ -71,68 +71,40 @@ def link_columns(scene: Scene, place: str, choice: Choice) -> Columns:
 
     theta = (L^2/2 l x F + L M) / EI,  delta = (L^3/3 F_across + L^2/2 M x l) / EI, l along it.
     """
-    return under_weight(scene, choice, "1/EI", "1/(N m^2)", of_link(scene, place))
-
-
-Shift = Callable[[Array, Array], Array]  # (k, 3, m) per unit, of masses and centres of gravity
+    return under_weight(scene, choice, "1/EI", "1/(N m^2)", of_link(place))
 
 
 def under_weight(scene: Scene, choice: Choice, name: str, unit: str, shift: Shift) -> Columns:
-    """What gives way to weights: to all together, or to those that a choice takes apart.
-
-    The payload, which nobody guesses, pulls with the last of these links.
-    """
-    kept = [part for part in unmasked(choice.get("weights", 0.0)) if part <= len(GROUPS)]
-    if not set(kept) & set(range(len(GROUPS))):  # none apart
-        whole, doubt = shift(*scene.masses), differing(scene, shift)
+    """What gives way to all weights; besides to the kilograms of a tool that nobody told."""
+    whole, doubt = shift(scene, *scene.masses), differing(shift)
+    if not choice.get("tool"):
         return Columns((name,), (unit,), shift=whole[None], doubt_shift=(doubt,))
-    fields, nothing = apart(scene, shift)
-    fields[max(part for part in kept if part < len(GROUPS))] += nothing
-    names = tuple(f"{name} ({(*GROUPS, 'tool')[part]})" for part in kept)
-    return Columns(names, (unit,) * len(kept), shift=fields[kept])
+    names, fields = (name, f"{name} (tool)"), np.stack([whole, of_tool(scene, shift)])
+    return Columns(names, (unit,) * 2, shift=fields, doubt_shift=(doubt,))
 
 
-def apart(scene: Scene, shift: Shift) -> tuple[Array, Array]:
-    """(4, k, 3, m) motion of the targets by upper arm, forearm, wrist, and a kilogram amid them.
-
-    And (k, 3, m) by the payload.
-    """
-    mass, com = scene.masses
-    group = np.minimum(np.arange(scene.joints) // 2, len(GROUPS) - 1)
-    nothing = shift(np.zeros(scene.joints), com)
-    links = [shift(np.where(group == g, mass, 0.0), com) - nothing for g in range(len(GROUPS))]
-    one, spot = np.zeros(scene.joints), np.zeros((scene.joints, 3))
-    one[-1], spot[-1] = 1.0, scene.target_positions.mean(axis=0)
-    tool = shift(one, spot) - nothing
-    return np.stack([*links, tool]), nothing
+def of_tool(scene: Scene, shift: Shift) -> Array:
+    """(k, 3, m) motion of the targets by one kilogram amid them."""
+    nothing, one = np.zeros((2, scene.joints))
+    one[-1], spot = 1.0, np.zeros((scene.joints, 3))
+    spot[-1] = scene.target_positions.mean(axis=0)
+    return shift(scene, one, spot) - shift(scene, nothing, spot)  # both with the payload
 
 
-def weights_of(scene: Scene, shift: Shift) -> Sequence[Choice]:
-    """All weights together; where the robot file tells none, also those that differ, apart.
-
-    One that others explain as well is left out.
-    """
+def tools(scene: Scene, shift: Shift) -> Sequence[Choice]:
+    """Without the tool's weight, and with it where nobody told masses and it does not act alike."""
     if scene.known_masses:
         return PLAIN
-    kept: list[int] = []
-    fields = apart(scene, shift)[0].reshape(len(GROUPS) + 1, -1)
-    basis = np.zeros((fields.shape[1], 0))
-    for part, field in enumerate(fields):
-        rest = field - basis @ (basis.T @ field)
-        if np.linalg.norm(rest) > UNLIKE * np.linalg.norm(field) + 1e-12:
-            kept.append(part)
-            basis = np.linalg.qr(fields[kept].T)[0]
-    return (*PLAIN, {"weights": mask_of(kept)}) if len(kept) > 1 else PLAIN
+    links, tool = shift(scene, *scene.masses), of_tool(scene, shift)
+    rest = tool - links * (float((tool * links).sum()) / max(float((links**2).sum()), 1e-300))
+    apart = float((rest**2).sum()) > UNLIKE**2 * float((tool**2).sum())
+    return ({"tool": 0.0}, {"tool": 1.0}) if apart else PLAIN
 
 
-def of_link(scene: Scene, place: str) -> Shift:
+def of_link(place: str) -> Shift:
     """What a link does."""
-    return lambda mass, com: bent(scene, joint_of(place), mass, com)
-
-
-def of_base(scene: Scene) -> Shift:
-    """What the base does."""
-    return lambda mass, com: tilted(scene, mass, com)
+    link = joint_of(place)
+    return lambda scene, mass, com: bent(scene, link, mass, com)
 
 
 LINK_BENDING = Effect(
@@ -141,7 +113,7 @@ LINK_BENDING = Effect(
     "theta = (L^2/2 l x F + L M)/EI, delta = (L^3/3 F + L^2/2 M x l)/EI",
     long_links,
     link_columns,
-    choices=lambda scene, place: weights_of(scene, of_link(scene, place)),
+    choices=lambda scene, place: tools(scene, of_link(place)),
     positive=True,
     follows="load",
 )
@@ -157,7 +129,7 @@ def tilted(scene: Scene, mass: Array, com: Array) -> Array:
 
 def base_columns(scene: Scene, place: str, choice: Choice) -> Columns:
     """The base turns by C times the overturning moment."""
-    return under_weight(scene, choice, "C", "rad/(N m)", of_base(scene))
+    return under_weight(scene, choice, "C", "rad/(N m)", tilted)
 
 
 BASE_FLEX = Effect(
@@ -166,7 +138,7 @@ BASE_FLEX = Effect(
     "omega = C M",
     lambda scene: ("frame",),
     base_columns,
-    choices=lambda scene, place: weights_of(scene, of_base(scene)),
+    choices=lambda scene, place: tools(scene, tilted),
     positive=True,
     moves="foot",
     follows="load",

@@ -97,6 +97,11 @@ def stiffening(scene: Scene, place: str, groups: Sequence[int]) -> Sequence[Choi
     ]
 
 
+def stiffens(choice: Choice) -> bool:
+    """Whether a joint gives way most to the first of its torque, which no single number tells."""
+    return bool(np.isfinite(choice.get("within", np.inf)))
+
+
 def largest_torque(scene: Scene, part: int) -> float:
     """The largest torque of some links about a joint [N m].  part: 4 j + g, as in `parts_of`."""
     return float(np.abs(torque_of(scene, *divmod(part, 4))).max())
@@ -176,7 +181,7 @@ def columns(scene: Scene, place: str, choice: Choice) -> Columns:
         np.concatenate(turns),
         doubt=tuple(doubts),
         either=np.arange(len(names)) >= positive,
-        fixed={told_as(scene): within} if np.isfinite(within) else {},
+        fixed={told_as(scene): within} if stiffens(choice) else {},
     )
 
 

@@ -200,7 +200,7 @@ class Columns:
     turn: (d, n, m) by how much each joint turns or slides [rad or m per unit]; empty for none.
     shift: (d, k, 3, m) by how much each target moves besides [m per unit]; empty for none.
     doubt: for each parameter (r, n, m) how `turn` may differ, one sigma each; empty for none.
-    doubt_shift: for each parameter (r, k, 3, m), once called, how `shift` may differ; or empty.
+    doubt_shift: for each parameter (r, k, 3, m) of a scene, once called, how `shift` may differ.
     fixed: what was chosen and not fitted (turns per revolution, time constants), for the report.
     ridge: (d,) weight of a prior of mean zero, (BESIDE / sigma)^2 [m^2 per unit^2]; empty for none.
     either: (d,) True for parameters of a positive effect that may have either sign; empty for none.
@@ -211,7 +211,7 @@ class Columns:
     turn: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     shift: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     doubt: tuple[Array, ...] = ()
-    doubt_shift: tuple[Callable[[], Array], ...] = ()
+    doubt_shift: tuple[Callable[[Scene], Array], ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
     ridge: Array = field(default_factory=lambda: np.zeros(0))
     either: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -237,7 +237,7 @@ class Columns:
             for owner, part in enumerate(self.doubt)
             if len(part)
         ]
-        shifted = [(owner, doubt()) for owner, doubt in enumerate(self.doubt_shift)]
+        shifted = [(owner, doubt(scene)) for owner, doubt in enumerate(self.doubt_shift)]
         return turned + [(owner, part) for owner, part in shifted if len(part)]
 
 

@@ -198,7 +198,6 @@ def terms(
 
 LAWS = 300  # whose columns a scene keeps
 CONSTANTS = frozenset({"constant", "fast", "slow", "within"})  # above 0; infinite is straight
-MASKS = frozenset({"weights"})  # which of a law's parts are apart: other poses may tell others
 FREE = frozenset({  # any number will do
     "turns", "constant", "fast", "slow", "within", "since", "zero", "eye", "rest",
     "low", "high", "length", "size",
@@ -213,13 +212,13 @@ def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choic
             said = f"choose {', '.join(sorted(known))}" if known else "its law has none"
             raise OptionError(f"effect {text!r}: no choice {key!r}; {said}")
         listed = sorted({choice[key] for choice in choices if key in choice})
-        if key in known - FREE - MASKS and value not in listed:
+        if key in known - FREE and value not in listed:
             offer = ", ".join(f"{number:g}" for number in listed)
             raise OptionError(f"effect {text!r}: no {key} {value:g}; choose {offer}")
         low = 0.0 if key in CONSTANTS else -np.inf
         if not (value > low and (np.isfinite(value) or key in CONSTANTS)):
             raise OptionError(f"effect {text!r}: {key} {value:g} is not possible")
-    fixed = given.keys() - FREE - MASKS  # what one variant has does not go with another's
+    fixed = given.keys() - FREE  # what one variant has does not go with another's
     fitting = (
         [
             c
