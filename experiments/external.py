@@ -21,6 +21,7 @@ from experiments import gap_cases, sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Cell as Entry
 from minimax_cal.ground.tables import Table
@@ -83,6 +84,15 @@ def arm_of(name: str) -> tuple[Robot, Measurements]:
     )
     columns = {key: value for key, value in made.data.columns.items() if key != "split"}
     return made.robot, replace(made.data, columns=columns)
+
+
+def asked_for(arms: str) -> list[str]:
+    """The arms of a list that are simulated, or on this machine.  Raises OptionError."""
+    named = arms.split(",")
+    for arm in named:
+        if arm not in (*REAL, *SIMULATED):
+            raise OptionError(f"--arms {arm}: choose {', '.join((*REAL, *SIMULATED))}")
+    return [arm for arm in named if arm not in REAL or here(arm)]
 
 
 def splits(arm: str, halves: int) -> Iterator[tuple[str, int]]:
@@ -212,7 +222,7 @@ def middle(of: Array) -> float:
 @click.option("--halves", type=int, default=HALVES, show_default=True)
 def main(study: Study, arms: str, ways: str, halves: int) -> None:
     """Claimed accuracy beside that on poses set aside."""
-    named = [arm for arm in arms.split(",") if arm not in REAL or here(arm)]
+    named = asked_for(arms)
     if study.quick:
         named, halves = [SIMULATED[0], *(arm for arm in named if arm == "qkm_hl6")], 2
     jobs = [

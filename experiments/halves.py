@@ -19,8 +19,7 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments import sweep
-from experiments.external import HALVES, RANDOM, REAL, SIMULATED, arm_of, aside
-from experiments.real import here
+from experiments.external import HALVES, RANDOM, REAL, SIMULATED, arm_of, aside, asked_for
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.study import studied
@@ -87,7 +86,7 @@ def line(name: str, z: list[list[float]]) -> tuple[Cell, ...]:
 @click.option("--halves", type=int, default=HALVES, show_default=True)
 def main(study: Study, arms: str, halves: int) -> None:
     """Effects fitted to two halves of the poses: do their sigmas tell the difference?"""
-    named = [arm for arm in arms.split(",") if arm not in REAL or here(arm)]
+    named = asked_for(arms)
     if study.quick:
         named, halves = [SIMULATED[0]], 2
     found = study.sweep(run, [Arm(name, halves, study.seed) for name in named], "arms")

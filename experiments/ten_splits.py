@@ -19,8 +19,7 @@ import numpy as np
 
 import minimax_cal as mc
 from experiments import sweep
-from experiments.external import REAL, SIMULATED, arm_of
-from experiments.real import here
+from experiments.external import REAL, SIMULATED, arm_of, asked_for
 from experiments.sweep import Study, study_options
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.history import with_history
@@ -146,7 +145,7 @@ def ends_of(causes: Sequence[Named]) -> set[float]:
 @click.option("--splits", type=int, default=SPLITS, show_default=True)
 def main(study: Study, arms: str, splits: int) -> None:
     """Names of causes over ten choices of the poses held out."""
-    named = [arm for arm in arms.split(",") if arm not in REAL or here(arm)]
+    named = asked_for(arms)
     if study.quick:
         named, splits = [SIMULATED[0], *(arm for arm in named if arm == "qkm_hl6")], 2
     jobs = [Split(arm, study.seed + number) for arm in named for number in range(splits)]

@@ -85,12 +85,39 @@ def causes_of(
         traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
-    effects = merged([finding(study, choice, i) for i in by_weight(choice)])
+    effects, every = found_again(study, choice, exclude), (*faults, *read_back)
+    wary, ripple = loudest(study, choice, traces) is not None, GEAR_RIPPLE.name not in exclude
+    return study, Causes(every, lib, ripple, choice, effects, traces, lib.untestable, wary)
+
+
+def found_again(study: Study, choice: Choice, exclude: Sequence[str]) -> tuple[Finding, ...]:
+    """The effects that were chosen, each with its rivals and how often it is found again."""
+    found = merged([finding(study, choice, i) for i in by_weight(choice)])
     ripple = GEAR_RIPPLE.name not in exclude
-    effects = judged_again(effects, choice, study.data, lib, ripple)
-    every, told = (*faults, *read_back), lib.untestable
-    wary = loudest(study, choice, traces) is not None
-    return study, Causes(every, lib, ripple, choice, tuple(effects), traces, told, wary)
+    return tuple(judged_again(found, choice, study.data, choice.library, ripple))
+
+
+def beside_curves(
+    study: Study, causes: Causes, maps: Sequence[Term], exclude: Sequence[str]
+) -> Causes:
+    """The causes sought anew beside maps of joints: what stood in for these is named no more.
+
+    What the data tell of the curves, by more than their priors do, is projected out like geometry.
+    """
+    columns = [term.columns(study.scene) for term in maps]
+    usual = [one.displacement(study.scene) / np.sqrt(one.ridge)[:, None, None, None]
+             for one in columns]  # fmt: skip
+    rows = study.rows
+    moved = rows.of(np.concatenate(usual))
+    moved = moved - rows.basis @ (rows.basis.T @ moved)
+    span, size, _ = np.linalg.svd(moved, full_matrices=False)
+    span = span[:, size > 1.0]
+    error = rows.error - span @ (span.T @ rows.error)
+    rows = replace(rows, error=error, basis=np.concatenate([rows.basis, span], axis=1))
+    study = replace(study, rows=rows)
+    lib, choice = chosen(study, exclude)
+    effects = found_again(study, choice, exclude)
+    return replace(causes, library=lib, choice=choice, effects=effects)
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:

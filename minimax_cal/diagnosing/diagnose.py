@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import (
     Causes,
+    beside_curves,
     beside_maps,
     causes_of,
     fault_findings,
@@ -211,18 +212,31 @@ def in_rungs(
 ) -> tuple[Causes, Causes, Ladder]:
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
     progress("gap ladder")
-    often = [f for f in causes.effects if not f.again < WEAK]
-    chosen = [term for finding in often for term in finding.terms]
-    spoken = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
-    ladder = climbed(study, [finding.terms for finding in spoken.effects], wary=causes.wary)
-    progress("error maps of joints")
-    spoken, ladder = with_maps(spoken, ladder, exclude)
+    spoken, ladder = with_maps(study, causes, exclude, progress)
+    if spoken.maps.curves:
+        progress("names beside the maps")
+        anew = beside_curves(study, causes, spoken.maps.curves, exclude)
+        other, wider = with_maps(study, anew, exclude, progress)
+        parts = wider.last.spared(ladder.last.spared(ladder.parts))
+        before, after = (one.last.cross_validated(parts) for one in (ladder, wider))
+        if other.maps.curves and after <= before:
+            spoken, ladder = other, wider
     return spoken if spoken.maps.terms else causes, spoken, ladder
 
 
-def with_maps(causes: Causes, ladder: Ladder, exclude: Sequence[str]) -> tuple[Causes, Ladder]:
-    """The causes and the ladder with the error maps, and fine waves, that joints have besides."""
-    maps, study = error_maps(ladder.last, exclude), ladder.last.study
+def with_maps(
+    study: Study, causes: Causes, exclude: Sequence[str], progress: Progress
+) -> tuple[Causes, Ladder]:
+    """The causes found often enough to be spoken of, and the ladder.
+
+    With the error maps, and fine waves, that joints have besides.
+    """
+    often = [f for f in causes.effects if not f.again < WEAK]
+    chosen = [term for finding in often for term in finding.terms]
+    causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
+    ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)
+    progress("error maps of joints")
+    maps = error_maps(ladder.last, exclude)
     if not maps.terms:
         return causes, ladder
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))

@@ -32,7 +32,7 @@ class Columns:
         self.rows = rows
         self.fixed = rows.basis.shape[1] + 1  # geometry and the error
         self.count = 0
-        self.held = np.empty((256, len(rows.error)))
+        self.held = grown(np.empty((256, len(rows.error))), self.fixed)
         self.plain = np.empty((0, len(rows.error)))
         self.held[: self.fixed] = np.concatenate([rows.basis.T, rows.error[None]])
 

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from test_remainder import geometric, rigid
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.causes import beside_curves, causes_of
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.study import SUM, studied
@@ -142,3 +143,40 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
     assert_allclose(loaded.predict(q), fit.predict(q), atol=1e-12)
     fixed = mc.compensate(loaded, q[:10])
     assert fixed.distance.max() < 2e-5
+
+
+def test_what_stood_in_for_curves_is_named_no_more() -> None:
+    """Names sought beside the maps: before them a series of waves of all joints passed for some."""
+    robot = mc.load_robot("ur10")
+    sim = rigid(robot, 300, 1, 2)
+    q, rng = sim.data.q, np.random.default_rng(2)
+    nodes, turn = np.arange(-7.0, 7.0, 0.15), np.zeros_like(q)
+    for joint_number in range(3):
+        heights = 3e-4 * rng.normal(size=len(nodes))
+        turn[:, joint_number] = np.interp(q[:, joint_number], nodes, heights)
+    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+    told = mc.diagnose(robot, data, quick=True)
+    found = [f.term.label for f in told.findings]
+    assert sorted(found) == [f"joint_error_map:J{number}" for number in (1, 2, 3)]
+    assert told.ladder[-1].holdout.rms_mm < 0.25 * told.ladder[1].holdout.rms_mm
+
+
+def test_what_curves_may_be_is_no_geometry_of_names(robot: Robot) -> None:
+    """Beside maps is projected out what the data tell of them; what their priors hold is not."""
+    sim = rigid(robot, 220, 2, 6)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 1] = bumps(sim.data.q[:, 1])
+    study = geometric(robot, sim, turn).study
+    (term,) = error_maps(joint(study, ())).terms
+    _, bare = causes_of(study, (), (), silent)
+    beside = beside_curves(study, bare, (term,), ())
+    rows, wide = study.rows, beside.library.rows
+    assert_allclose(wide.basis.T @ wide.basis, np.eye(wide.basis.shape[1]), atol=1e-9)
+    assert_allclose(wide.basis.T @ wide.error, 0.0, atol=1e-12)
+    columns = term.columns(study.scene)
+    fields = rows.of(
+        columns.displacement(study.scene) / np.sqrt(columns.ridge)[:, None, None, None]
+    )
+    rest = fields - wide.basis @ (wide.basis.T @ fields)
+    assert np.linalg.svd(rest, compute_uv=False)[0] <= 1.0 + 1e-9  # what is left priors hold
+    assert {f.term.place for f in beside.effects} <= {"J2"}  # waves finer than a map has

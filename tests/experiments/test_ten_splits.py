@@ -1,4 +1,7 @@
-from experiments.external import SIMULATED
+import pytest
+
+import minimax_cal as mc
+from experiments.external import SIMULATED, asked_for
 from experiments.ten_splits import Named, Split, Told, arms_table, names_table, run
 
 
@@ -23,3 +26,9 @@ def test_causes_are_counted_split_by_split() -> None:
     assert [row[1] for row in rows] == ["backlash J1", "gear_ripple J2"]
     assert [row[3:] for row in rows] == [(1, 1, ""), (1, 2, "99.9, 100.2")]
     assert abs(float(rows[1][2]) - 15.0) < 1e-9  # type: ignore[arg-type]
+
+
+def test_an_arm_that_nobody_knows_is_a_users_error() -> None:
+    with pytest.raises(mc.OptionError, match="--arms ur10: choose irb120"):
+        asked_for("simulated play,ur10")
+    assert asked_for("simulated play") == ["simulated play"]
