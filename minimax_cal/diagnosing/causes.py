@@ -43,9 +43,8 @@ ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 class Causes:
     """What may be wrong.
 
-    faults: of the data.  library: what could be tested, and ripple:
-    whether lines of gears were looked for.  choice: the effects selected, effects: as findings, the
-    weightiest first.
+    faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
+    choice: the effects selected, effects: as findings, the weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
     whether structure is left that matters.  maps: of joints, sought beside the effects, once there
     is a ladder.
@@ -53,13 +52,18 @@ class Causes:
 
     faults: tuple[Fault, ...]
     library: Library
-    ripple: bool
+    exclude: tuple[str, ...]
     choice: Choice
     effects: tuple[Finding, ...]
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
     wary: bool
     maps: Mapped = NO_MAPS
+
+    @property
+    def ripple(self) -> bool:
+        """Whether lines of gears were looked for."""
+        return GEAR_RIPPLE.name not in self.exclude
 
 
 def causes_of(
@@ -81,13 +85,14 @@ def causes_of(
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
-        lib, choice = chosen(study, (*exclude, *play))
+        exclude = (*exclude, *play)
+        lib, choice = chosen(study, exclude)
         traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     effects, every = found_again(study, choice, exclude), (*faults, *read_back)
-    wary, ripple = loudest(study, choice, traces) is not None, GEAR_RIPPLE.name not in exclude
-    return study, Causes(every, lib, ripple, choice, effects, traces, lib.untestable, wary)
+    wary, told = loudest(study, choice, traces) is not None, lib.untestable
+    return study, Causes(every, lib, tuple(exclude), choice, effects, traces, told, wary)
 
 
 def found_again(study: Study, choice: Choice, exclude: Sequence[str]) -> tuple[Finding, ...]:
@@ -97,9 +102,7 @@ def found_again(study: Study, choice: Choice, exclude: Sequence[str]) -> tuple[F
     return tuple(judged_again(found, choice, study.data, choice.library, ripple))
 
 
-def beside_curves(
-    study: Study, causes: Causes, maps: Sequence[Term], exclude: Sequence[str]
-) -> Causes:
+def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     """The causes sought anew beside maps of joints: what stood in for these is named no more.
 
     What the data tell of the curves, by more than their priors do, is projected out like geometry.
@@ -115,9 +118,10 @@ def beside_curves(
     error = rows.error - span @ (span.T @ rows.error)
     rows = replace(rows, error=error, basis=np.concatenate([rows.basis, span], axis=1))
     study = replace(study, rows=rows)
-    lib, choice = chosen(study, exclude)
-    effects = found_again(study, choice, exclude)
-    return replace(causes, library=lib, choice=choice, effects=effects)
+    lib, choice = chosen(study, causes.exclude)
+    effects, traces = found_again(study, choice, causes.exclude), left_by(study, choice)
+    wary = loudest(study, choice, traces) is not None
+    return replace(causes, library=lib, choice=choice, effects=effects, traces=traces, wary=wary)
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
@@ -130,12 +134,14 @@ def loudest(study: Study, choice: Choice, traces: Sequence[Trace]) -> Trace | No
     return heard(traces, explained(study.rows, choice), study.rows.count)
 
 
-def beside_maps(study: Study, causes: Causes) -> tuple[Trace, ...]:
-    """Traces of what effects and maps leave together."""
-    maps = [term.columns(study.scene).displacement(study.scene) for term in causes.maps.terms]
-    known = np.concatenate([causes.choice.doubted, *map(study.rows.of, maps)], axis=1)
+def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
+    """The causes with the traces of what their effects and some maps leave together."""
+    fields = [term.columns(study.scene).displacement(study.scene) for term in maps]
+    known = np.concatenate([causes.choice.doubted, *map(study.rows.of, fields)], axis=1)
     noise = restricted(study.rows, known)
-    return structure(study.scene, study.rows, noise, known, named_in(causes.choice))
+    traces = structure(study.scene, study.rows, noise, known, named_in(causes.choice))
+    wary = loudest(study, causes.choice, traces) is not None
+    return replace(causes, traces=traces, wary=wary)
 
 
 def named_in(choice: Choice) -> list[Named]:

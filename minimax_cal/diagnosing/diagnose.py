@@ -156,8 +156,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
     study, causes = causes_of(study, clean.faults, options.exclude, progress)
+    causes, spoken, ladder = in_rungs(study, causes, progress)
     noise = causes.choice.noise
-    causes, spoken, ladder = in_rungs(study, causes, options.exclude, progress)
     last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
@@ -207,26 +207,25 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     )
 
 
-def in_rungs(
-    study: Study, causes: Causes, exclude: Sequence[str], progress: Progress
-) -> tuple[Causes, Causes, Ladder]:
+def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
     progress("gap ladder")
-    spoken, ladder = with_maps(study, causes, exclude, progress)
-    if spoken.maps.curves:
+    spoken, ladder = with_maps(study, causes, progress)
+    if ladder.maps:
         progress("names beside the maps")
-        anew = beside_curves(study, causes, spoken.maps.curves, exclude)
-        other, wider = with_maps(study, anew, exclude, progress)
-        parts = wider.last.spared(ladder.last.spared(ladder.parts))
-        before, after = (one.last.cross_validated(parts) for one in (ladder, wider))
-        if other.maps.curves and after <= before:
+        other, wider = with_maps(study, beside_curves(study, causes, ladder.maps), progress)
+        if wider.maps and no_worse(wider, ladder):
             spoken, ladder = other, wider
     return spoken if spoken.maps.terms else causes, spoken, ladder
 
 
-def with_maps(
-    study: Study, causes: Causes, exclude: Sequence[str], progress: Progress
-) -> tuple[Causes, Ladder]:
+def no_worse(one: Ladder, other: Ladder) -> bool:
+    """Whether groups left out of the last fit are met no worse than by another's."""
+    parts = one.last.spared(other.last.spared(other.parts))
+    return one.last.cross_validated(parts) <= other.last.cross_validated(parts)
+
+
+def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Ladder]:
     """The causes found often enough to be spoken of, and the ladder.
 
     With the error maps, and fine waves, that joints have besides.
@@ -236,13 +235,14 @@ def with_maps(
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)
     progress("error maps of joints")
-    maps = error_maps(ladder.last, exclude)
+    maps = error_maps(ladder.last, causes.exclude)
     if not maps.terms:
         return causes, ladder
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
-    causes = replace(causes, effects=tuple(effects), maps=maps)
-    causes = replace(causes, traces=beside_maps(study, causes))
-    return causes, climbed(study, [finding.terms for finding in effects], wary=causes.wary)
+    causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
+    ladder = climbed(study, [finding.terms for finding in effects], wary=causes.wary)
+    held = [term for term in maps.terms if term in ladder.last.terms]
+    return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:

@@ -57,33 +57,24 @@ class Mapped:
     again: tuple[float, ...] = ()
     needless: tuple[Term, ...] = ()
 
-    @property
-    def curves(self) -> tuple[Term, ...]:
-        """Those that are maps."""
-        return tuple(term for term in self.terms if EFFECTS[term.effect].is_map)
-
     def beside(self, effects: Sequence[Sequence[Term]]) -> list[Sequence[Term]]:
-        """The maps, the effects of a ladder without what these replace, and fine waves."""
+        """The effects of a ladder with the maps, without what these replace."""
         gone = {term.key for term in self.needless}
         kept = [terms for terms in effects if terms[0].key not in gone]
         had = {terms[0].key for terms in kept}
-        waves = [term for term in self.terms if term not in self.curves and term.key not in had]
-        return [*((term,) for term in self.curves), *kept, *((term,) for term in waves)]
+        return [*kept, *((term,) for term in self.terms if term.key not in had)]
 
     def findings(self, named: Sequence[Finding], scene: Scene) -> list[Finding]:
         """`beside` for findings; values are those of a fit that comes."""
         gone = {term.key for term in self.needless}
-        kept = [finding for finding in named if finding.term.key not in gone]
-        maps: list[Finding] = []
-        waves: list[Finding] = []
+        out = [finding for finding in named if finding.term.key not in gone]
         for i, term in enumerate(self.terms):
             columns = term.columns(scene)
             none = (0.0,) * len(columns.names)
             names, units, chance = columns.names, columns.units, self.chances[i]
             new = Finding((term,), names, units, none, none, self.gains[i], chance)
-            new = replace(new, fixed=columns.fixed, again=self.again[i])
-            (maps if EFFECTS[term.effect].is_map else waves).append(new)
-        return [*maps, *kept, *waves]
+            out.append(replace(new, fixed=columns.fixed, again=self.again[i]))
+        return out
 
 
 NO_MAPS = Mapped()

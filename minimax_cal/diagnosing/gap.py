@@ -54,6 +54,11 @@ class Ladder:
         """With every effect taken."""
         return self.fits[-1]
 
+    @property
+    def maps(self) -> tuple[Term, ...]:
+        """The error maps of joints that it took."""
+        return tuple(term for term in self.last.terms if EFFECTS[term.effect].is_map)
+
 
 def folds(data: Measurements, count: int) -> Array:
     """(m,) number of a fold, groups of poses together, at random."""
@@ -63,7 +68,10 @@ def folds(data: Measurements, count: int) -> Array:
 
 
 def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = False) -> Ladder:
-    """The ladder of a study's effects, in their order.
+    """The ladder of a study's effects, in their order; with maps of joints the largest first.
+
+    What is refused is tried again beside what was taken after it: beside errors much larger than
+    its own the prior of a map is too wide.
 
     wary: where structure is left, names are a best guess.  Laws of a joint's angle, or of the time,
     are then believed only if the ends of what drives them, left out, are met no worse either: there
@@ -72,17 +80,44 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []
     spared = fits[0].spared([part == number for number in range(FOLDS)])
-    for number, terms in enumerate(effects):
-        wide = joint(study, (*fits[-1].terms, *terms))
-        told = wide.spared(spared)
-        square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
-        if not (new < (1.0 - HELPS) * square and wide.no_worse(fits[-1])):
-            continue
-        if wary and astray(fits[-1], wide, terms):
-            continue
-        fits.append(wide)
-        taken.append(number)
+    mapped = any(EFFECTS[term.effect].is_map for terms in effects for term in terms)
+    waiting = by_size(study, effects) if mapped else list(range(len(effects)))
+    while waiting:
+        refused = []
+        for number in waiting:
+            terms = effects[number]
+            wide = joint(study, (*fits[-1].terms, *terms))
+            told = wide.spared(spared)
+            square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
+            helps = new < (1.0 - HELPS) * square and wide.no_worse(fits[-1])
+            if helps and not (wary and astray(fits[-1], wide, terms)):
+                fits.append(wide)
+                taken.append(number)
+            else:
+                refused.append(number)
+        waiting = refused if mapped and len(refused) < len(waiting) else []
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
+
+
+def by_size(study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:
+    """Effects in the order of how far they move the points beside what geometry does.
+
+    All are fitted together; rows weigh as those in which they were sought.
+    """
+    fit = joint(study, [term for terms in effects for term in terms])
+    moved: dict[str, Array] = {}
+    at, scene, rows = 0, study.scene, study.rows
+    for term in fit.terms:
+        fields = term.columns(scene).displacement(scene)
+        value = fit.state.effects[at : at + len(fields)]
+        at += len(fields)
+        moved[term.text] = rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
+    whole = np.zeros((len(effects), len(rows.error)))
+    for number, terms in enumerate(effects):
+        for term in terms:
+            whole[number] += moved.get(term.text, 0.0)
+    clear = whole - (whole @ rows.basis) @ rows.basis.T
+    return [int(number) for number in np.argsort(-(clear**2).sum(axis=1), kind="stable")]
 
 
 def astray(before: Joint, wide: Joint, terms: Sequence[Term]) -> bool:

@@ -8,7 +8,9 @@ from test_remainder import geometric, rigid
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.causes import beside_curves, causes_of
+from minimax_cal.diagnosing.diagnose import no_worse
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
+from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.study import SUM, studied
 from minimax_cal.fitting.options import silent
@@ -16,7 +18,8 @@ from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.effects.maps import sines, spread
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term, terms
+from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot
 
 NODES = np.arange(-2.0, 3.0, 0.15)
@@ -169,7 +172,7 @@ def test_what_curves_may_be_is_no_geometry_of_names(robot: Robot) -> None:
     study = geometric(robot, sim, turn).study
     (term,) = error_maps(joint(study, ())).terms
     _, bare = causes_of(study, (), (), silent)
-    beside = beside_curves(study, bare, (term,), ())
+    beside = beside_curves(study, bare, (term,))
     rows, wide = study.rows, beside.library.rows
     assert_allclose(wide.basis.T @ wide.basis, np.eye(wide.basis.shape[1]), atol=1e-9)
     assert_allclose(wide.basis.T @ wide.error, 0.0, atol=1e-12)
@@ -180,3 +183,39 @@ def test_what_curves_may_be_is_no_geometry_of_names(robot: Robot) -> None:
     rest = fields - wide.basis @ (wide.basis.T @ fields)
     assert np.linalg.svd(rest, compute_uv=False)[0] <= 1.0 + 1e-9  # what is left priors hold
     assert {f.term.place for f in beside.effects} <= {"J2"}  # waves finer than a map has
+
+
+def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
+    """The law first, whose errors are too large for the prior of the curve."""
+    robot, place = mc.load_robot("ur10"), 2
+    sim = simulate(robot, 150, 1, seed=1, truth=Truth(compliance=2e-6))
+    q, nodes = sim.data.q, np.arange(-7.0, 7.0, 0.15)
+    turn = np.zeros_like(q)
+    heights = 1e-4 * np.random.default_rng(1).normal(size=len(nodes))
+    turn[:, place] = np.interp(q[:, place], nodes, heights)
+    data = sim.data.with_y(sim.data.y + sim.cell.predict(q + turn) - sim.cell.predict(q))
+    told = mc.diagnose(robot, data, quick=True)
+    first, second = (f.term.label for f in told.findings[:2])
+    assert (first, second) == ("joint_compliance:all", "joint_error_map:J3")
+    steps = [step.name for step in told.ladder[2:]]
+    assert steps[:2] == ["+ joint_compliance all", "+ joint_error_map J3"]
+    rms = [step.holdout.rms_mm for step in told.ladder]
+    assert rms[3] < 0.75 * rms[2] < 0.3 * rms[1]
+
+
+def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(robot: Robot) -> None:
+    sim = simulate(robot, 200, 1, seed=4, truth=Truth(compliance=2e-6))
+    q = sim.data.q
+    turn = np.zeros_like(q)
+    turn[:, 1] = 0.3 * bumps(q[:, 1])
+    study = geometric(robot, sim, turn).study
+    law = Term(
+        "joint_compliance", "all", EFFECTS["joint_compliance"].choices(study.scene, "all")[0]
+    )
+    (curve,) = terms(study.scene, ["joint_error_map:J2:size=0.0001"])
+    for effects in ([(law,), (curve,)], [(curve,), (law,)]):
+        ladder = climbed(study, effects)
+        assert [effects[number][0].effect for number in ladder.taken] == [law.effect, curve.effect]
+        assert ladder.maps == (curve,)
+    assert no_worse(ladder, climbed(study, [(law,)]))
+    assert not no_worse(climbed(study, [(law,)]), ladder)
