@@ -12,7 +12,7 @@ from minimax_cal.diagnosing.lack_of_fit import chance_of
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import CERTAIN, HALF, WORTH
+from minimax_cal.evidence.limits import CERTAIN, HALF, MUCH, WORTH
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
@@ -87,8 +87,8 @@ def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> b
 
 
 def wavers(ladder: Ladder, rest: Remainder) -> bool:
-    """Whether effects of which none is established tell what no noise does."""
-    return closed_by(ladder) > WORTH * rest.unpredictable_mm**2
+    """Whether effects of which none is established tell much."""
+    return closed_by(ladder) > MUCH * rest.unpredictable_mm**2
 
 
 def closed_by(ladder: Ladder) -> float:

@@ -77,6 +77,8 @@ def test_effects_of_which_none_is_established_leave_it_unknown_where_they_tell_m
     assert len(ladder.taken) == 1
     nothing = Remainder(0.0, (), ladder.last.train.rms_mm, None)
     assert wavers(ladder, nothing)
+    noise = float(np.sqrt(10.0 * closed_by(ladder)))
+    assert not wavers(ladder, replace(nothing, unpredictable_mm=noise))  # a tenth of it is little
     assert not wavers(climbed(study, []), nothing)
     assert_allclose(
         closed_by(ladder),
