@@ -90,16 +90,21 @@ def causes_of(
         traces = left_by(study, choice)
     if choice.noise.variance < EXACT**2:
         traces = (Trace("rounding", 1.0, 0.0),)
-    effects, every = found_again(study, choice, exclude), (*faults, *read_back)
-    wary, told = loudest(study, choice, traces) is not None, lib.untestable
-    return study, Causes(every, lib, tuple(exclude), choice, effects, traces, told, wary)
+    every, told = (*faults, *read_back), lib.untestable
+    causes = Causes(every, lib, tuple(exclude), choice, (), traces, told, wary=False)
+    return study, found_again(study, causes)
 
 
-def found_again(study: Study, choice: Choice, exclude: Sequence[str]) -> tuple[Finding, ...]:
-    """The effects that were chosen, each with its rivals and how often it is found again."""
+def found_again(study: Study, causes: Causes) -> Causes:
+    """The causes with their effects as findings: rivals, and how often each is found again.
+
+    And whether what these leave has structure that matters.
+    """
+    choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
-    ripple = GEAR_RIPPLE.name not in exclude
-    return tuple(judged_again(found, choice, study.data, choice.library, ripple))
+    found = judged_again(found, choice, study.data, causes.library, causes.ripple)
+    wary = loudest(study, choice, causes.traces) is not None
+    return replace(causes, effects=tuple(found), wary=wary)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
@@ -110,18 +115,10 @@ def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     columns = [term.columns(study.scene) for term in maps]
     usual = [one.displacement(study.scene) / np.sqrt(one.ridge)[:, None, None, None]
              for one in columns]  # fmt: skip
-    rows = study.rows
-    moved = rows.of(np.concatenate(usual))
-    moved = moved - rows.basis @ (rows.basis.T @ moved)
-    span, size, _ = np.linalg.svd(moved, full_matrices=False)
-    span = span[:, size > 1.0]
-    error = rows.error - span @ (span.T @ rows.error)
-    rows = replace(rows, error=error, basis=np.concatenate([rows.basis, span], axis=1))
-    study = replace(study, rows=rows)
+    study = replace(study, rows=study.rows.beside(study.rows.of(np.concatenate(usual))))
     lib, choice = chosen(study, causes.exclude)
-    effects, traces = found_again(study, choice, causes.exclude), left_by(study, choice)
-    wary = loudest(study, choice, traces) is not None
-    return replace(causes, library=lib, choice=choice, effects=effects, traces=traces, wary=wary)
+    traces = left_by(study, choice)
+    return found_again(study, replace(causes, library=lib, choice=choice, traces=traces))
 
 
 def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:

@@ -241,7 +241,8 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
     causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
     ladder = climbed(study, [finding.terms for finding in effects], wary=causes.wary)
-    held = [term for term in maps.terms if term in ladder.last.terms]
+    texts = {term.text for term in ladder.last.terms}
+    held = [term for term in maps.terms if term.text in texts]
     return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
 
 

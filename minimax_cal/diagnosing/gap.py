@@ -83,7 +83,7 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
     mapped = any(EFFECTS[term.effect].is_map for terms in effects for term in terms)
     waiting = by_size(study, effects) if mapped else list(range(len(effects)))
     while waiting:
-        refused = []
+        refused: list[tuple[int, int]] = []  # with how many were taken before
         for number in waiting:
             terms = effects[number]
             wide = joint(study, (*fits[-1].terms, *terms))
@@ -94,8 +94,8 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
                 fits.append(wide)
                 taken.append(number)
             else:
-                refused.append(number)
-        waiting = refused if mapped and len(refused) < len(waiting) else []
+                refused.append((number, len(taken)))
+        waiting = [number for number, before in refused if mapped and before < len(taken)]
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
 
 

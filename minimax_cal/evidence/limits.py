@@ -50,7 +50,7 @@ MATTERS = 0.015  # share of what was explained below which structure is of no ac
 # machines are not quite ours (study, saturating and loaded forms), real arms leave 1 %
 WORTH = 0.02  # of the noise: structure that would lower the RMS by less than 1 % is of no account
 CREDIBLE = 3.0  # sigmas by which masses may be off to explain what a name leaves: with the true law
-# they are by up to 2, without it by 3.3 to 9 (simulated UR10s, twelve of each)
+# they are by up to 2, without it by 3.3 to 9 (twelve and eighteen simulated UR10s)
 MUCH = 0.2  # of the noise: what tentative effects alone may tell on an arm that has nothing (study:
 # 0.02 where the base only creeps; 2.1 where the one law that was there is in no library)
 CERTAIN = 1e-6  # chance below which something is there, though no name of it holds

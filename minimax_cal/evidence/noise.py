@@ -54,6 +54,18 @@ class Rows:
         flat = np.moveaxis(fields.reshape(d, 3 * k, m), -1, 0) * self.weight[:, None, :]
         return np.asarray((flat @ self.turn).swapaxes(1, 2).reshape(3 * k * m, d))
 
+    def beside(self, columns: Array) -> Rows:
+        """With columns (N, q) projected out as geometry is, as far as they are told.
+
+        columns: of factors whose priors weigh as one row of unit error; what is told of a direction
+        by no more than that is left.
+        """
+        rest = columns - self.basis @ (self.basis.T @ columns)
+        span, size, _ = np.linalg.svd(rest, full_matrices=False)
+        span = span[:, size > 1.0]
+        error = self.error - span @ (span.T @ self.error)
+        return replace(self, error=error, basis=np.concatenate([self.basis, span], axis=1))
+
     def back(self, rows: Array) -> Array:
         """(k, 3, m) rows (N,) as points again; what was not measured is 0."""
         m, r = self.weight.shape

@@ -7,8 +7,9 @@ from numpy.testing import assert_allclose
 from test_remainder import geometric, rigid
 
 import minimax_cal as mc
+from minimax_cal.diagnosing import diagnose, gap
 from minimax_cal.diagnosing.causes import beside_curves, causes_of
-from minimax_cal.diagnosing.diagnose import no_worse
+from minimax_cal.diagnosing.diagnose import in_rungs, no_worse, with_maps
 from minimax_cal.diagnosing.error_maps import error_maps, strongest_wave
 from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.joint import joint
@@ -185,6 +186,23 @@ def test_what_curves_may_be_is_no_geometry_of_names(robot: Robot) -> None:
     assert {f.term.place for f in beside.effects} <= {"J2"}  # waves finer than a map has
 
 
+def test_what_was_found_first_stays_where_the_new_model_is_worse(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sim = rigid(robot, 220, 2, 6)
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 1] = bumps(sim.data.q[:, 1])
+    study = geometric(robot, sim, turn).study
+    _, bare = causes_of(study, (), (), silent)
+    first, _ = with_maps(study, bare, silent)
+    monkeypatch.setattr(diagnose, "no_worse", lambda one, other: False)
+    causes, spoken, ladder = in_rungs(study, bare, silent)
+    assert causes is spoken
+    assert [f.term.text for f in spoken.effects] == [f.term.text for f in first.effects]
+    assert spoken.choice is bare.choice  # and with it its noise
+    assert ladder.maps
+
+
 def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
     """The law first, whose errors are too large for the prior of the curve."""
     robot, place = mc.load_robot("ur10"), 2
@@ -203,19 +221,25 @@ def test_a_law_and_a_curve_much_smaller_are_both_told() -> None:
     assert rms[3] < 0.75 * rms[2] < 0.3 * rms[1]
 
 
-def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(robot: Robot) -> None:
-    sim = simulate(robot, 200, 1, seed=4, truth=Truth(compliance=2e-6))
-    q = sim.data.q
-    turn = np.zeros_like(q)
-    turn[:, 1] = 0.3 * bumps(q[:, 1])
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
+    order: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = mc.load_robot("ur10")
+    sim = simulate(robot, 150, 1, seed=1, truth=Truth(compliance=2e-6))
+    turn = np.zeros_like(sim.data.q)
+    turn[:, 2] = 0.3 * bumps(sim.data.q[:, 2])
     study = geometric(robot, sim, turn).study
-    law = Term(
-        "joint_compliance", "all", EFFECTS["joint_compliance"].choices(study.scene, "all")[0]
-    )
-    (curve,) = terms(study.scene, ["joint_error_map:J2:size=0.0001"])
-    for effects in ([(law,), (curve,)], [(curve,), (law,)]):
-        ladder = climbed(study, effects)
-        assert [effects[number][0].effect for number in ladder.taken] == [law.effect, curve.effect]
-        assert ladder.maps == (curve,)
-    assert no_worse(ladder, climbed(study, [(law,)]))
-    assert not no_worse(climbed(study, [(law,)]), ladder)
+    plain, *_ = EFFECTS["joint_compliance"].choices(study.scene, "all")
+    law = Term("joint_compliance", "all", plain)
+    (curve,) = terms(study.scene, ["joint_error_map:J3:size=0.0001"])
+    effects = [[(law,), (curve,)][number] for number in order]
+    ladder = climbed(study, effects)
+    assert [effects[number] for number in ladder.taken] == [(law,), (curve,)]
+    assert ladder.maps == (curve,)
+    bare = climbed(study, [(law,)])
+    assert no_worse(ladder, bare)
+    assert not no_worse(bare, ladder)
+    monkeypatch.setattr(gap, "by_size", lambda study, effects: list(range(len(effects))))
+    again = climbed(study, effects)  # the curve by itself is refused, and tried again
+    assert again.taken == ladder.taken

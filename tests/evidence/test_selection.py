@@ -1,6 +1,7 @@
 """Selection by evidence: names what is there, nothing where nothing is, and knows its rivals."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from scipy.optimize import lsq_linear
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing import causes
 from minimax_cal.diagnosing.causes import chosen
 from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
@@ -19,6 +22,7 @@ from minimax_cal.evidence.library import Kind, library
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import strongest_lines
+from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
@@ -70,6 +74,26 @@ def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
+
+
+def test_fifths_are_asked_of_what_was_told_before_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What all poses tuned a law to is no candidate of those that shall find it again."""
+    asked = []
+
+    def again(found: list[Finding], choice: Choice, *rest: Any) -> list[Finding]:
+        asked.append((choice, rest[1]))
+        return found
+
+    monkeypatch.setattr(causes, "judged_again", again)
+    made = opened(Cause("target_shift", "smr2", 1000.0), seed=3)
+    told = {c.term.text for c in library(made.scene, made.rows).candidates}
+    _, found = causes.causes_of(made, (), (), silent)
+    ((choice, lib),) = asked
+    assert {c.term.text for c in choice.chosen} - told  # its moment was tuned
+    assert {c.term.text for c in lib.candidates} <= told
+    assert lib is found.library
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
