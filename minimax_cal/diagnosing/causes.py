@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import judged_again
+from minimax_cal.diagnosing.established import judged_again, mostly_loose
 from minimax_cal.diagnosing.lack_of_fit import (
     Named,
     Trace,
@@ -27,6 +27,7 @@ from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
 from minimax_cal.evidence.noise import restricted
+from minimax_cal.evidence.periodogram import in_company
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
@@ -46,8 +47,8 @@ class Causes:
     faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether structure is left that matters.  maps: of joints, sought beside the effects, once there
-    is a ladder.
+    whether structure is left that matters, or names that change with the poses.  maps: of joints,
+    sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -98,13 +99,30 @@ def causes_of(
 def found_again(study: Study, causes: Causes) -> Causes:
     """The causes with their effects as findings: rivals, and how often each is found again.
 
-    And whether what these leave has structure that matters.
+    And whether what these leave has structure that matters, or most of them change with the poses.
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     found = judged_again(found, choice, study.data, causes.library, causes.ripple)
-    wary = loudest(study, choice, causes.traces) is not None
+    change = any(np.isfinite(f.again) for f in found)
+    change = change and mostly_loose(found, [f for f in found if f.established])
+    wary = change or loudest(study, choice, causes.traces) is not None
     return replace(causes, effects=tuple(found), wary=wary)
+
+
+def lone(finding: Finding, causes: Causes) -> bool:
+    """Whether it is waves of a joint that no gear tells: neither its ratio, nor other lines.
+
+    Among thousands of frequencies one fits a curve that has no name, and meets new poses no better.
+    """
+    if finding.term.effect != GEAR_RIPPLE.name:
+        return False
+    every = [f for f in causes.effects if f.term.effect == GEAR_RIPPLE.name]
+    lines = [(term.place, term.choice["turns"]) for f in every for term in f.terms]
+    mine = finding.term.place
+    own, others = ([t for place, t in lines if (place == mine) is here] for here in (True, False))
+    ratio = float(causes.library.scene.robot.ratio[joint_of(mine)])
+    return not in_company(ratio, own, others)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:

@@ -16,6 +16,7 @@ from minimax_cal.diagnosing.causes import (
     beside_maps,
     causes_of,
     fault_findings,
+    lone,
     merged,
     whole,
 )
@@ -230,7 +231,7 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
 
     With the error maps, and fine waves, that joints have besides.
     """
-    often = [f for f in causes.effects if not f.again < WEAK]
+    often = [f for f in causes.effects if not (f.again < WEAK or (causes.wary and lone(f, causes)))]
     chosen = [term for finding in often for term in finding.terms]
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)

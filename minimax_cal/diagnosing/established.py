@@ -15,6 +15,7 @@ from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import (
     AGAIN,
     ASKED,
+    CERTAIN,
     DIFFER,
     DWARFED,
     ENOUGH,
@@ -64,6 +65,22 @@ def judged_again(
 def share(found: Sequence[bool]) -> float:
     """How often an effect was found in the parts that could show it; too few of them show none."""
     return sum(found) / len(found) if len(found) >= ASKED else 0.0
+
+
+def loose_among(effects: Sequence[Finding], sure: Sequence[Finding]) -> list[Finding]:
+    """Effects that are there by their chance, but under no name that holds.
+
+    sure: what is established and was taken by the ladder: a name that was found again, but helps at
+    no poses left out, holds as little as one that changes.
+    """
+    held = {found.term.key for found in sure}
+    return [f for f in effects if f.term.key not in held and f.p_value < CERTAIN]
+
+
+def mostly_loose(effects: Sequence[Finding], sure: Sequence[Finding]) -> bool:
+    """Whether most of what is there has no name that holds.  sure: those that do."""
+    loose = sum(found.size for found in loose_among(effects, sure))
+    return loose > HALF * (loose + sum(found.size for found in sure))
 
 
 def dwarfs(large: Finding, small: Finding) -> bool:

@@ -73,9 +73,9 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
     What is refused is tried again beside what was taken after it: beside errors much larger than
     its own the prior of a map is too wide.
 
-    wary: where structure is left, names are a best guess.  Laws of a joint's angle, or of the time,
-    are then believed only if the ends of what drives them, left out, are met no worse either: there
-    a law that is not the machine's goes astray.
+    wary: where structure is left, or names change with the poses, they are a best guess.  Laws of a
+    joint's angle, or of the time, are then believed only if the ends of what drives them, left out,
+    are met no worse either: there a law that is not the machine's goes astray.
     """
     part = folds(study.data, FOLDS)
     fits, taken = [joint(study, ())], []

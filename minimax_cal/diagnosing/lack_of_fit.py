@@ -27,7 +27,7 @@ from minimax_cal.robots.kinematics import cross
 
 SHARE = 0.3  # of the degrees of freedom that a test may take at most
 FASTEST = 6  # waves a turn, of two joints together, that are looked for
-STEPS = 5  # joint values at which a joint may jump
+STEPS = 5  # joint values at which a joint, or its play, may jump
 LEAST, MOST = 1e-300, 0.99  # chances as they are combined: one of 1 would outweigh all others
 SWINGS = 12  # half periods of a course, from the first visit to the last, that are looked for
 
@@ -60,9 +60,9 @@ def probes(scene: Scene) -> Iterator[Probe]:
         u, v = unit(load[j]), unit(move[j])
         carried = [u, u**2, u**3] if u.any() else []
         led = [side[j], v, np.abs(v), v * np.abs(v)] if side[j].any() else []
-        if led and j in circle:
-            turned = [side[j], *(side[j] * row for row in circle[j][:2])]
-            yield Probe(f"{name} with its approach and angle", motion, np.array(turned))
+        if side[j].any() and j in circle:  # teeth wear where a gear works most
+            sectors = [side[j], *(side[j] * (scene.q[j] > at) for at in steps(scene.q[j]))]
+            yield Probe(f"{name} with its approach and angle", motion, np.array(sectors))
         if carried or led:
             yield Probe(f"{name} with its load or last move", motion, np.array([*carried, *led]))
     first = angles[:3]
@@ -128,8 +128,13 @@ def around(scene: Scene) -> dict[int, list[Array]]:
 def by_itself(q: Array) -> Array:
     """Functions of one joint's value (m,): waves, powers, jumps: (f, m)."""
     u = unit(q - q.mean())
-    jumps = [np.sign(q - at) for at in np.quantile(q, np.arange(1, STEPS + 1) / (STEPS + 1))]
+    jumps = [np.sign(q - at) for at in steps(q)]
     return np.array([*(row for k in (1, 2, 3, 4, 5) for row in wave(q, k)), u, u**2, u**3, *jumps])
+
+
+def steps(q: Array) -> Array:
+    """(s,) values that part the poses of one joint (m,) into equal numbers."""
+    return np.asarray(np.quantile(q, np.arange(1, STEPS + 1) / (STEPS + 1)))
 
 
 def wave(q: Array, k: int) -> Array:

@@ -7,17 +7,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes, loudest
+from minimax_cal.diagnosing.established import loose_among, mostly_loose
 from minimax_cal.diagnosing.gap import Ladder
 from minimax_cal.diagnosing.lack_of_fit import chance_of
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import CERTAIN, HALF, MUCH, WORTH
+from minimax_cal.evidence.limits import HALF, MUCH, WORTH
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
 UNSURE = "names that change with the poses"
 UNASKED = "names that so few poses cannot confirm"
+UNHELPFUL = "names that do not help at poses left out"
 ORDERS = 2  # waves a turn that one gear shows at once
 
 Structure = tuple[str, float]
@@ -41,10 +43,8 @@ def judged(
     if patched(named, study.scene):
         return "unknown", ("two laws for one joint may stand for one that is not known",
                            structure[1])  # fmt: skip
-    loose = sum(f.size for f in causes.effects if not f.established and f.p_value < CERTAIN)
-    asked = any(np.isfinite(found.again) for found in causes.effects)
-    unsure = UNSURE if asked else UNASKED
-    if loose > HALF * (loose + sum(found.size for found in named)):
+    unsure = why_loose(causes.effects, loose_among(causes.effects, named))
+    if mostly_loose(causes.effects, named):
         return "unknown", (unsure, structure[1])
     if not closes_enough(named, ladder, rest):
         return "unknown", ("a curve of the joints that has no name", structure[1])
@@ -53,6 +53,14 @@ def judged(
     if not sure:
         return "none", structure
     return ("one_of" if any(found.alternatives for found in sure) else "named"), structure
+
+
+def why_loose(effects: Sequence[Finding], loose: Sequence[Finding]) -> str:
+    """What is wrong with the names that do not hold."""
+    if not any(np.isfinite(found.again) for found in effects):
+        return UNASKED
+    refused = sum(found.size for found in loose if found.established)
+    return UNHELPFUL if refused > HALF * sum(found.size for found in loose) else UNSURE
 
 
 def patched(findings: Sequence[Finding], scene: Scene) -> bool:

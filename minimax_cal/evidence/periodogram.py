@@ -62,6 +62,18 @@ def strongest_lines(
     return [*((term, tried_near) for term in near), *((term, tried) for term in free)]
 
 
+def in_company(ratio: float, own: Sequence[float], others: Sequence[float]) -> bool:
+    """Whether some line of a joint is where its gear's ratio tells, or of a kind with another line.
+
+    ratio: of the gear, NaN untold.  own, others: waves a turn of lines at the joint, and elsewhere.
+    """
+    for number, turns in enumerate(own):
+        near = bands(abs(ratio)) or alike([*others, *own[:number], *own[number + 1 :]])
+        if any(low <= turns <= high for low, high in near):
+            return True
+    return False
+
+
 def bands(ratio: float) -> list[tuple[float, float]]:
     """Where lines of a gear may be, whose ratio is told; none for NaN."""
     return [(k * (ratio - BESIDE), k * (ratio + BESIDE)) for k in TIMES if ratio > SLOWEST]

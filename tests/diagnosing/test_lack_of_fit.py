@@ -140,16 +140,18 @@ def test_a_law_that_is_not_in_proportion_leaves_a_trace(power: int, heard: bool)
     assert heard or own.p > 0.01
 
 
-def test_play_in_one_sector_leaves_a_trace() -> None:
-    """By a question of three functions, where those of load and move by themselves ask seven."""
+@pytest.mark.parametrize(("low", "high", "play"), [(0.0, 0.5, 6e-5), (0.3, 0.6, 9e-5)])
+def test_play_in_one_sector_leaves_a_trace(low: float, high: float, play: float) -> None:
+    """By a question of six functions, where those of load and move by themselves ask seven."""
     made, noise = study(6e-6, 1.0, 3), Noise(0.1, 1e-10, 0.0)
     q, side = made.scene.q[2], made.scene.each("approach")[2]
-    turn = 5e-5 * np.where(q < np.median(q), side, 0.0)
+    first, last = np.quantile(q, (low, high))
+    turn = play * np.where((q > first) & (q < last), side, 0.0)
     spread = np.sqrt(1.0 / noise.weights(made.rows))
     error = spread * np.random.default_rng(2).normal(size=len(spread)) + of_joint(made, 2, turn)
     found = structure(
         made.scene, replace(made.rows, error=error), noise, np.zeros((len(spread), 0))
     )
-    first = min(found, key=lambda trace: trace.p)
-    assert first.name == "J3 with its approach and angle"
-    assert first.p * len(found) < 0.005
+    best = min(found, key=lambda trace: trace.p)
+    assert best.name == "J3 with its approach and angle"
+    assert best.p * len(found) < 0.005

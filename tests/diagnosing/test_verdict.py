@@ -12,11 +12,20 @@ from scipy.stats import norm
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import established
+from minimax_cal.diagnosing.established import loose_among, mostly_loose
 from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.lack_of_fit import Trace, chance_of, heard
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import DWARFED, Finding
-from minimax_cal.diagnosing.verdict import closed_by, patched, wavers
+from minimax_cal.diagnosing.verdict import (
+    UNASKED,
+    UNHELPFUL,
+    UNSURE,
+    closed_by,
+    patched,
+    wavers,
+    why_loose,
+)
 from minimax_cal.evidence import limits
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.cell import Cell, still
@@ -85,6 +94,22 @@ def test_effects_of_which_none_is_established_leave_it_unknown_where_they_tell_m
         ladder.fits[0].train.rms_mm ** 2 - ladder.last.train.rms_mm**2,
         rtol=0.3,  # parts left out tell about as much as the poses of the fit
     )
+
+
+def test_a_name_that_helps_at_no_poses_left_out_holds_nothing() -> None:
+    firm, weak = finding("gear_error", "J3"), finding("encoder_gain", "J2", 50.0, again=0.6)
+    chance = replace(finding("backlash", "J1"), p_value=10.0 * limits.CERTAIN)
+    every = [firm, weak, chance]
+    assert loose_among(every, [firm]) == [weak]
+    assert loose_among(every, []) == [firm, weak]  # the ladder refused the first
+    assert not mostly_loose(every, [firm])
+    assert mostly_loose(every, [])
+    assert mostly_loose([firm, replace(weak, size=300.0)], [firm])
+    assert why_loose(every, [weak]) == UNSURE
+    assert why_loose(every, [firm, weak]) == UNHELPFUL
+    assert why_loose(every, [firm, replace(weak, size=300.0)]) == UNSURE  # most of it changes
+    few = [replace(one, again=float("nan")) for one in every]
+    assert why_loose(few, loose_among(few, [])) == UNASKED
 
 
 def test_two_laws_of_one_angle_are_one_that_is_not_known() -> None:

@@ -13,7 +13,7 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import Line, alike, bands, strongest_lines
+from minimax_cal.evidence.periodogram import Line, alike, bands, in_company, strongest_lines
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
@@ -145,6 +145,24 @@ def test_gears_of_a_kind_are_sought_at_their_ratio(
     heard: list[float], expected: list[tuple[float, float]]
 ) -> None:
     assert_allclose(np.array(alike(heard)).reshape(-1, 2), np.array(expected).reshape(-1, 2))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "own", "others", "kept"),
+    [
+        (np.nan, [33.3], [], False),
+        (33.0, [33.3], [], True),
+        (-33.0, [66.0], [], True),
+        (100.0, [33.3], [33.3], False),  # a ratio that is told is the joint's own
+        (np.nan, [33.3], [66.2], True),
+        (np.nan, [33.3, 66.2], [], True),
+        (np.nan, [33.3, 75.0], [20.0], False),
+    ],
+)
+def test_a_line_has_a_ratio_or_another_line_for_company(
+    ratio: float, own: list[float], others: list[float], kept: bool
+) -> None:
+    assert in_company(ratio, own, others) == kept
 
 
 @pytest.mark.parametrize("strong", [20.0, 2000.0])
