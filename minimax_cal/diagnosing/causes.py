@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import judged_again, mostly_loose
+from minimax_cal.diagnosing.established import UNASKED, judged_again, mostly_loose
 from minimax_cal.diagnosing.lack_of_fit import (
     Named,
     Trace,
@@ -25,7 +25,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
+from minimax_cal.evidence.limits import ENOUGH, EXACT, HELPED, STRUCTURE, WEAK
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import in_company
 from minimax_cal.evidence.selection import Choice
@@ -47,8 +47,8 @@ class Causes:
     faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether structure is left that matters, or names that change with the poses.  maps: of joints,
-    sought beside the effects, once there is a ladder.
+    whether structure is left that matters, or names that change with the poses.  met: as `Again`
+    has it.  maps: of joints, sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -59,6 +59,7 @@ class Causes:
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
     wary: bool
+    met: float = UNASKED
     maps: Mapped = NO_MAPS
 
     @property
@@ -103,11 +104,24 @@ def found_again(study: Study, causes: Causes) -> Causes:
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
-    found = judged_again(found, choice, study.data, causes.library, causes.ripple)
-    change = any(np.isfinite(f.again) for f in found)
-    change = change and mostly_loose(found, [f for f in found if f.established])
+    again = judged_again(found, choice, study.data, causes.library, causes.ripple)
+    effects = again.findings
+    change = any(np.isfinite(f.again) for f in effects)
+    change = change and mostly_loose(effects, [f for f in effects if f.established])
     wary = change or loudest(study, choice, causes.traces) is not None
-    return replace(causes, effects=tuple(found), wary=wary)
+    return replace(causes, effects=effects, wary=wary, met=again.met)
+
+
+def believed(causes: Causes) -> list[Finding]:
+    """The effects found often enough to be in the model.
+
+    Names that are a best guess must help the fifths that they were sought without, and none is a
+    wave by itself.
+    """
+    if causes.wary and causes.met > HELPED:
+        return []
+    often = [found for found in causes.effects if not found.again < WEAK]
+    return [found for found in often if not (causes.wary and lone(found, causes))]
 
 
 def lone(finding: Finding, causes: Causes) -> bool:

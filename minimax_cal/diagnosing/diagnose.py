@@ -12,11 +12,11 @@ from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import (
     Causes,
+    believed,
     beside_curves,
     beside_maps,
     causes_of,
     fault_findings,
-    lone,
     merged,
     whole,
 )
@@ -43,7 +43,6 @@ from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
-from minimax_cal.evidence.limits import WEAK
 from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
@@ -231,7 +230,7 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
 
     With the error maps, and fine waves, that joints have besides.
     """
-    often = [f for f in causes.effects if not (f.again < WEAK or (causes.wary and lone(f, causes)))]
+    often = believed(causes)
     chosen = [term for finding in often for term in finding.terms]
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy.stats import chi2
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import bench
+from minimax_cal.evidence.bench import bench, columns_of
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import (
     AGAIN,
@@ -25,6 +26,7 @@ from minimax_cal.evidence.limits import (
     MOST,
     SAME,
 )
+from minimax_cal.evidence.noise import remaining
 from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -33,33 +35,61 @@ from minimax_cal.modelling.effects.table import EFFECTS
 UNASKED = float("nan")  # how often an effect is found again where poses are too few to ask
 
 
+@dataclass(frozen=True)
+class Again:
+    """What the search tells that is made anew without each fifth of the groups.
+
+    findings: each with how often it was found again.  met: square of what it leaves of those
+    fifths, over that of geometry alone; NaN where poses are too few to ask.
+    """
+
+    findings: tuple[Finding, ...]
+    met: float
+
+
 def judged_again(
     findings: Sequence[Finding], whole: Choice, data: Measurements, library: Library, ripple: bool
-) -> list[Finding]:
-    """The findings, each with how often it was found again.
+) -> Again:
+    """The findings, sought anew without each fifth.
 
     whole: what was chosen on all poses.  library: what it was chosen from.
     """
     if not findings:
-        return []
+        return Again((), UNASKED)
     part = folds(data, FOLDS)
     told: list[list[bool]] = [[] for _ in findings]
-    rich = 0
+    rich, squares = 0, np.zeros(2)
     for number in range(FOLDS):
         rest = library.only(part != number)
         rich += rest.products.dof(NOTHING) >= LEAST_DOF
         choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
+        squares += predicted(choice, {found.term.key for found in findings})
         for one, known in zip(findings, told, strict=True):
             found = is_found(one, choice, whole)
             known += [found] if found or shows(one, choice, whole) else []
-    return [
+    asked = rich >= ASKED
+    again = [
         replace(
             one,
-            again=share(known) if rich >= ASKED else UNASKED,
+            again=share(known) if asked else UNASKED,
             dwarfed=any(dwarfs(other, one) for other in findings),
         )
         for one, known in zip(findings, told, strict=True)
     ]
+    return Again(tuple(again), float(squares[1] / max(squares[0], 1e-300)) if asked else UNASKED)
+
+
+def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
+    """(2,) squares of what geometry, and with it effects, leave of rows that were not kept [m^2].
+
+    keys: of the effects that count, of those chosen on the rows that were.
+    """
+    lib = choice.library
+    weight = choice.noise.weights(lib.rows) * lib.products.kept
+    several = [c for c in choice.chosen if c.key in keys]
+    known = [lib.columns[:, columns_of(some)[0]] for some in ((), several)]
+    left = [remaining(lib.rows, weight, columns)[~lib.products.kept] for columns in known]
+    return np.array([one @ one for one in left])
 
 
 def share(found: Sequence[bool]) -> float:
@@ -71,10 +101,18 @@ def loose_among(effects: Sequence[Finding], sure: Sequence[Finding]) -> list[Fin
     """Effects that are there by their chance, but under no name that holds.
 
     sure: what is established and was taken by the ladder: a name that was found again, but helps at
-    no poses left out, holds as little as one that changes.
+    no poses left out, holds as little as one that changes; unless one that holds stands for it.
     """
     held = {found.term.key for found in sure}
-    return [f for f in effects if f.term.key not in held and f.p_value < CERTAIN]
+    loose = [f for f in effects if f.term.key not in held and f.p_value < CERTAIN]
+    return [f for f in loose if not (f.established and any(stands_for(one, f) for one in sure))]
+
+
+def stands_for(one: Finding, other: Finding) -> bool:
+    """Whether an effect is the other at all joints, or one of them, or a rival told with it."""
+    effect, place = one.term.key
+    names = [other.term.key, *((rival.effect, rival.place) for rival in other.alternatives)]
+    return any(effect == name and (place == at or "all" in (place, at)) for name, at in names)
 
 
 def mostly_loose(effects: Sequence[Finding], sure: Sequence[Finding]) -> bool:

@@ -4,13 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems_fit import study_of
 
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import causes as module
-from minimax_cal.diagnosing.causes import Causes, causes_of, found_again, lone
+from minimax_cal.diagnosing.causes import Causes, believed, causes_of, found_again, lone
 from minimax_cal.diagnosing.diagnose import with_maps
+from minimax_cal.diagnosing.established import Again, predicted
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.options import silent
 
 RIPPLE = Cause("gear_ripple", "J2", 2000.0)
@@ -55,6 +58,37 @@ def test_names_that_change_with_the_poses_are_a_best_guess(
 ) -> None:
     """As structure that is left; poses that are too few to leave any out say nothing of it."""
     study, causes = ripple
-    asked = [replace(found, again=again) for found in causes.effects]
+    asked = Again(tuple(replace(found, again=again) for found in causes.effects), 0.5)
     monkeypatch.setattr(module, "judged_again", lambda *_: asked)
     assert found_again(study, causes).wary == wary
+
+
+@pytest.mark.parametrize(
+    ("wary", "met", "held"),
+    [(True, 1.1, 0), (True, 0.5, 2), (False, 1.1, 2), (True, np.nan, 2)],
+)
+def test_a_best_guess_must_help_fifths_that_it_was_sought_without(
+    ripple: tuple[Study, Causes], wary: bool, met: float, held: int
+) -> None:
+    (one,) = ripple[1].effects
+    pair = [replace(one, terms=(replace(one.term, place=place),)) for place in ("J1", "J2")]
+    assert len(believed(replace(ripple[1], effects=tuple(pair), wary=wary, met=met))) == held
+
+
+def test_what_is_sought_anew_meets_its_fifth(ripple: tuple[Study, Causes]) -> None:
+    """By least squares on the other poses, told here in another way."""
+    study, causes = ripple
+    part = np.arange(study.data.poses) % 5 == 0
+    library = causes.library.only(~part)
+    choice = select(library)
+    assert [c.key for c in choice.chosen] == [("gear_ripple", "J2")]
+    rows = library.rows
+    mine = np.repeat(part, len(rows.error) // study.data.poses)
+    root = np.sqrt(choice.noise.weights(rows))[:, None]
+    expected = []
+    for columns in (rows.basis, np.concatenate([rows.basis, choice.known], axis=1)):
+        fit = np.linalg.lstsq((columns * root)[~mine], (rows.error * root[:, 0])[~mine])[0]
+        expected.append(float(((rows.error - columns @ fit)[mine] ** 2).sum()))
+    assert_allclose(predicted(choice, {("gear_ripple", "J2")}), expected, rtol=1e-6)
+    assert_allclose(predicted(choice, {("backlash", "J2")}), [expected[0]] * 2, rtol=1e-6)
+    assert causes.met < 0.5

@@ -16,7 +16,7 @@ from minimax_cal.diagnosing.established import loose_among, mostly_loose
 from minimax_cal.diagnosing.gap import climbed
 from minimax_cal.diagnosing.lack_of_fit import Trace, chance_of, heard
 from minimax_cal.diagnosing.remainder import Remainder
-from minimax_cal.diagnosing.result import DWARFED, Finding
+from minimax_cal.diagnosing.result import DWARFED, Alternative, Finding
 from minimax_cal.diagnosing.verdict import (
     UNASKED,
     UNHELPFUL,
@@ -102,6 +102,12 @@ def test_a_name_that_helps_at_no_poses_left_out_holds_nothing() -> None:
     every = [firm, weak, chance]
     assert loose_among(every, [firm]) == [weak]
     assert loose_among(every, []) == [firm, weak]  # the ladder refused the first
+    rival = Alternative("gear_error", "all", 0.9, 5.0, 1.0, "")
+    for other in (finding("gear_error", "all"), finding("backlash", "J3")):
+        assert loose_among([firm, other], [firm]) == [other][: other.term.effect == "backlash"]
+    bending = replace(finding("link_bending", "L3"), alternatives=(rival,))
+    assert loose_among([firm, bending], [firm]) == []  # which is told with it
+    assert loose_among([firm, replace(bending, again=0.6)], [firm])  # by itself it changes
     assert not mostly_loose(every, [firm])
     assert mostly_loose(every, [])
     assert mostly_loose([firm, replace(weak, size=300.0)], [firm])

@@ -13,6 +13,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import causes
 from minimax_cal.diagnosing.causes import chosen
 from minimax_cal.diagnosing.diagnose import resemblance
+from minimax_cal.diagnosing.established import Again
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
@@ -82,9 +83,9 @@ def test_fifths_are_asked_of_what_was_told_before_the_search(
     """What all poses tuned a law to is no candidate of those that shall find it again."""
     asked = []
 
-    def again(found: list[Finding], choice: Choice, *rest: Any) -> list[Finding]:
+    def again(found: list[Finding], choice: Choice, *rest: Any) -> Again:
         asked.append((choice, rest[1]))
-        return found
+        return Again(tuple(found), 0.5)
 
     monkeypatch.setattr(causes, "judged_again", again)
     made = opened(Cause("target_shift", "smr2", 1000.0), seed=3)

@@ -331,7 +331,7 @@ def test_new_data_bring_their_own_columns(many: Many) -> None:
         ("gear_error:J2:turn=2", "no choice 'turn'; choose orders, turns"),
         ("joint_coupling:J5:source=5", "no source 5; choose 3, 4"),
         ("tool_flex:all:lever=3", "no lever 3; choose 0, 1, 2"),
-        ("backlash:J2:turns=2", "no choice 'turns'; its law has none"),
+        ("backlash:J2:turns=2", "no choice 'turns'; its law has no such number"),
         ("frame_drift:frame:constant=0", "constant 0 is not possible"),
         ("gear_error:J2:turns=nan", "turns nan is not possible"),
         ("thermal_growth:all:temperature=1:constant=0.5", "no variant has temperature and"),

@@ -209,7 +209,7 @@ def variants(text: str, choices: Sequence[Choice], given: Choice) -> tuple[Choic
     known = {key for choice in choices for key in choice}
     for key, value in given.items():
         if key not in known and (choices or key not in FREE):
-            said = f"choose {', '.join(sorted(known))}" if known else "its law has none"
+            said = f"choose {', '.join(sorted(known))}" if known else "its law has no such number"
             raise OptionError(f"effect {text!r}: no choice {key!r}; {said}")
         listed = sorted({choice[key] for choice in choices if key in choice})
         if key in known - FREE and value not in listed:
