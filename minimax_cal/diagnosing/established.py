@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import bench, columns_of
+from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import (
     AGAIN,
@@ -25,6 +25,7 @@ from minimax_cal.evidence.limits import (
     LEAST_DOF,
     MOST,
     SAME,
+    WEAK,
 )
 from minimax_cal.evidence.noise import remaining
 from minimax_cal.evidence.selection import NOTHING, Choice, select
@@ -39,8 +40,10 @@ UNASKED = float("nan")  # how often an effect is found again where poses are too
 class Again:
     """What the search tells that is made anew without each fifth of the groups.
 
-    findings: each with how often it was found again.  met: square of what it leaves of those
-    fifths, over that of geometry alone; NaN where poses are too few to ask.
+    findings: each with how often it was found again.  met: square of what those found often leave
+    of the fifths without which they were sought, over that of geometry alone; but for the one that
+    speaks most against them, which may hold what alone tells a parameter.  NaN where poses are too
+    few to ask.
     """
 
     findings: tuple[Finding, ...]
@@ -57,26 +60,30 @@ def judged_again(
     if not findings:
         return Again((), UNASKED)
     part = folds(data, FOLDS)
-    told: list[list[bool]] = [[] for _ in findings]
-    rich, squares = 0, np.zeros(2)
+    known: list[list[bool]] = [[] for _ in findings]
+    rich, choices = 0, []
     for number in range(FOLDS):
         rest = library.only(part != number)
         rich += rest.products.dof(NOTHING) >= LEAST_DOF
         choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
-        squares += predicted(choice, {found.term.key for found in findings})
-        for one, known in zip(findings, told, strict=True):
+        choices.append(choice)
+        for one, times in zip(findings, known, strict=True):
             found = is_found(one, choice, whole)
-            known += [found] if found or shows(one, choice, whole) else []
+            times += [found] if found or shows(one, choice, whole) else []
     asked = rich >= ASKED
     again = [
         replace(
             one,
-            again=share(known) if asked else UNASKED,
+            again=share(times) if asked else UNASKED,
             dwarfed=any(dwarfs(other, one) for other in findings),
         )
-        for one, known in zip(findings, told, strict=True)
+        for one, times in zip(findings, known, strict=True)
     ]
-    return Again(tuple(again), float(squares[1] / max(squares[0], 1e-300)) if asked else UNASKED)
+    often = {found.term.key for found in again if not found.again < WEAK}
+    told = np.array([predicted(choice, often) for choice in choices])
+    least = int(np.argmax(told[:, 1] - told[:, 0]))
+    alone, beside = np.delete(told, least, axis=0).sum(axis=0)
+    return Again(tuple(again), float(beside / max(alone, 1e-300)) if asked else UNASKED)
 
 
 def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
@@ -86,9 +93,13 @@ def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
     """
     lib = choice.library
     weight = choice.noise.weights(lib.rows) * lib.products.kept
-    several = [c for c in choice.chosen if c.key in keys]
-    known = [lib.columns[:, columns_of(some)[0]] for some in ((), several)]
-    left = [remaining(lib.rows, weight, columns)[~lib.products.kept] for columns in known]
+    moved = np.zeros(len(weight))
+    for one, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
+        if one.key in keys:
+            moved += lib.columns[:, one.main] @ value
+    none = np.zeros((len(weight), 0))
+    errors = [replace(lib.rows, error=error) for error in (lib.rows.error, lib.rows.error - moved)]
+    left = [remaining(rows, weight, none)[~lib.products.kept] for rows in errors]
     return np.array([one @ one for one in left])
 
 

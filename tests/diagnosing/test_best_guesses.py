@@ -30,20 +30,20 @@ def ripple() -> tuple[Study, Causes]:
 def test_a_line_by_itself_is_taken_where_nothing_else_is_left(
     ripple: tuple[Study, Causes],
 ) -> None:
-    study, causes = ripple
+    made, causes = ripple
     (one,) = causes.effects
     assert one.term.key == ("gear_ripple", "J2")
     assert not causes.wary
     assert lone(one, causes)
-    assert [t.key for t in with_maps(study, causes, silent)[1].last.terms] == [one.term.key]
+    assert [t.key for t in with_maps(made, causes, silent)[1].last.terms] == [one.term.key]
 
 
 def test_a_line_by_itself_is_not_taken_where_something_unknown_is_left(
     ripple: tuple[Study, Causes],
 ) -> None:
-    study, causes = ripple
+    made, causes = ripple
     wary = replace(causes, wary=True)
-    spoken, ladder = with_maps(study, wary, silent)
+    spoken, ladder = with_maps(made, wary, silent)
     assert spoken.effects == ladder.last.terms == ()
     twice = replace(one := causes.effects[0].term, choice={"turns": 2.0 * one.choice["turns"]})
     pair = replace(causes.effects[0], terms=(one, twice))
@@ -57,10 +57,10 @@ def test_names_that_change_with_the_poses_are_a_best_guess(
     ripple: tuple[Study, Causes], again: float, wary: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As structure that is left; poses that are too few to leave any out say nothing of it."""
-    study, causes = ripple
+    made, causes = ripple
     asked = Again(tuple(replace(found, again=again) for found in causes.effects), 0.5)
     monkeypatch.setattr(module, "judged_again", lambda *_: asked)
-    assert found_again(study, causes).wary == wary
+    assert found_again(made, causes).wary == wary
 
 
 @pytest.mark.parametrize(
@@ -77,13 +77,13 @@ def test_a_best_guess_must_help_fifths_that_it_was_sought_without(
 
 def test_what_is_sought_anew_meets_its_fifth(ripple: tuple[Study, Causes]) -> None:
     """By least squares on the other poses, told here in another way."""
-    study, causes = ripple
-    part = np.arange(study.data.poses) % 5 == 0
+    made, causes = ripple
+    part = np.arange(made.data.poses) % 5 == 0
     library = causes.library.only(~part)
     choice = select(library)
     assert [c.key for c in choice.chosen] == [("gear_ripple", "J2")]
     rows = library.rows
-    mine = np.repeat(part, len(rows.error) // study.data.poses)
+    mine = np.repeat(part, len(rows.error) // made.data.poses)
     root = np.sqrt(choice.noise.weights(rows))[:, None]
     expected = []
     for columns in (rows.basis, np.concatenate([rows.basis, choice.known], axis=1)):
