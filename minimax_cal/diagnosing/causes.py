@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import UNASKED, judged_again, mostly_loose
+from minimax_cal.diagnosing.established import UNASKED, asked, judged_again, mostly_loose, often
 from minimax_cal.diagnosing.lack_of_fit import (
     Named,
     Trace,
@@ -25,7 +25,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import ENOUGH, EXACT, HELPED, STRUCTURE, WEAK
+from minimax_cal.evidence.limits import ENOUGH, EXACT, HELPED, STRUCTURE
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import in_company
 from minimax_cal.evidence.selection import Choice
@@ -106,9 +106,8 @@ def found_again(study: Study, causes: Causes) -> Causes:
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     again = judged_again(found, choice, study.data, causes.library, causes.ripple)
     effects = again.findings
-    change = any(np.isfinite(f.again) for f in effects)
-    change = change and mostly_loose(effects, [f for f in effects if f.established])
-    wary = change or loudest(study, choice, causes.traces) is not None
+    change = mostly_loose(effects, [found for found in effects if found.established])
+    wary = (change and asked(effects)) or loudest(study, choice, causes.traces) is not None
     return replace(causes, effects=effects, wary=wary, met=again.met)
 
 
@@ -120,8 +119,7 @@ def believed(causes: Causes) -> list[Finding]:
     """
     if causes.wary and causes.met > HELPED:
         return []
-    often = [found for found in causes.effects if not found.again < WEAK]
-    return [found for found in often if not (causes.wary and lone(found, causes))]
+    return [one for one in often(causes.effects) if not (causes.wary and lone(one, causes))]
 
 
 def lone(finding: Finding, causes: Causes) -> bool:
@@ -164,7 +162,10 @@ def loudest(study: Study, choice: Choice, traces: Sequence[Trace]) -> Trace | No
 
 
 def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
-    """The causes with the traces of what their effects and some maps leave together."""
+    """The causes with the traces of what their effects and some maps leave together.
+
+    Names that changed with the poses are no longer there to be wary of: the maps are.
+    """
     fields = [term.columns(study.scene).displacement(study.scene) for term in maps]
     known = np.concatenate([causes.choice.doubted, *map(study.rows.of, fields)], axis=1)
     noise = restricted(study.rows, known)

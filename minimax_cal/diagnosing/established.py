@@ -70,20 +70,20 @@ def judged_again(
         for one, times in zip(findings, known, strict=True):
             found = is_found(one, choice, whole)
             times += [found] if found or shows(one, choice, whole) else []
-    asked = rich >= ASKED
+    enough = rich >= ASKED
     again = [
         replace(
             one,
-            again=share(times) if asked else UNASKED,
+            again=share(times) if enough else UNASKED,
             dwarfed=any(dwarfs(other, one) for other in findings),
         )
         for one, times in zip(findings, known, strict=True)
     ]
-    often = {found.term.key for found in again if not found.again < WEAK}
-    told = np.array([predicted(choice, often) for choice in choices])
+    keys = {found.term.key for found in often(again)}
+    told = np.array([predicted(choice, keys) for choice in choices])
     least = int(np.argmax(told[:, 1] - told[:, 0]))
     alone, beside = np.delete(told, least, axis=0).sum(axis=0)
-    return Again(tuple(again), float(beside / max(alone, 1e-300)) if asked else UNASKED)
+    return Again(tuple(again), float(beside / max(alone, 1e-300)) if enough else UNASKED)
 
 
 def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
@@ -101,6 +101,16 @@ def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
     errors = [replace(lib.rows, error=error) for error in (lib.rows.error, lib.rows.error - moved)]
     left = [remaining(rows, weight, none)[~lib.products.kept] for rows in errors]
     return np.array([one @ one for one in left])
+
+
+def often(findings: Sequence[Finding]) -> list[Finding]:
+    """Those found often enough to be in the model, or of which nobody could be asked."""
+    return [found for found in findings if not found.again < WEAK]
+
+
+def asked(findings: Sequence[Finding]) -> bool:
+    """Whether the poses were enough to ask how often some of them are found."""
+    return any(np.isfinite(found.again) for found in findings)
 
 
 def share(found: Sequence[bool]) -> float:

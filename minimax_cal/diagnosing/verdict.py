@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from minimax_cal.diagnosing.causes import Causes, loudest
-from minimax_cal.diagnosing.established import loose_among, mostly_loose
+from minimax_cal.diagnosing.established import asked, loose_among, mostly_loose
 from minimax_cal.diagnosing.gap import Ladder
 from minimax_cal.diagnosing.lack_of_fit import chance_of
 from minimax_cal.diagnosing.remainder import Remainder
@@ -57,7 +57,7 @@ def judged(
 
 def why_loose(effects: Sequence[Finding], loose: Sequence[Finding]) -> str:
     """What is wrong with the names that do not hold."""
-    if not any(np.isfinite(found.again) for found in effects):
+    if not asked(effects):
         return UNASKED
     refused = sum(found.size for found in loose if found.established)
     return UNHELPFUL if refused > HALF * sum(found.size for found in loose) else UNSURE

@@ -36,7 +36,7 @@ from minimax_cal.evidence.limits import (
     TIE,
     TUNINGS,
 )
-from minimax_cal.evidence.noise import FREE, Noise, Rows, remaining
+from minimax_cal.evidence.noise import FREE, Noise, Rows
 from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
@@ -95,16 +95,6 @@ class Choice:
             return self.known
         main, loose, _ = columns_of(self.chosen, self.found)
         return self.library.columns[:, np.concatenate([main, loose])]
-
-    @property
-    def left(self) -> Array:
-        """(N,) what geometry and effects, fitted to the poses that count, leave of all rows [m].
-
-        `Rows.back` gives it as errors of points: those of poses that do not count are predicted.
-        """
-        rows = self.library.rows
-        weight = self.noise.weights(rows) * self.library.products.kept
-        return remaining(rows, weight, self.known)
 
 
 def select(
