@@ -35,6 +35,7 @@ from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
+from minimax_cal.robots.robot import Robot
 
 FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
@@ -112,29 +113,32 @@ def found_again(study: Study, causes: Causes) -> Causes:
 
 
 def believed(causes: Causes) -> list[Finding]:
-    """The effects found often enough to be in the model.
+    """The effects that are in the model: found often enough, and not held back."""
+    every = [term for found in causes.effects for term in found.terms]
+    return [one for one in often(causes.effects) if not held_back(one.terms, every, causes)]
 
-    Names that are a best guess must help the fifths that they were sought without, and none is a
-    wave by itself.
+
+def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes) -> bool:
+    """Whether an effect is a best guess that is in no model.
+
+    Names that are one must help the fifths that they were sought without, and none is a wave by
+    itself.  terms: of the effect, every: of all that were found with it.
     """
-    if causes.wary and causes.met > HELPED:
-        return []
-    return [one for one in often(causes.effects) if not (causes.wary and lone(one, causes))]
+    robot = causes.library.scene.robot
+    return causes.wary and (causes.met > HELPED or lone(terms, every, robot))
 
 
-def lone(finding: Finding, causes: Causes) -> bool:
+def lone(terms: Sequence[Term], every: Sequence[Term], robot: Robot) -> bool:
     """Whether it is waves of a joint that no gear tells: neither its ratio, nor other lines.
 
     Among thousands of frequencies one fits a curve that has no name, and meets new poses no better.
     """
-    if finding.term.effect != GEAR_RIPPLE.name:
+    effect, place = terms[0].key
+    if effect != GEAR_RIPPLE.name:
         return False
-    every = [f for f in causes.effects if f.term.effect == GEAR_RIPPLE.name]
-    lines = [(term.place, term.choice["turns"]) for f in every for term in f.terms]
-    mine = finding.term.place
-    own, others = ([t for place, t in lines if (place == mine) is here] for here in (True, False))
-    ratio = float(causes.library.scene.robot.ratio[joint_of(mine)])
-    return not in_company(ratio, own, others)
+    lines = [(term.place, term.choice["turns"]) for term in every if term.effect == effect]
+    own, others = ([t for at, t in lines if (at == place) is here] for here in (True, False))
+    return not in_company(float(robot.ratio[joint_of(place)]), own, others)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:

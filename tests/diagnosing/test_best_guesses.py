@@ -34,7 +34,7 @@ def test_a_line_by_itself_is_taken_where_nothing_else_is_left(
     (one,) = causes.effects
     assert one.term.key == ("gear_ripple", "J2")
     assert not causes.wary
-    assert lone(one, causes)
+    assert lone(one.terms, one.terms, made.robot)
     assert [t.key for t in with_maps(made, causes, silent)[1].last.terms] == [one.term.key]
 
 
@@ -45,11 +45,11 @@ def test_a_line_by_itself_is_not_taken_where_something_unknown_is_left(
     wary = replace(causes, wary=True)
     spoken, ladder = with_maps(made, wary, silent)
     assert spoken.effects == ladder.last.terms == ()
-    twice = replace(one := causes.effects[0].term, choice={"turns": 2.0 * one.choice["turns"]})
-    pair = replace(causes.effects[0], terms=(one, twice))
-    assert not lone(pair, replace(wary, effects=(pair,)))
-    play = replace(pair, terms=(replace(one, effect="backlash", choice={}),))
-    assert not lone(play, replace(wary, effects=(play,)))
+    one = causes.effects[0].term
+    pair = (one, replace(one, choice={"turns": 2.0 * one.choice["turns"]}))
+    assert not lone(pair, pair, made.robot)
+    play = (replace(one, effect="backlash", choice={}),)
+    assert not lone(play, play, made.robot)
 
 
 @pytest.mark.parametrize(("again", "wary"), [(1.0, False), (0.6, True), (np.nan, False)])
