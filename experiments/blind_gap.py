@@ -350,7 +350,7 @@ class Criterion:
         share = hits / n if n else float("nan")
         low, high = interval(hits, n)
         kept = share >= self.limit if self.good else share <= self.limit
-        bound = f"{'>=' if self.good else '<='} {100.0 * self.limit:.0f} %"
+        bound = f"{'>=' if self.good else '<='} {100.0 * self.limit:.3g} %"
         shown = bound if np.isfinite(self.limit) else ""
         verdict = ("met" if kept else "MISSED") if shown and n else ""
         return (self.text, n, 100.0 * share, 100.0 * low, 100.0 * high, shown, verdict)

@@ -389,6 +389,25 @@ def test_criteria_and_tables_of_made_up_rows() -> None:
     assert counts[1, columns.index("unknown")] == 1
 
 
+@pytest.mark.parametrize(
+    ("hits", "limit", "good", "shown"),
+    [
+        (197, 0.985, True, (">= 98.5 %", "met")),
+        (196, 0.985, True, (">= 98.5 %", "MISSED")),
+        (1, 0.005, False, ("<= 0.5 %", "met")),
+        (2, 0.005, False, ("<= 0.5 %", "MISSED")),
+        (1, 0.0, False, ("<= 0 %", "MISSED")),
+        (1, float("nan"), True, ("", "")),
+    ],
+)
+def test_a_limit_is_shown_as_it_is_asked(
+    hits: int, limit: float, good: bool, shown: tuple[str, str]
+) -> None:
+    rows = [{"hit": i < hits} for i in range(200)]
+    line = blind_gap.Criterion("", "", rows, lambda row: row["hit"], limit, good).line()
+    assert line[5:] == shown
+
+
 def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Robot and data by path, in a folder that says nothing; then the seal is opened."""
     given = []
