@@ -48,7 +48,6 @@ WAYS = {  # name: (objective, loss, trim)
     "point": ("point", "square", 0.0),
     "point, trimmed": ("point", "square", TRIM),
 }
-ROBUST = tuple(way for way, (_, loss, trim) in WAYS.items() if loss != "square" or trim)
 MOST, RECALL, OTHERS = 1.05, 0.95, 0.10  # the promise for each robust way
 COLOURS = ("#000000", "#e69f00", "#56b4e9", "#0072b2", "#009e73")  # [Okabe and Ito 2008]
 

@@ -1,4 +1,4 @@
-"""What explains the errors that geometry leaves: effects, their rivals, and the verdict."""
+"""What explains the errors that geometry leaves: effects, and their rivals."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ from minimax_cal.measuring.faults import (
     standing_out,
 )
 from minimax_cal.measuring.faults.fault import listed
-from minimax_cal.measuring.floor import Floor, floor_of
+from minimax_cal.measuring.floor import Floor, floor_of, instrument_noise
 from minimax_cal.measuring.grouping import held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -297,7 +297,7 @@ def located(study: Study) -> Where:
         study.model.error(state),
         study.scene.jacobian,
         study.geometric.base,
-        float("nan"),
+        instrument_noise(study.data),
         fitted=study.model.jacobian(state)[..., study.fit.identification.active],
         up=study.robot.up,
     )
@@ -364,7 +364,7 @@ def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Faul
 
 
 def resemblance(
-    robot: Robot | str | Path, data: Measurements | str | Path, displacement: Array, seed: int = 0
+    robot: Robot | str | Path, data: Measurements | str | Path, displacement: Array
 ) -> dict[tuple[str, str], float]:
     """rho^2 between a known displacement and every effect that the data can test.
 
@@ -373,7 +373,7 @@ def resemblance(
     """
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = with_history(data if isinstance(data, Measurements) else read_measurements(data))
-    train, _, _ = split(data, 0.2, seed)
+    train, _, _ = split(data, 0.2, 0)
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)
     moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.joint import FOLDS, Joint, joint
+from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
 from minimax_cal.ground.arrays import Array

@@ -2,7 +2,7 @@
 
 Points weigh alike, but for their u95, as in the accuracy that is claimed.  (Weights by the noise of
 instrument and joints are what effects are sought with.  What a model lacks looks like noise of the
-joints there, and a fit with such weights meets new poses of real arms worse: the IRB 120 by 13 %.)
+joints there, and a fit with such weights meets new poses of real arms worse.)
 Compliances are not negative, nothing moves the arm by more than an arm can be off, and effects of
 several parameters have priors of their own size (`sizes`).
 """
@@ -35,7 +35,6 @@ PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in e
 SETTLED = 1e-4  # relative change of the weighed square that ends them
 ROUNDING = 1e-9  # of a parameter's largest value
 FARTHEST = 0.02  # of the reach: no effect of a body moves a point farther
-FOLDS = 5  # of groups of poses, by which a rung is judged
 WORSE = 1e-3  # relative rise of the training error that is none
 
 

@@ -21,7 +21,8 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 
 from minimax_cal.diagnosing.gap import folds
-from minimax_cal.diagnosing.joint import FOLDS, Joint
+from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters

@@ -32,7 +32,7 @@ ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidenc
 
 # ---- what is established -------------------------------------------------------------------------
 
-FOLDS = 5  # fifths of the groups of poses
+FOLDS = 5  # fifths of the groups of poses, by which names are sought anew and rungs judged
 AGAIN = 0.2  # chance of a false name in four fifths: the name is known, only its place is contested
 DIFFER = 1e-3  # chance that parameters of four fifths differ so much from those of all poses
 SAME = 0.05  # of their square: a smaller difference is none, however sure they are (real arms)

@@ -1,4 +1,4 @@
-"""Which effects explain what geometry leaves: tests, selection, rivals.
+"""Which effects explain what geometry leaves: they are selected by evidence, one after another.
 
 A candidate is judged by how much it raises the likelihood when it is added to the geometry and to
 the effects already chosen, the ratio of joint noise to instrument noise being estimated anew each
@@ -99,7 +99,6 @@ class Choice:
 
 def select(
     lib: Library,
-    most: int = MOST,
     *,
     ripple: bool = True,
     level: float = LEVEL,
@@ -109,7 +108,7 @@ def select(
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
     lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
-    at.  most: effects at most.  ripple: whether to look for lines of gears besides.  level: chance
+    at.  ripple: whether to look for lines of gears besides.  level: chance
     of a false name on data without an effect.  seldom: of more than REFINED effects each is
     compared anew after so many, and at the end.  first: what was chosen with other weights.
     """
@@ -120,7 +119,7 @@ def select(
     if fits:  # weighed otherwise now
         lib, fits = refined(lib, fits, level, last=True)
         noise = noise_beside(lib, fits)
-    for _ in range(most):
+    for _ in range(MOST):
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
             heard = [one.candidate.term for one in fits if one.candidate.is_line]

@@ -84,12 +84,15 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
 
 def declared(data: Measurements, repeatability: float) -> tuple[float, float] | None:
     """RMS distance by the instrument's u95 and by the arm's repeatability, NaN unknown [mm]."""
-    instrument = np.nan
-    if "u95" in data.columns and np.isfinite(data.columns["u95"]).any():
-        u95 = data.columns["u95"]
-        instrument = 1e3 * float(np.sqrt(3.0 * np.nanmean((u95 / SIGMAS) ** 2)))
+    instrument = 1e3 * math.sqrt(3.0) * instrument_noise(data)
     arm = 1e3 * RMS_OF_REPEATABILITY * repeatability
     return None if np.isnan(instrument) and np.isnan(arm) else (instrument, arm)
+
+
+def instrument_noise(data: Measurements) -> float:
+    """Of a coordinate by the instrument's u95 [m]; NaN if none is told."""
+    u95 = data.columns.get("u95", np.full(data.poses, np.nan)) / SIGMAS
+    return float(np.sqrt(np.nanmean(u95**2))) if np.isfinite(u95).any() else math.nan
 
 
 def known_floor(data: Measurements, error: Array, repeatability: float) -> tuple[float, str] | None:
@@ -125,15 +128,6 @@ def rms_mm(square: Array) -> float:
     not set it.
     """
     return 1e3 * float(np.sqrt(np.median(square) / USUAL))
-
-
-def revisits(data: Measurements, error: Array) -> Floor | None:
-    """By the scatter of errors among visits to one pose; None where they are too few.
-
-    error: (k, m, 3), or points as measured [m].
-    """
-    found = visited(data, error)
-    return between(*found) if found else None
 
 
 def between(square: Array, group: Array) -> Floor:

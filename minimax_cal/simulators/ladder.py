@@ -34,7 +34,6 @@ from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
 
 TRAINING = 200  # poses that place base and targets
-SAGGING = 1e-4  # a joint that stands farther from its command is told [rad, m]
 
 
 def simulator_gap(

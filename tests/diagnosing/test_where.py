@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from conftest import shared
 from numpy.testing import assert_allclose
+from problems_fit import study
 from scipy.stats import binom
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.diagnose import located
 from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, triage_table, where
 from minimax_cal.diagnosing.where.mean_squares import (
     lack_of_fit,
@@ -19,9 +21,10 @@ from minimax_cal.diagnosing.where.mean_squares import (
     shape_energy,
     shape_scatter,
 )
-from minimax_cal.diagnosing.where.residual import joint_rows, orthonormal, residual_of
+from minimax_cal.diagnosing.where.residual import joint_rows, residual_of
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
+from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.model import model_of
@@ -488,6 +491,21 @@ def test_no_error_at_all() -> None:
     assert found.structure == 1.0
     assert all(gap.share == 0.0 for gap in found.by_joint)
     json.dumps(found.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("promised", "own"), [(1.0, False), (0.5, True)])
+def test_targets_that_scatter_on_their_own_show_beside_a_noise_that_is_declared(
+    promised: float, own: bool
+) -> None:
+    """Of a diagnosis; where nothing is declared they are the noise, by definition."""
+    made = study(6e-6, 1.0, 3)
+    assert math.isnan(located(made).triage.shape.rms)
+    u95 = np.full(made.data.poses, 1.959964 * promised * noise_of(made.data))
+    data = replace(made.data, columns={**made.data.columns, "u95": u95})
+    shape = located(replace(made, data=data)).triage.shape
+    assert (shape.p < 1e-6) == own
+    assert own or shape.p > 0.01
+    assert own == (shape.share > 0.3)
 
 
 def test_a_table_holds_the_numbers(rng: np.random.Generator) -> None:

@@ -11,7 +11,7 @@ from minimax_cal.measuring.floor import (
     Floor,
     declared,
     floor_of,
-    revisits,
+    instrument_noise,
 )
 from minimax_cal.measuring.instrument import instrument_of, with_instrument
 from minimax_cal.measuring.measurements import Measurements
@@ -33,8 +33,8 @@ def visited(
 @pytest.mark.parametrize("times", [2, 3, 5])
 def test_visits_tell_the_noise_whatever_the_model(rng: np.random.Generator, times: int) -> None:
     data, error = visited(rng, times)
-    found = revisits(data, error)
-    assert found is not None
+    found = floor_of(data, error, np.nan, 10.0)
+    assert found.source == REPEATS
     # 600 to 3000 squares of three coordinates; a median is a little less sure than a mean
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.06)
     assert found.low < 1e3 * np.sqrt(3.0) * SIGMA < found.high
@@ -43,8 +43,8 @@ def test_visits_tell_the_noise_whatever_the_model(rng: np.random.Generator, time
 def test_a_few_wrong_visits_do_not_set_the_floor(rng: np.random.Generator) -> None:
     data, error = visited(rng, 2)
     error[:, :20] += 2e-3 * rng.normal(size=(3, 20, 3))
-    found = revisits(data, error)
-    assert found is not None
+    found = floor_of(data, error, np.nan, 10.0)
+    assert found.source == REPEATS
     assert_allclose(found.value, 1e3 * np.sqrt(3.0) * SIGMA, rtol=0.12)
 
 
@@ -101,3 +101,5 @@ def test_a_column_counts_more_than_the_option(rng: np.random.Generator) -> None:
     assert_allclose(kept.columns["u95"], 3e-5)
     assert "column u95_mm is used" in kept.notices[-1]
     assert declared(bare, np.nan) is None
+    assert np.isnan(instrument_noise(bare))
+    assert_allclose(instrument_noise(kept), 3e-5 / 1.959964, rtol=1e-6)  # of a coordinate

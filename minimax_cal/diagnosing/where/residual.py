@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import qr
 
+from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 
 NO_FIT: Array = np.zeros((0, 0, 0, 0))
@@ -105,17 +105,6 @@ def unfollowed(rows: Array, basis: Array, spread: Array, middle: Array) -> Array
     turned = np.swapaxes(vector, 1, 2) @ np.linalg.solve(factor, rows[..., None])
     stretch = 1.0 / np.sqrt(np.maximum(value, 0.1))  # a pose the fit has all but taken tells little
     return np.asarray((factor @ vector @ (stretch[..., None] * turned))[..., 0])
-
-
-def orthonormal(columns: Array, least: float = 1e-9) -> Array:
-    """Orthonormal basis of the columns (N, p): (N, rank)."""
-    length = np.linalg.norm(columns, axis=0)
-    columns = columns[:, length > 0.0] / length[length > 0.0]
-    if not columns.shape[1]:
-        return columns
-    basis, triangle, _ = qr(columns, mode="economic", pivoting=True, check_finite=False)
-    size = np.abs(np.diag(triangle))
-    return np.asarray(basis[:, : len(size)][:, size > least * size[0]])
 
 
 def flat_of(rows: Array) -> Array:
