@@ -87,7 +87,7 @@ def turns_by_angle(term: Term, scene: Scene) -> bool:
 
 
 def closes_enough(sure: Sequence[Finding], ladder: Ladder, rest: Remainder) -> bool:
-    """Whether what is established closes half of what groups left out show to be predictable."""
+    """Whether a model with something established closes half of what is predictable by groups."""
     if rest.predictable_mm**2 <= WORTH * rest.unpredictable_mm**2:
         return True
     closed = closed_by(ladder) if sure else 0.0
