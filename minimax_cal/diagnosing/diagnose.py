@@ -112,7 +112,8 @@ def diagnose(
     held, notices = held_out(raw, holdout, seed, holdout_by)
     if not held.any():
         raise DataError(
-            f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen"
+            f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen: "
+            "measure more poses, or hold out more (holdout)"
         )
     notices = (*notices, *unplaced(raw, ~held))
     raw = stationed(robot, raw, ~held)
