@@ -25,7 +25,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import ENOUGH, EXACT, HELPED, STRUCTURE
+from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.periodogram import in_company
 from minimax_cal.evidence.selection import Choice
@@ -35,7 +35,6 @@ from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
-from minimax_cal.robots.robot import Robot
 
 FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
@@ -121,14 +120,13 @@ def believed(causes: Causes) -> list[Finding]:
 def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes) -> bool:
     """Whether an effect is a best guess that is in no model.
 
-    Names that are one must help the fifths that they were sought without, and none is a wave by
+    Names that are one must help the fifths without which they were sought, and none is a wave by
     itself.  terms: of the effect, every: of all that were found with it.
     """
-    robot = causes.library.scene.robot
-    return causes.wary and (causes.met > HELPED or lone(terms, every, robot))
+    return causes.wary and (causes.met > 1.0 or lone(terms, every, causes.library.scene))
 
 
-def lone(terms: Sequence[Term], every: Sequence[Term], robot: Robot) -> bool:
+def lone(terms: Sequence[Term], every: Sequence[Term], scene: Scene) -> bool:
     """Whether it is waves of a joint that no gear tells: neither its ratio, nor other lines.
 
     Among thousands of frequencies one fits a curve that has no name, and meets new poses no better.
@@ -138,7 +136,8 @@ def lone(terms: Sequence[Term], every: Sequence[Term], robot: Robot) -> bool:
         return False
     lines = [(term.place, term.choice["turns"]) for term in every if term.effect == effect]
     own, others = ([t for at, t in lines if (at == place) is here] for here in (True, False))
-    return not in_company(float(robot.ratio[joint_of(place)]), own, others)
+    joint = joint_of(place)
+    return not in_company(float(scene.robot.ratio[joint]), scene.q[joint], own, others)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:

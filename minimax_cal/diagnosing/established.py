@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from minimax_cal.evidence.limits import (
     SAME,
     WEAK,
 )
-from minimax_cal.evidence.noise import remaining
+from minimax_cal.evidence.noise import identified, remaining
 from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -40,10 +40,9 @@ UNASKED = float("nan")  # how often an effect is found again where poses are too
 class Again:
     """What the search tells that is made anew without each fifth of the groups.
 
-    findings: each with how often it was found again.  met: square of what those found often leave
-    of the fifths without which they were sought, over that of geometry alone; but for the one that
-    speaks most against them, which may hold what alone tells a parameter.  NaN where poses are too
-    few to ask.
+    findings: each with how often it was found again.  met: square of what effects leave of the
+    fifths without which they were sought, over that of geometry alone; each row counts as the rest
+    of the poses tells it.  NaN where poses are too few to ask.
     """
 
     findings: tuple[Finding, ...]
@@ -79,28 +78,30 @@ def judged_again(
         )
         for one, times in zip(findings, known, strict=True)
     ]
-    keys = {found.term.key for found in often(again)}
-    told = np.array([predicted(choice, keys) for choice in choices])
-    least = int(np.argmax(told[:, 1] - told[:, 0]))
-    alone, beside = np.delete(told, least, axis=0).sum(axis=0)
+    alone, beside = np.sum([predicted(choice) for choice in choices], axis=0)
     return Again(tuple(again), float(beside / max(alone, 1e-300)) if enough else UNASKED)
 
 
-def predicted(choice: Choice, keys: Collection[tuple[str, str]]) -> Array:
+def predicted(choice: Choice) -> Array:
     """(2,) squares of what geometry, and with it effects, leave of rows that were not kept [m^2].
 
-    keys: of the effects that count, of those chosen on the rows that were.
+    Rows count by their variance over that of what is left of them: what the rows that were kept do
+    not tell of another, the one end of a joint, is no test.
     """
     lib = choice.library
-    weight = choice.noise.weights(lib.rows) * lib.products.kept
-    moved = np.zeros(len(weight))
-    for one, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
-        if one.key in keys:
-            moved += lib.columns[:, one.main] @ value
-    none = np.zeros((len(weight), 0))
-    errors = [replace(lib.rows, error=error) for error in (lib.rows.error, lib.rows.error - moved)]
-    left = [remaining(rows, weight, none)[~lib.products.kept] for rows in errors]
-    return np.array([one @ one for one in left])
+    rows, kept = lib.rows, lib.products.kept.astype(bool)
+    every, none = choice.noise.weights(rows), np.zeros((len(kept), 0))
+    values = [value for value, _ in choice.estimates]
+    moved = choice.known @ np.concatenate([*values, np.zeros(0)])
+    left = [
+        remaining(replace(rows, error=error), every * kept, none)[~kept]
+        for error in (rows.error, rows.error - moved)
+    ]
+    columns = np.concatenate([rows.basis, choice.known], axis=1)
+    told = columns[kept] * every[kept, None]
+    unit = columns[~kept] @ identified(columns[kept].T @ told)
+    share = 1.0 / (1.0 + every[~kept] * (unit**2).sum(axis=1))
+    return np.array([share @ one**2 for one in left])
 
 
 def often(findings: Sequence[Finding]) -> list[Finding]:

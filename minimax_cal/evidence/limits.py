@@ -40,9 +40,6 @@ ASKED = 3  # parts at least that can show an effect, or nothing is said of it
 FIRM = 1.0  # share of the parts without which an effect is found again, to be established
 WEAK = 0.8  # the same, for what is found less often not to be in the model (study: with 0.5 two of
 # four models that met new poses worse than geometry held such an effect)
-HELPED = 0.96  # of the square that geometry leaves of fifths: what names sought without them may,
-# to be in the model beside something unknown (study: above it new poses are met at 0.99 of
-# geometry's RMS in the mean of 53 cases, four of them 15 to 22 % worse; at 0.94 in the 42 before)
 DWARFED = 0.05  # of a larger effect's lambda, both driven by the time or both by the way: below it
 # an effect may be what the larger one's law lacks (study: growth of two time constants, 0.01, 0.04)
 

@@ -62,16 +62,23 @@ def strongest_lines(
     return [*((term, tried_near) for term in near), *((term, tried) for term in free)]
 
 
-def in_company(ratio: float, own: Sequence[float], others: Sequence[float]) -> bool:
+def in_company(ratio: float, q: Array, own: Sequence[float], others: Sequence[float]) -> bool:
     """Whether some line of a joint is where its gear's ratio tells, or of a kind with another line.
 
-    ratio: of the gear, NaN untold.  own, others: waves a turn of lines at the joint, and elsewhere.
+    To half of what the joint's sweep resolves.  ratio: of the gear, NaN untold.  q: (m,) its
+    angles.  own, others: waves a turn of lines at the joint, and elsewhere.
     """
+    loose = 0.5 / sweep(q)
     for number, turns in enumerate(own):
         near = bands(abs(ratio)) or alike([*others, *own[:number], *own[number + 1 :]])
-        if any(low <= turns <= high for low, high in near):
+        if any(low - loose <= turns <= high + loose for low, high in near):
             return True
     return False
+
+
+def sweep(q: Array) -> float:
+    """Of angles (m,), in turns; a wave is resolved from another that makes one more in it."""
+    return max(float(np.ptp(q)) / (2.0 * np.pi), 0.1)
 
 
 def bands(ratio: float) -> list[tuple[float, float]]:
@@ -103,18 +110,13 @@ class Line:
     score: Array
     size: Array
 
-    @property
-    def sweep(self) -> float:
-        """In turns; a wave is resolved from another that makes one more in it."""
-        return max(float(np.ptp(self.q)) / (2.0 * np.pi), 0.1)
-
     def gain(self, turns: Array) -> Array:
         """(f,) by equally spaced waves a turn."""
         return power(*sums(turns, self.q, self.score, self.size))
 
     def strongest(self, low: float, high: float) -> tuple[float, float]:
         """The strongest of a band, and the number of independent frequencies in it."""
-        step = 1.0 / (DENSITY * self.sweep)
+        step = 1.0 / (DENSITY * sweep(self.q))
         turns = np.arange(low, high + step, step)
         near = turns[int(np.argmax(self.gain(turns)))] + step * np.linspace(-1.0, 1.0, 41)
         return float(near[int(np.argmax(self.gain(near)))]), len(turns) / DENSITY * 2.0
@@ -131,7 +133,7 @@ class Line:
         more = -whole
         for half in (low, ~low):
             own = Line(self.q[half], self.score[half], self.size[half])
-            near = turns + np.linspace(-1.0, 1.0, 41) / own.sweep
+            near = turns + np.linspace(-1.0, 1.0, 41) / sweep(own.q)
             more += float(own.gain(near).max())
         return bool(chdtrc(4, more) > UNSTEADY or more < apart * whole)
 

@@ -34,7 +34,7 @@ def test_a_line_by_itself_is_taken_where_nothing_else_is_left(
     (one,) = causes.effects
     assert one.term.key == ("gear_ripple", "J2")
     assert not causes.wary
-    assert lone(one.terms, one.terms, made.robot)
+    assert lone(one.terms, one.terms, made.scene)
     assert [t.key for t in with_maps(made, causes, silent)[1].last.terms] == [one.term.key]
 
 
@@ -47,9 +47,9 @@ def test_a_line_by_itself_is_not_taken_where_something_unknown_is_left(
     assert spoken.effects == ladder.last.terms == ()
     one = causes.effects[0].term
     pair = (one, replace(one, choice={"turns": 2.0 * one.choice["turns"]}))
-    assert not lone(pair, pair, made.robot)
+    assert not lone(pair, pair, made.scene)
     play = (replace(one, effect="backlash", choice={}),)
-    assert not lone(play, play, made.robot)
+    assert not lone(play, play, made.scene)
 
 
 @pytest.mark.parametrize(("again", "wary"), [(1.0, False), (0.6, True), (np.nan, False)])
@@ -85,10 +85,37 @@ def test_what_is_sought_anew_meets_its_fifth(ripple: tuple[Study, Causes]) -> No
     rows = library.rows
     mine = np.repeat(part, len(rows.error) // made.data.poses)
     root = np.sqrt(choice.noise.weights(rows))[:, None]
+    wide = np.concatenate([rows.basis, choice.known], axis=1)
+    back = np.linalg.pinv((wide * root)[~mine])
+    leverage = (((wide * root)[mine] @ back) ** 2).sum(axis=1)
     expected = []
-    for columns in (rows.basis, np.concatenate([rows.basis, choice.known], axis=1)):
+    for columns in (rows.basis, wide):
         fit = np.linalg.lstsq((columns * root)[~mine], (rows.error * root[:, 0])[~mine])[0]
-        expected.append(float(((rows.error - columns @ fit)[mine] ** 2).sum()))
-    assert_allclose(predicted(choice, {("gear_ripple", "J2")}), expected, rtol=1e-6)
-    assert_allclose(predicted(choice, {("backlash", "J2")}), [expected[0]] * 2, rtol=1e-6)
+        left = (rows.error - columns @ fit)[mine]
+        expected.append(float((left**2 / (1.0 + leverage)).sum()))
+    assert_allclose(predicted(choice), expected, rtol=1e-6)
     assert causes.met < 0.5
+
+
+def test_rows_that_others_do_not_tell_are_no_test(
+    ripple: tuple[Study, Causes], rng: np.random.Generator
+) -> None:
+    """An error of theirs alone, however large, is not laid at the door of what was named."""
+    made, causes = ripple
+    part = np.arange(made.data.poses) % 5 == 0
+    choice = select(causes.library.only(~part))
+    rows = choice.library.rows
+    mine = np.repeat(part, len(rows.error) // made.data.poses)
+    known = np.concatenate([rows.basis, choice.known, rows.error[:, None]], axis=1)
+    weight = choice.noise.weights(rows)[~mine, None] ** 0.5
+    faint = rng.normal(size=(~mine).sum())[:, None] * weight
+    faint -= known[~mine] * weight @ np.linalg.lstsq(known[~mine] * weight, faint)[0]
+    alone = np.zeros(len(mine))
+    alone[np.flatnonzero(mine)[:3]] = 1.0
+    shown = alone.copy()  # by the other rows, too, but each ten thousand times less
+    shown[~mine] = 1e-4 * (faint / weight)[:, 0]
+    basis = np.concatenate([rows.basis, shown[:, None]], axis=1)
+    for off, kept in ((0.0, True), (0.01, True), (1.0, False)):  # [m], and in sigmas 500, 50,000
+        spoilt = replace(rows, error=rows.error + off * alone, basis=basis)
+        after = predicted(replace(choice, library=replace(choice.library, rows=spoilt)))
+        assert np.allclose(after, predicted(choice), rtol=0.06) == kept

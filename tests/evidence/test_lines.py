@@ -148,21 +148,24 @@ def test_gears_of_a_kind_are_sought_at_their_ratio(
 
 
 @pytest.mark.parametrize(
-    ("ratio", "own", "others", "kept"),
+    ("ratio", "own", "others", "turned", "kept"),
     [
-        (np.nan, [33.3], [], False),
-        (33.0, [33.3], [], True),
-        (-33.0, [66.0], [], True),
-        (100.0, [33.3], [33.3], False),  # a ratio that is told is the joint's own
-        (np.nan, [33.3], [66.2], True),
-        (np.nan, [33.3, 66.2], [], True),
-        (np.nan, [33.3, 75.0], [20.0], False),
+        (np.nan, [33.3], [], 1.0, False),
+        (33.0, [33.3], [], 1.0, True),
+        (-33.0, [66.0], [], 1.0, True),
+        (100.0, [33.3], [33.3], 1.0, False),  # a ratio that is told is the joint's own
+        (np.nan, [33.3], [66.2], 1.0, True),
+        (np.nan, [33.3, 66.2], [], 1.0, True),
+        (np.nan, [33.3, 75.0], [20.0], 1.0, False),
+        (np.nan, [33.3], [36.5], 1.0, False),
+        (np.nan, [33.3], [36.5], 0.25, True),  # whose sweep resolves no such difference
     ],
 )
 def test_a_line_has_a_ratio_or_another_line_for_company(
-    ratio: float, own: list[float], others: list[float], kept: bool
+    ratio: float, own: list[float], others: list[float], turned: float, kept: bool
 ) -> None:
-    assert in_company(ratio, own, others) == kept
+    q = np.linspace(0.0, 2.0 * np.pi * turned, 50)
+    assert in_company(ratio, q, own, others) == kept
 
 
 @pytest.mark.parametrize("strong", [20.0, 2000.0])
