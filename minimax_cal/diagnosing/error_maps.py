@@ -134,10 +134,11 @@ def fine_waves(fit: Joint, left: Left) -> list[Found]:
         j for j in sweeping(fit.study.scene) if f"J{j + 1}" not in {term.place for term in heard}
     ]
     waiting = [line for j in silent for line in strongest(fit, left, j, heard)]
+    asked = 1 if heard else len(silent)  # each by itself, where another has a line
     at, out = begun(left), []
     for block, turns, tries in waiting:
         wide = at.with_block(block)
-        chance = len(silent) * tries * gain_chance(at, wide, left.group)
+        chance = asked * tries * gain_chance(at, wide, left.group)
         if chance < LEVEL:
             out.append(Found(block, chance, Term(GEAR_RIPPLE.name, block.place, {"turns": turns})))
             at = wide

@@ -13,6 +13,7 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
+from minimax_cal.evidence.periodogram import is_expected
 from minimax_cal.evidence.products import LEAST, At, within
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
@@ -200,7 +201,10 @@ class Bench:
 
     def looked_at(self, c: Candidate) -> float:
         """Candidates of its kind, over the share of the level that the kind has."""
-        return c.tries / LINES if c.is_line else self.tries / (1.0 - 2.0 * LINES)
+        if not c.is_line:
+            return self.tries / (1.0 - 2.0 * LINES)
+        heard = [one.term for one in self.chosen if one.is_line]
+        return c.tries / (1.0 if is_expected(self.library.scene, c.term, heard) else LINES)
 
     def improbable(self, one: Added, level: float) -> bool:
         """Whether a gain is less probable than a level, by all rows and by groups of them."""

@@ -16,7 +16,8 @@ NEAR, CONTENDERS = 20.0, 3  # candidates within so much evidence, at most so man
 TUNINGS = 3  # rounds of a finer search
 MOST = 30  # effects: the IRB 120 has about twenty
 
-LINES = 0.1  # share of the level for lines near a told ratio, and as much for all other lines
+LINES = 0.1  # share of the level for lines near a told ratio, and as much for all other lines; near
+# a ratio each joint has the level to itself once another has a line: on a sound arm none has
 UNSTEADY = 1e-3  # chance that halves of a joint's sweep differ so much in a line
 APART = 0.1  # of a line's gain, by which they may differ however sure they are: those of gears do
 # by less than 0.09 on the Meca500 and the IRB 120, a curve's by 0.1 to 1.1 on the UR10

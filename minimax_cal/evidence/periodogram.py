@@ -12,12 +12,13 @@ from minimax_cal.evidence.limits import APART, UNSTEADY
 from minimax_cal.evidence.noise import Noise, Rows, remaining
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
-from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import Term
 
 SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has fewer teeth
 DENSITY = 4.0  # frequencies tried for each one that is independent
 TIMES = (1, 2)  # waves of a gear in each turn of its motor
+SEVERAL = 2.0  # a line is never found at once
 BESIDE = 1.0  # a strain wave gear turns by one more or less than its ratio tells
 
 
@@ -34,32 +35,50 @@ def strongest_lines(
 
     A ratio is told by the robot, else by lines of other joints: arms have few kinds of gears.
 
-    With the number of independent frequencies tried of such lines at all joints.  known: (N, q)
-    columns that are fitted already.  kept: (N,) rows that count, None for all.  heard: lines that
-    were found.
+    With the number of independent frequencies tried of such lines, at all joints; near ratios at
+    the joint alone once another has a line: each gear of an arm whose gears err is asked for by
+    itself.  known: (N, q) columns that are fitted already.  kept: (N,) rows that count, None for
+    all.  heard: lines that were found.
     """
     weight = noise.weights(rows) * (1.0 if kept is None else kept)
     pull = weight * remaining(rows, weight, known)
     arms = rows.of(scene.jacobian)
-    near: list[Term] = []
+    near: list[tuple[Term, float]] = []
     free: list[Term] = []
-    tried_near, tried = 2.0, 2.0  # a line is never found at once
+    tried_near, tried = SEVERAL, SEVERAL
     for j in sweeping(scene):
         score = (arms[:, j] * pull).reshape(scene.poses, -1).sum(axis=1)
         size = (arms[:, j] ** 2 * weight).reshape(scene.poses, -1).sum(axis=1)
         line, place = Line(scene.q[j], score, size), f"J{j + 1}"
         told = bands(abs(float(scene.robot.ratio[j])))
-        others = [term.choice["turns"] for term in heard if term.place != place]
-        for low, high in told or alike(others):
-            turns, tries = line.strongest(low, high)
-            tried_near += tries
+        others = elsewhere(place, heard)
+        found = [line.strongest(*band) for band in told or alike(others)]
+        here = sum(tries for _, tries in found)
+        tried_near += here
+        for turns, _ in found:
             if told or line.stays(turns):
-                near.append(Term("gear_ripple", place, {"turns": turns}))
+                own = SEVERAL + here if others else 0.0
+                near.append((Term("gear_ripple", place, {"turns": turns}), own))
         turns, tries = line.strongest(SLOWEST, FASTEST)
         tried += tries
         if line.stays(turns):
             free.append(Term("gear_ripple", place, {"turns": turns}))
-    return [*((term, tried_near) for term in near), *((term, tried) for term in free)]
+    beside = [(term, own or tried_near) for term, own in near]
+    return [*beside, *((term, tried) for term in free)]
+
+
+def elsewhere(place: str, heard: Sequence[Term]) -> list[float]:
+    """Waves a turn of lines at other joints."""
+    return [term.choice["turns"] for term in heard if term.place != place]
+
+
+def is_expected(scene: Scene, line: Term, heard: Sequence[Term]) -> bool:
+    """Whether a line is where its gear's is, on an arm of which another gear has one."""
+    joint, others = joint_of(line.place), elsewhere(line.place, heard)
+    near = in_company(
+        float(scene.robot.ratio[joint]), scene.q[joint], [line.choice["turns"]], others
+    )
+    return bool(others) and near
 
 
 def in_company(ratio: float, q: Array, own: Sequence[float], others: Sequence[float]) -> bool:
