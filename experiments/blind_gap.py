@@ -194,6 +194,7 @@ def diagnosis(folder: Path, case: Case) -> tuple[Row, float]:
             folder / gap_cases.DATA,
             seed=case.seed,
             exclude=case.delete,
+            quick=True,  # what is claimed of other poses is not asked here
         )
         said: Row = found.to_dict()
     except Exception as error:  # a crash is an answer too, and a bad one
@@ -458,7 +459,7 @@ def headline(rows: Sequence[Row], all_criteria: Sequence[Criterion]) -> Table:
     lines = [criterion.line() for criterion in all_criteria]
     for text, values, middle, limit in (
         ("one effect, lambda >= 50: mean size of the set", sizes, np.mean, 2.0),
-        ("median seconds of a diagnosis", times, np.median, 0.5),
+        ("median seconds of a quick diagnosis", times, np.median, 0.5),
     ):
         value, low, high = spread(values, middle)
         kept = value <= limit if limit == 2.0 else value < limit
