@@ -430,7 +430,7 @@ def test_a_run_shows_the_diagnosis_files_only(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(blind_gap, "resemblance", resemblance)
     case = Case("irb2600", "single", (Cause(*GAIN, 1000.0),), poses=60, seed=8)
     row = blind_gap.run(case)
-    assert given == [("robot.json", "data.csv", {"seed": 8, "exclude": ()})]
+    assert given == [("robot.json", "data.csv", {"seed": 8, "exclude": (), "quick": True})]
     assert row["trouble"] == ""
     assert (row["match"], row["rho2"], row["rival"]) == ("exact", 0.7, list(J2))
     assert_allclose(row["telling"], 300.0, rtol=1e-6)
