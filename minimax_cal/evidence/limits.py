@@ -27,7 +27,8 @@ UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed a
 
 # ---- what else it could be -----------------------------------------------------------------------
 
-BAND = 12.0  # of evidence: what fits worse by less may be the truth (blind_gap: in all sets)
+BAND = 12.0  # of evidence: what fits worse by less may be the truth (blind_gap: in all sets,
+# lambda 50 and more)
 LIGHT = 4.0  # of fit, in the same sense, parameters charged lightly
 ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
 
