@@ -204,11 +204,13 @@ def diagnosis(folder: Path, case: Case) -> tuple[Row, float]:
 
 def rivals(case: Case, truth: Truth, robot: mc.Robot, data: mc.Measurements) -> Row:
     """How alike the nearest rival in the library is to each cause (of the least telling first)."""
-    if case.condition not in (*FITTED, "outside", "wrong_law", "background"):
+    if case.condition in ("none", "fault"):
         return {}
     found = []
     for name, power, part in zip(truth.truth, truth.powers, truth.parts, strict=True):
-        rival, rho2 = nearest(name, resemblance(robot, data, part))
+        alike = resemblance(robot, data, part)
+        alike = {other: rho2 for other, rho2 in alike.items() if other[0] not in case.delete}
+        rival, rho2 = nearest(name, alike)
         found.append((power * (1.0 - rho2), rho2, rival))
     telling, rho2, rival = min(found)
     return {"telling": telling, "rho2": rho2, "rival": list(rival)}
@@ -426,6 +428,8 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         Criterion("  all of lambda >= 50: unknown", "", outside, unknown),
         Criterion("true effect deleted: named for sure", "sure without the truth", of("deleted"),
                   lambda r: r["sure"], 0.15, False),
+        Criterion("  of these, lambda (1 - rho^2) >= 25 of the best other: named for sure", "",
+                  [r for r in of("deleted") if r["telling"] >= SEPARABLE], lambda r: r["sure"]),
         Criterion("  unknown", "", of("deleted"), unknown),
         Criterion("two effects exactly right, each lambda (1 - rho^2) >= 25", "pair", told,
                   lambda r: r["all_right"], 0.90),

@@ -27,7 +27,7 @@ from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library, library
 from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import in_company
+from minimax_cal.evidence.periodogram import elsewhere, in_company
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
@@ -134,10 +134,10 @@ def lone(terms: Sequence[Term], every: Sequence[Term], scene: Scene) -> bool:
     effect, place = terms[0].key
     if effect != GEAR_RIPPLE.name:
         return False
-    lines = [(term.place, term.choice["turns"]) for term in every if term.effect == effect]
-    own, others = ([t for at, t in lines if (at == place) is here] for here in (True, False))
-    joint = joint_of(place)
-    return not in_company(float(scene.robot.ratio[joint]), scene.q[joint], own, others)
+    lines = [term for term in every if term.effect == effect]
+    own = [line.choice["turns"] for line in lines if line.place == place]
+    ratio, q = scene.robot.ratio[joint_of(place)], scene.q[joint_of(place)]
+    return not in_company(float(ratio), q, own, elsewhere(place, lines))
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:

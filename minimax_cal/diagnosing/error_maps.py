@@ -29,7 +29,7 @@ from minimax_cal.diagnosing.remainder import (
 )
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import NEARLY
-from minimax_cal.evidence.periodogram import Line, alike, bands
+from minimax_cal.evidence.periodogram import Line, elsewhere, expected
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
 from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
@@ -154,17 +154,17 @@ def strongest(
     arm, at = left.arm[:, :, joint], begun(left)
     score, size = ((arm * other).sum(axis=1) / at.variance for other in (at.error, arm))
     line = Line(left.q[:, joint], score, size)
-    told = bands(abs(float(fit.study.scene.robot.ratio[joint])))
-    others = told or alike([term.choice["turns"] for term in heard])
-    if not others:
+    place = f"J{joint + 1}"
+    near = expected(float(fit.study.scene.robot.ratio[joint]), elsewhere(place, heard))
+    if not near:
         return []
-    found = [line.strongest(*band) for band in others]
+    found = [line.strongest(*band) for band in near]
     gains = [float(line.gain(turns + np.array([0.0, 1e-3]))[0]) for turns, _ in found]
     turns = found[int(np.argmax(gains))][0]
     if not line.stays(turns, NEARLY):
         return []
     wave = np.stack([f(turns * left.q[:, joint]) for f in (np.cos, np.sin)], axis=1)
-    block = Block(f"J{joint + 1}", arm[:, :, None] * wave[:, None], np.full((1, 2), USUAL))
+    block = Block(place, arm[:, :, None] * wave[:, None], np.full((1, 2), USUAL))
     return [(block, turns, sum(tries for _, tries in found))]
 
 

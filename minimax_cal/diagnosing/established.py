@@ -11,10 +11,11 @@ from scipy.stats import chi2
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import bench
+from minimax_cal.evidence.bench import Added, Bench, bench
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import (
     AGAIN,
+    ALONE,
     ASKED,
     CERTAIN,
     DIFFER,
@@ -67,8 +68,10 @@ def judged_again(
         choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
         choices.append(choice)
         for one, times in zip(findings, known, strict=True):
-            found = is_found(one, choice, whole)
-            times += [found] if found or shows(one, choice, whole) else []
+            if is_found(one, choice, whole):
+                times.append(True)
+            elif shows(one, choice, whole):
+                times.append(is_uncontested(one, choice, whole))
     enough = rich >= ASKED
     again = [
         replace(
@@ -190,21 +193,44 @@ def is_rival(finding: Finding, choice: Choice) -> bool:
     )
 
 
+def is_uncontested(finding: Finding, choice: Choice, whole: Choice) -> bool:
+    """Whether a part that names nothing else tells of an effect, asked for by itself, as before.
+
+    To search the whole library costs power, which a part lacks for a faint effect; that it does not
+    come first there speaks against its name only if another does.
+    """
+    table, one = bench_without(finding, choice, whole), fit_of(finding, whole)
+    if one is None or len(table.chosen) < len(choice.chosen):
+        return False
+    found = table.added(one.candidate)
+    sure = table.chance(found, table.wide(found)) < ALONE
+    return sure and agree((found.value, found.sigma), (one.value, one.sigma))
+
+
 def shows(finding: Finding, choice: Choice, whole: Choice) -> bool:
     """Whether a part, as noisy as it is, has enough of an effect as large as before.
 
     One that holds less than half of what all poses show of it, and little, is no test of its name:
     the poses that it lacks, the end of a joint, are those that tell.
     """
-    term = finding.term
-    one = next((fit for fit in whole.fits if fit.candidate.term == term), None)
+    one = fit_of(finding, whole)
     if one is None:
         return True
-    before = {candidate.key for candidate in whole.chosen} - {term.key}
-    table = bench(choice.library, [c for c in choice.chosen if c.key in before])
+    table = bench_without(finding, choice, whole)
     there = replace(one, ratio=table.settings.ratios[0], variance=choice.noise.variance)
     size, _ = table.likeness(there, one.candidate)
     return size > min(ENOUGH, HALF * finding.size)
+
+
+def fit_of(finding: Finding, whole: Choice) -> Added | None:
+    """An effect as it was found, beside the others; of several lines the strongest."""
+    return next((fit for fit in whole.fits if fit.candidate.term == finding.term), None)
+
+
+def bench_without(finding: Finding, choice: Choice, whole: Choice) -> Bench:
+    """The bench of a part, beside those effects alone that all poses have besides one."""
+    before = {candidate.key for candidate in whole.chosen} - {finding.term.key}
+    return bench(choice.library, [c for c in choice.chosen if c.key in before])
 
 
 def estimates_of(finding: Finding, choice: Choice) -> dict[str, tuple[Array, Array]]:

@@ -189,15 +189,19 @@ class Bench:
             for i in shown.tolist()
         ]
 
-    def p_value(self, one: Added, wide: float = 1.0) -> float:
-        """Probability that a candidate without effect gains so much, the best of all tries.
+    def chance(self, one: Added, wide: float = 1.0) -> float:
+        """Probability that this candidate, without effect, gains so much; no other was tried.
 
         wide: by how much the rows are noisier along it than all together, as `inflation`.
         """
         d = len(one.candidate.main) + one.candidate.shapes
         free = max(self.dof - d, 1)
         ratio = np.expm1(min(one.gain / max(self.dof, 1), 50.0)) * free / d / wide
-        return float(min(1.0, fdtrc(d, free, ratio) * self.looked_at(one.candidate)))
+        return float(fdtrc(d, free, ratio))
+
+    def p_value(self, one: Added, wide: float = 1.0) -> float:
+        """Probability that a candidate without effect gains so much, the best of all tries."""
+        return min(1.0, self.chance(one, wide) * self.looked_at(one.candidate))
 
     def looked_at(self, c: Candidate) -> float:
         """Candidates of its kind, over the share of the level that the kind has."""

@@ -43,28 +43,29 @@ def strongest_lines(
     weight = noise.weights(rows) * (1.0 if kept is None else kept)
     pull = weight * remaining(rows, weight, known)
     arms = rows.of(scene.jacobian)
-    near: list[tuple[Term, float]] = []
+    apart: list[tuple[Term, float]] = []
+    near: list[Term] = []
     free: list[Term] = []
     tried_near, tried = SEVERAL, SEVERAL
     for j in sweeping(scene):
         score = (arms[:, j] * pull).reshape(scene.poses, -1).sum(axis=1)
         size = (arms[:, j] ** 2 * weight).reshape(scene.poses, -1).sum(axis=1)
         line, place = Line(scene.q[j], score, size), f"J{j + 1}"
-        told = bands(abs(float(scene.robot.ratio[j])))
-        others = elsewhere(place, heard)
-        found = [line.strongest(*band) for band in told or alike(others)]
+        ratio, others = float(scene.robot.ratio[j]), elsewhere(place, heard)
+        found = [line.strongest(*band) for band in expected(ratio, others)]
         here = sum(tries for _, tries in found)
         tried_near += here
-        for turns, _ in found:
-            if told or line.stays(turns):
-                own = SEVERAL + here if others else 0.0
-                near.append((Term("gear_ripple", place, {"turns": turns}), own))
+        stay = [turns for turns, _ in found if bands(ratio) or line.stays(turns)]
+        lines = [Term("gear_ripple", place, {"turns": turns}) for turns in stay]
+        if others:
+            apart += [(term, SEVERAL + here) for term in lines]
+        else:
+            near += lines
         turns, tries = line.strongest(SLOWEST, FASTEST)
         tried += tries
         if line.stays(turns):
             free.append(Term("gear_ripple", place, {"turns": turns}))
-    beside = [(term, own or tried_near) for term, own in near]
-    return [*beside, *((term, tried) for term in free)]
+    return [*apart, *((term, tried_near) for term in near), *((term, tried) for term in free)]
 
 
 def elsewhere(place: str, heard: Sequence[Term]) -> list[float]:
@@ -84,12 +85,12 @@ def is_expected(scene: Scene, line: Term, heard: Sequence[Term]) -> bool:
 def in_company(ratio: float, q: Array, own: Sequence[float], others: Sequence[float]) -> bool:
     """Whether some line of a joint is where its gear's ratio tells, or of a kind with another line.
 
-    To half of what the joint's sweep resolves.  ratio: of the gear, NaN untold.  q: (m,) its
-    angles.  own, others: waves a turn of lines at the joint, and elsewhere.
+    To half of what the joint's sweep resolves.  q: (m,) its angles.  own, others: waves a turn of
+    lines at the joint, and elsewhere.
     """
     loose = 0.5 / sweep(q)
     for number, turns in enumerate(own):
-        near = bands(abs(ratio)) or alike([*others, *own[:number], *own[number + 1 :]])
+        near = expected(ratio, [*others, *own[:number], *own[number + 1 :]])
         if any(low - loose <= turns <= high + loose for low, high in near):
             return True
     return False
@@ -100,9 +101,18 @@ def sweep(q: Array) -> float:
     return max(float(np.ptp(q)) / (2.0 * np.pi), 0.1)
 
 
+def expected(ratio: float, others: Sequence[float]) -> list[tuple[float, float]]:
+    """Where lines of a joint's gear may be: near its ratio, else where gears of others have theirs.
+
+    ratio: NaN untold.  others: waves a turn of lines that were heard.
+    """
+    return bands(ratio) or alike(others)
+
+
 def bands(ratio: float) -> list[tuple[float, float]]:
-    """Where lines of a gear may be, whose ratio is told; none for NaN."""
-    return [(k * (ratio - BESIDE), k * (ratio + BESIDE)) for k in TIMES if ratio > SLOWEST]
+    """Where lines of a gear may be, whose ratio is told, of either sign; none for NaN."""
+    size = abs(ratio)
+    return [(k * (size - BESIDE), k * (size + BESIDE)) for k in TIMES if size > SLOWEST]
 
 
 def alike(heard: Sequence[float]) -> list[tuple[float, float]]:

@@ -10,6 +10,7 @@ from minimax_cal.diagnosing.established import (
     dwarfs,
     is_found,
     is_rival,
+    is_uncontested,
     laws_there,
     share,
     shows,
@@ -102,6 +103,35 @@ def test_an_effect_is_found_where_its_rival_is_named(geared: tuple[Study, Librar
     assert is_rival(effect, replace(other, library=lib))
     assert is_found(effect, replace(other, library=lib), whole)
     assert not is_found(effect, other, whole)
+
+
+def test_a_part_that_names_nothing_else_is_asked_for_the_effect_by_itself() -> None:
+    """To come first of a whole library takes more power than to be there."""
+    study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 60.0),), seed=4)))
+    lib = library(study.scene, study.rows)
+    whole = select(lib)
+    effect = replace(named(whole, "gear_error", "J1"), alternatives=())
+    rest = lib.only(np.arange(study.data.poses) % 5 != 0)
+    silent = select(rest, level=1e-15)
+    assert not silent.chosen
+    assert not is_found(effect, silent, whole)
+    assert shows(effect, silent, whole)
+    assert is_uncontested(effect, silent, whole)
+    assert not is_rival(effect, silent)
+    (fit,) = whole.fits
+    twice = replace(whole)
+    object.__setattr__(twice, "fits", (replace(fit, value=2.0 * fit.value),))
+    assert not is_uncontested(effect, silent, twice)  # its size is not what all poses tell
+    candidates = tuple(c for c in lib.candidates if c.term.effect != "gear_error")
+    other = select(replace(rest, candidates=candidates))
+    assert other.chosen
+    assert not is_uncontested(effect, replace(other, library=rest), whole)  # another name is there
+    rng = np.random.default_rng(0)
+    flipped = study.rows.error * rng.choice([-1.0, 1.0], len(study.rows.error))
+    bare = library(study.scene, replace(study.rows, error=flipped))
+    nothing = select(bare, level=1e-15)
+    assert not nothing.chosen
+    assert not is_uncontested(effect, nothing, whole)  # points tell nothing of it
 
 
 def test_an_effect_that_shares_its_joint_with_another_variant_need_not_agree(
