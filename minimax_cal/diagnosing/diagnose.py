@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from minimax_cal.diagnosing.causes import (
     fault_findings,
     merged,
     whole,
+    with_jumps,
 )
 from minimax_cal.diagnosing.error_maps import error_maps
 from minimax_cal.diagnosing.folds import beyond_of
@@ -47,6 +48,7 @@ from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
+from minimax_cal.fitting.crossed import FEW
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.fitting.solve import Solved, fit_cell
@@ -64,7 +66,7 @@ from minimax_cal.measuring.faults import (
 )
 from minimax_cal.measuring.faults.fault import listed
 from minimax_cal.measuring.floor import Floor, floor_of, instrument_noise
-from minimax_cal.measuring.grouping import held_out, split, with_groups
+from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -73,6 +75,7 @@ from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.robots.robot import Robot, load_robot
 
 NOT_ASKED = Beyond(reason="not asked for")
+EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
 
 
 def diagnose(
@@ -115,10 +118,19 @@ def diagnose(
             f"{given.source}: no pose is held out; a diagnosis needs some that no fit has seen: "
             "measure more poses, or hold out more (holdout)"
         )
-    notices = (*notices, *unplaced(raw, ~held))
+    notices = (*notices, *few_judges(raw.take(held)), *unplaced(raw, ~held))
     raw = stationed(robot, raw, ~held)
     with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
         return examined(Asked(robot, raw, held, options), notices, progress, began)
+
+
+def few_judges(held: Measurements) -> Iterator[str]:
+    """That few poses judge.  held: those held out."""
+    if len(np.unique(clusters(held))) < FEW:
+        yield (
+            f"only {held.poses} poses are held out: what is said of new poses rests on these; "
+            "calibrate with the effects found judges every pose by a fit without it"
+        )
 
 
 @dataclass(frozen=True)
@@ -166,7 +178,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
-    findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.value)
+    findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     progress("remainder")
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes, study, ladder, rest)
@@ -378,4 +390,6 @@ def resemblance(
     study = studied(robot, train, fit_cell(robot, train, SUM, silent))
     rows = np.isin(data.line, train.line)
     moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
-    return resemblances(library(study.scene, study.rows), moved)
+    clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
+    study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
+    return resemblances(with_jumps(library(study.scene, study.rows), study), moved)

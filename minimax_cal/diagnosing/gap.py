@@ -88,9 +88,7 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
         for number in waiting:
             terms = effects[number]
             wide = joint(study, (*fits[-1].terms, *terms))
-            told = wide.spared(spared)
-            square, new = (fit.cross_validated(told) for fit in (fits[-1], wide))
-            helps = new < (1.0 - HELPS) * square and wide.no_worse(fits[-1])
+            helps = wide.no_worse(fits[-1]) and tells(fits[-1], wide, wide.spared(spared))
             if helps and not (wary and astray(fits[-1], wide, terms)):
                 fits.append(wide)
                 taken.append(number)
@@ -98,6 +96,17 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
                 refused.append((number, len(taken)))
         waiting = [number for number, before in refused if mapped and before < len(taken)]
     return Ladder(tuple(fits), tuple(taken), tuple(spared))
+
+
+def tells(before: Joint, wide: Joint, folds: Sequence[Array]) -> bool:
+    """Whether groups that are left out are met better with more effects.
+
+    All alike, as they are claimed; or weighed as they can be foretold: where groups are clusters
+    few others tell the geometry there, and what it errs by drowns what an effect mends.
+    """
+    alike = [fit.cross_validated(folds) for fit in (before, wide)]
+    weighed = [fit.foretold(folds, wide) for fit in (before, wide)]
+    return any(new < (1.0 - HELPS) * old for old, new in (alike, weighed))
 
 
 def by_size(study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:

@@ -30,6 +30,7 @@ from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.bounded import bounded
+from minimax_cal.solvers.least_squares import solve_normal
 
 PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
 SETTLED = 1e-4  # relative change of the weighed square that ends them
@@ -99,14 +100,34 @@ class Joint:
 
     def cross_validated(self, folds: Sequence[Array]) -> float:
         """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
-        poses, total = self.poses, 0.0
+        total = 0.0
         if len(self.spared(folds)) < len(folds):
             return float("inf")
         for mine in folds:
-            step = step_without(poses, mine)
-            left = poses.error[mine] - np.einsum("mrp,p->mr", poses.jacobian[mine], step)
-            total += float((left**2).sum())
+            total += float((self.left_at(mine) ** 2).sum())
         return total
+
+    def foretold(self, folds: Sequence[Array], known: Joint) -> float:
+        """The same, errors weighed as one that is known foretells them without each fold.
+
+        left' (1 + A C A')^-1 left, C being the covariance of its parameters without the fold, over
+        the variance of a coordinate.  That is left' left - (A' left)' B^-1 (A' left), where B are
+        the products of all poses.  Where a fold alone tells a direction, its errors count little.
+        """
+        poses, total = known.poses, 0.0
+        for mine in folds:
+            left = self.left_at(mine)
+            score = np.einsum("mrp,mr->p", poses.jacobian[mine], left)
+            total += float(
+                (left**2).sum() - score @ solve_normal(poses.bread, score[:, None])[:, 0]
+            )
+        return total
+
+    def left_at(self, fold: Array) -> Array:
+        """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
+        step = step_without(self.poses, fold)
+        told = np.einsum("mrp,p->mr", self.poses.jacobian[fold], step)
+        return np.asarray(self.poses.error[fold] - told)
 
 
 def joint(study: Study, terms: Sequence[Term]) -> Joint:

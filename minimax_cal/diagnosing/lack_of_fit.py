@@ -63,8 +63,10 @@ def probes(scene: Scene) -> Iterator[Probe]:
         if side[j].any() and j in circle:  # teeth wear where a gear works most
             sectors = [side[j], *(side[j] * (scene.q[j] > at) for at in steps(scene.q[j]))]
             yield Probe(f"{name} with its approach and angle", motion, np.array(sectors))
-        if carried or led:
-            yield Probe(f"{name} with its load or last move", motion, np.array([*carried, *led]))
+        if carried:
+            yield Probe(f"{name} with its load", motion, np.array(carried))
+        if led:
+            yield Probe(f"{name} with its last move", motion, np.array(led))
     first = angles[:3]
     wide = [row for i in first for row in circle[i]] + summed(scene, first)
     for axis, letter in enumerate("xyz"):
@@ -79,12 +81,14 @@ def probes(scene: Scene) -> Iterator[Probe]:
         course.append(unit(scene.column("temperature") - ROOM))
     if course:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
-        twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape)), scene.points[None]]
+        twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape))]
+        yield Probe("the base at a steady pace", np.concatenate(twist), np.array(course[:1]))
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
+        yield Probe("the scale with time", scene.points[None], np.array(course))
         yield Probe("the joints with time", scene.jacobian, np.array(course))
     if np.ptp(clock) > 0.0:
         swings = np.array([np.cos(np.pi * k * clock) for k in range(1, SWINGS + 1)])
-        yield Probe("the base to and fro", np.concatenate(twist[:2]), swings[4:])
+        yield Probe("the base to and fro", np.concatenate(twist), swings[4:])
         for j in range(scene.joints):
             yield Probe(f"J{j + 1} to and fro with time", scene.jacobian[j : j + 1], swings)
     yield from at_targets(scene, np.array(course))
@@ -149,11 +153,15 @@ def unit(x: Array) -> Array:
 
 @dataclass(frozen=True)
 class Trace:
-    """p: probability that the rest has nothing of it.  excess: weighed square beyond chance."""
+    """p: probability that the rest has nothing of it.  excess: weighed square beyond chance.
+
+    doubts: whether a name is asked, not the poses in general.
+    """
 
     name: str
     p: float
     excess: float
+    doubts: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +241,23 @@ def doubted(scene: Scene, named: Named) -> Iterator[tuple[str, Array]]:
         yield f"{name} with time", np.array([np.cos(np.pi * k * clock) for k in (1, 2)])
 
 
+def narrowly(scene: Scene, named: Named) -> Iterator[Probe]:
+    """Questions to a name of which few functions tell: what its nearest relatives would leave."""
+    name, since = named.term.label, named.term.choice.get("since")
+    if since is not None:
+        after = (scene.column("clock") >= since).astype(float)[None]
+        for i, target in enumerate(scene.data.target_names):
+            alone = np.zeros((3, *scene.points.shape))
+            alone[:, i] = scene.links.axes
+            yield Probe(f"{target} since {name}", alone, after)
+    if named.joint is not None:
+        motion = scene.jacobian[named.joint : named.joint + 1]
+        for i in turning(scene):
+            if i != named.joint:
+                bare = unit(scene.q[i] - scene.q[i].mean())
+                yield Probe(f"{name} with J{i + 1}", motion, np.array([bare, *wave(scene.q[i], 1)]))
+
+
 def structure(
     scene: Scene, rows: Rows, noise: Noise, known: Array, names: Sequence[Named] = ()
 ) -> tuple[Trace, ...]:
@@ -243,20 +268,21 @@ def structure(
     rest = rest_of(rows, noise, known)
     found = []
     r = rows.weight.shape[1]
-    for probe in probes(scene):
+    wide, narrow = list(probes(scene)), [p for one in names for p in narrowly(scene, one)]
+    for number, probe in enumerate((*wide, *narrow)):
         moved = rows.of(probe.motion) * rest.root[:, None]
         spread = np.repeat(probe.feature.T, r, axis=0)
         features = (moved[:, :, None] * spread[:, None, :]).reshape(len(moved), -1)
-        found.append(Trace(probe.name, *share(features, rest)))
+        found.append(Trace(probe.name, *share(features, rest), doubts=number >= len(wide)))
     for one in names:
         for name, functions in doubted(scene, one):
             spread = np.repeat(functions, r, axis=1) * rest.root
             features = (one.motion[:, None] * spread).reshape(-1, len(rest.root)).T
-            found.append(Trace(name, *share(features, rest)))
+            found.append(Trace(name, *share(features, rest), doubts=True))
         size = one.size(scene, rows)  # a law that is not in proportion to what drives it
         spread = np.repeat([size, size**2], r, axis=1) * rest.root
         found.append(Trace(f"{one.term.label} with its own size",
-                           *share((one.whole * spread).T, rest)))  # fmt: skip
+                           *share((one.whole * spread).T, rest), doubts=True))  # fmt: skip
     found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
     found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
     return tuple(found)
@@ -279,14 +305,16 @@ def chance_of(traces: Sequence[Trace]) -> float:
     """Chance that noise alone shows so much in all traces together, in whatever way they depend.
 
     The Cauchy combination of their chances [Liu and Xie 2020].  Several that each are rare count
-    together; the smallest times their number, by Bonferroni, would count one.  A chance of 1 is of
-    a question that these data cannot be asked.
+    together; the smallest times their number, by Bonferroni, would count one.  Questions to the
+    names weigh together as much as all others: there a law that is in no library shows first.  A
+    chance of 1 is of a question that these data cannot be asked.
     """
-    asked = [trace.p for trace in traces if trace.p < 1.0]
+    asked = [trace for trace in traces if trace.p < 1.0]
+    kinds = [[t.p for t in asked if t.doubts == doubts] for doubts in (False, True)]
     if not asked:
         return 1.0
-    p = np.clip(asked, LEAST, MOST)
-    return float(stats.cauchy.sf(np.mean(stats.cauchy.isf(p))))
+    score = [np.mean(stats.cauchy.isf(np.clip(p, LEAST, MOST))) for p in kinds if p]
+    return float(stats.cauchy.sf(np.mean(score)))
 
 
 def explained(rows: Rows, choice: Choice) -> float:

@@ -35,6 +35,15 @@ def plain() -> mc.Diagnosis:
     return diagnosed(Cause("backlash", "J2", 1000.0))
 
 
+def test_few_poses_that_judge_are_said() -> None:
+    many, robot = diagnosed(Cause("backlash", "J2", 1000.0)), mc.load_robot("irb2600")
+    few = mc.diagnose(robot, mc.simulate(robot, 60, 3, seed=1).data, quick=True)
+    told = [text for text in few.notices if "poses are held out" in text]
+    assert len(told) == 1
+    assert "calibrate with the effects found judges every pose" in told[0]
+    assert not [text for text in many.notices if "poses are held out" in text]
+
+
 def test_nothing_is_named_on_a_sound_arm() -> None:
     made, found = sealed(condition="none"), diagnosed()
     assert found.verdict == "none"

@@ -115,6 +115,39 @@ def test_poses_that_are_off_are_no_lack_of_fit() -> None:
     assert repeats(scene, rest_of(replace(made.rows, error=bent.ravel()), noise, none))[0] < 1e-3
 
 
+def test_few_functions_tell_what_a_name_stands_for() -> None:
+    """One of three nests moved, and a plate that was seated anew is named for it: lambda 60.
+
+    So is scale that grows beside a base that drifts, and a joint that yields to another's angle.
+    """
+    made = study(6e-6, 1.0, 0)
+    scene, rows = made.scene, made.rows
+    seated = Term("target_reseat", "all", {"since": 0.5, "apart": 0.0})
+    nest = Term("target_shift", "smr2", {"since": 0.5}).columns(scene).displacement(scene)[:1]
+    grown = (scene.points * scene.column("clock"))[None]
+    bent = (scene.jacobian[2] * np.sin(scene.q[4]))[None]
+    backlash = Term("backlash", "J3")
+    drift = Term("frame_drift", "frame", {"constant": np.inf})
+    cases = (
+        (seated, nest, "smr2 since target_reseat:all"),
+        (drift, grown, "the scale with time"),
+        (backlash, bent, "backlash:J3 with J5"),
+    )
+    for name, motion, expected in cases:
+        fields = name.columns(scene).displacement(scene)
+        known, moved = rows.of(fields), rows.of(motion)[:, 0]
+        noise = Noise(0.0, 1e-10, 0.0)
+        clear = rest_of(replace(rows, error=moved), noise, known)
+        moved *= np.sqrt(60.0 / clear.total)
+        drawn = np.random.default_rng(3).normal(size=len(moved)) * 1e-5
+        named = [Named(name, known.T, known.sum(axis=1))]
+        found = structure(scene, replace(rows, error=moved + drawn), noise, known, named)
+        best = min(found, key=lambda trace: trace.p)
+        assert best.name == expected
+        assert best.p < 1e-6
+        assert best.doubts == (name is not drift)
+
+
 def of_joint(made: Study, joint: int, turn: Array) -> Array:
     """(N,) rows of a joint that turns by so much (m,) [rad]."""
     return made.rows.of((turn * made.scene.jacobian[joint])[None])[:, 0]

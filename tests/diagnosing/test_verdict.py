@@ -78,6 +78,8 @@ def test_chances_combine_however_they_depend(alike: float) -> None:
     assert chance_of(unasked) == 1.0
     assert_allclose(chance_of([Trace("", 1e-3, 1.0), *unasked]), 1e-3)
     assert_allclose(chance_of([Trace("", 1e-9, 1.0)]), 1e-9, rtol=1e-6)
+    doubt, many = Trace("", 1e-6, 1.0, doubts=True), [Trace("", 0.5, 1.0)] * 99
+    assert_allclose(chance_of([doubt, *many]), 2e-6, rtol=1e-3)  # names weigh as much as all else
 
 
 def test_effects_of_which_none_is_established_leave_it_unknown_where_they_tell_much() -> None:
