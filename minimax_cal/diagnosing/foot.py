@@ -104,11 +104,15 @@ def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
         across, told = motion(scene, term), measured(scene, term)
         value = across @ fit.cell.effects.values[fit.terms.index(term)]
         spread = across @ np.nan_to_num(fit.uncertainty.covariance[own, own]) @ across.T
-        sigma = np.hypot(np.sqrt(np.diag(spread)), told.sigma)
+        own_sigma = np.sqrt(np.diag(spread))
+        sigma = np.hypot(own_sigma, told.sigma)
         wrong = np.abs(value - told.value) > AGREE * sigma
         shown = ", ".join(
-            f"{axis} {1e6 * a:+.0f} um named, {1e6 * b:+.0f} +- {1e6 * s:.0f} measured"
-            for axis, a, b, s in zip("xyz", value, told.value, told.sigma, strict=True)
+            f"{axis} {1e6 * a:+.0f} +- {1e6 * u:.0f} um named, "
+            f"{1e6 * b:+.0f} +- {1e6 * s:.0f} um measured"
+            for axis, a, u, b, s in zip(
+                "xyz", value, own_sigma, told.value, told.sigma, strict=True
+            )
         )
         odd = ", ".join(np.array(list("xyz"))[wrong])
         verdict = f"they contradict it in {odd}" if odd else "they agree with it"

@@ -456,8 +456,8 @@ class Diagnosis:
         header = ("named", "or rather", "likeness", "power", "fits worse by",
                   "what to measure next")  # fmt: skip
         title = (
-            f"rivals that these data do not rule out; likeness 1 is the same motion, power "
-            f"{ENOUGH:.0f} tells apart, worse by {BAND:.0f} is much"
+            f"rivals that these data do not rule out: they fit worse by less than {BAND:.0f}, or "
+            f"less than the power {ENOUGH:.0f} tells apart; likeness 1 is the same motion"
         )
         return Table(title, header, rows,
                      ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip

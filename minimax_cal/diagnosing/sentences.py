@@ -70,9 +70,11 @@ def listed(title: str, findings: Sequence[Finding], *, rivals: bool = False) -> 
     for effect, same in kinds.items():
         why = f" ({same[0].cause})" if rivals else ""
         parts.append(f"{effect} {together([f.at for f in same])}{why}{lines_of(same[0])}")
-        others = {f"{a.effect} {in_words(a.place)}" for f in same for a in f.alternatives}
-        if rivals and others:
-            parts[-1] += f", or else {' or '.join(sorted(others))}"
+        for finding in same if rivals else ():
+            others = {f"{a.effect} {in_words(a.place)}" for a in finding.alternatives}
+            where = f" {finding.at}" if len(same) > 1 else ""
+            if others:
+                parts[-1] += f",{where} or else {' or '.join(sorted(others))}"
     many = "s" if title == "Cause" and len(findings) > 1 else ""
     return f"{title}{many}: {'; '.join(parts)}." if parts else ""
 
@@ -108,7 +110,8 @@ def shrunk(found: Diagnosis) -> str:
         return f"{text}."
     low, high = (100.0 * end for end in found.closed_ci)
     ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
-    return f"{text}; {100.0 * found.closed:.0f} % of the gap to the noise is closed{ends}."
+    least = "" if found.floor.certain else "at least "  # told as if noise alone left nothing
+    return f"{text}; {least}{100.0 * found.closed:.0f} % of the gap to the noise is closed{ends}."
 
 
 def remaining(found: Diagnosis) -> str:
@@ -123,11 +126,11 @@ def remaining(found: Diagnosis) -> str:
     if left is None:
         return f"Noise alone would leave {noise}."
     if left.predictable_mm < NOTHING_MM:
-        return f"What remains follows nothing known; noise alone would leave {noise}."
+        return f"Nothing tells poses left out what remains; noise alone would leave {noise}."
     where = ", ".join(f"{in_words(place)} {100.0 * share:.0f} %" for place, share in left.where[:3])
     told = f" ({where})" if where else ""
     return (
-        f"Of what remains, {left.predictable_mm:.3f} mm follow the pose{told}, "
+        f"Of what remains at poses left out, {left.predictable_mm:.3f} mm follow the pose{told}, "
         f"{left.unpredictable_mm:.3f} mm follow nothing known; noise alone would leave {noise}."
     )
 
@@ -145,7 +148,10 @@ def away(found: Diagnosis) -> str:
 
 
 def next_measurement(causes: Sequence[Finding]) -> str:
-    """The one measurement that tells most rivals apart; empty where none would."""
+    """The one measurement that settles most of the gap; empty where none would.
+
+    That is causes by their share, and of equal ones the most rivals.
+    """
     by_text: dict[str, list[tuple[Finding, Alternative]]] = {}
     for finding in causes:
         for other in finding.alternatives:
@@ -153,7 +159,12 @@ def next_measurement(causes: Sequence[Finding]) -> str:
                 by_text.setdefault(other.separate_with, []).append((finding, other))
     if not by_text:
         return ""
-    text, pairs = max(by_text.items(), key=lambda entry: len(entry[1]))
+
+    def settled(pairs: Sequence[tuple[Finding, Alternative]]) -> tuple[float, int]:
+        told = {f.term.key: f.share for f, _ in pairs if f.share > 0.0}
+        return sum(told.values()), len(pairs)
+
+    text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
     named = " and ".join(dict.fromkeys(f"{f.term.effect} {f.at}" for f, _ in pairs))
     others = " and ".join(dict.fromkeys(f"{a.effect} {in_words(a.place)}" for _, a in pairs))
     return f"Next measurement: {text}, to tell {named} from {others}."

@@ -108,6 +108,23 @@ def test_a_single_cause_is_one(found: Diagnosis) -> None:
     assert "Small" not in alone.headline()
 
 
+def test_rivals_stand_at_their_own_place(found: Diagnosis) -> None:
+    """Of two causes of a kind only the second has one; the measurement is for the larger share."""
+    rivals = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
+    large, small = found.findings[:2]
+    second = replace(small, terms=(replace(small.term, effect=large.term.effect),),
+                     alternatives=(rivals[0], replace(rivals[0], place="L3")))  # fmt: skip
+    told = replace(found, findings=(large, second), ladder=found.ladder[:4])
+    causes = next(text for text in told.reasons if text.startswith("Cause"))
+    assert "joint_compliance at joint 3 and 2" in causes
+    assert f", {second.at} or else link_bending at link 1 or link_bending at link 3" in causes
+    assert f"{large.at} or else" not in causes
+    both = replace(told, findings=(replace(large, alternatives=(rivals[1],)), second))
+    text = next(text for text in both.reasons if text.startswith("Next measurement"))
+    assert large.share > second.share > 0.0
+    assert text.startswith("Next measurement: measure 2, to tell")
+
+
 def test_tentative_effects_stand_together_below(found: Diagnosis) -> None:
     told = marked(found, established={"gear_ripple": False})
     causes = next(text for text in told.reasons if text.startswith("Cause"))
@@ -128,7 +145,8 @@ def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
         0.2, 0.05, 0.02, 0.03
     ]  # fmt: skip
     told = replace(found, remainder=replace(left, predictable_mm=0.0))
-    assert any(text.startswith("What remains follows nothing known;") for text in told.reasons)
+    nothing = "Nothing tells poses left out what remains;"
+    assert any(text.startswith(nothing) for text in told.reasons)
     told = replace(found, remainder=None)
     assert not any(text.startswith("Of what remains") for text in told.reasons)
 
@@ -154,7 +172,7 @@ def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
     assert "by chance 1e-07, below 0.005 is no accident" in told.headline()
     assert "0.005 is rare enough" in told.effects_table().title
-    assert "power 25 tells apart" in told.rival_table().title
+    assert "less than the power 25 tells apart" in told.rival_table().title
     assert " p = " not in told.headline()
     assert "lambda" not in told.summary()
     from minimax_cal.reporting.tables import where_tables

@@ -189,7 +189,7 @@ class Where:
 def triage_table(triage: Mapping[str, Any]) -> Table:
     """The mean squares, one a row.  triage: as `Triage.to_dict`."""
     causes = {
-        "noise": "instrument noise",
+        "noise": "noise, of any origin",
         "shape": "targets against each other",
         "repeat": "revisits against each other",
         "pose": "static model error",
