@@ -271,8 +271,11 @@ class WorstCase:
             for name, size, mu in zip(self.functions, self.size, self.multiplier, strict=True)
         )
         header = ("error of", "F_i mm^2, of a point mm", "multiplier", "is the worst")
-        return Table("what the worst error on the training poses rests on", header, rows,
-                     ("", ".4f", ".4f", ""))  # fmt: skip
+        title = (
+            "what the worst error on the training poses rests on; targets compare by F_i over the "
+            "number of their points"
+        )
+        return Table(title, header, rows, ("", ".4f", ".4f", ""))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
