@@ -110,8 +110,10 @@ def shrunk(found: Diagnosis) -> str:
         return f"{text}."
     low, high = (100.0 * end for end in found.closed_ci)
     ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
-    least = "" if found.floor.certain else "at least "  # told as if noise alone left nothing
-    return f"{text}; {least}{100.0 * found.closed:.0f} % of the gap to the noise is closed{ends}."
+    share = f"{100.0 * found.closed:.0f} %"
+    if not (found.floor.certain or share == "100 %"):  # told as if noise alone left nothing
+        share = f"at least {share}"
+    return f"{text}; {share} of the gap to the noise is closed{ends}."
 
 
 def remaining(found: Diagnosis) -> str:
