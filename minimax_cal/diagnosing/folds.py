@@ -45,9 +45,12 @@ def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) 
     states = without(estimator, study.fit.state, masks)
     for number, (part, mask, state) in enumerate(zip(found, masks, states, strict=True)):
         if state is None:
+            errors.miss(part.name)
             continue
         progress(f"part {number + 1} of {len(found)} left out: {part.name}")
         fits = fold_of(study, causes, ~mask, state).fits
         rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
-    return errors.beyond() if found else Beyond(reason="the poses are too few or too much alike")
+    if not found:
+        return Beyond(reason="the poses are too few or too much alike")
+    return errors.beyond(sought=True)

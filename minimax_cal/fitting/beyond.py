@@ -2,30 +2,34 @@
 
 Poses held out at random stand among those of the fit, and tell nothing of places where none was
 measured.  Here every part (`grouping.parts`) is left out in its turn, the fit is made again of the
-rest, and the part judges it.
+rest, and the part judges it.  Parts that none can judge are counted and named.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.intervals import max_interval, rms_interval
+from minimax_cal.fitting.identify import redundant
+from minimax_cal.fitting.intervals import max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region
+from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
+from minimax_cal.solvers.status import Status
 
 WORSE = 3.0  # a part is needed, and not left out, if the condition without it is so much worse
 RANK = 1e-3  # singular value below which a parameter is lost, as `identify.RESOLUTION`
+NEAR = 5e-3  # of a part's error: a fit that another step would move there by less has arrived
 SHOWN = 4  # parts, the worst, for people
 NOTHING_LEFT = "every part of the poses is needed for the fit"
 
@@ -42,12 +46,24 @@ class Fold:
 
 
 @dataclass(frozen=True)
+class Trusted:
+    """The same parts without the points that stand out: RMS of all, of the worst [mm], its name."""
+
+    typical_mm: float
+    worst_mm: float
+    where: str
+
+
+@dataclass(frozen=True)
 class Beyond:
     """The claim for poses where none was measured.
 
     typical: RMS over all parts together.  worst: of the worst part.  Both [mm], NaN with a
     `reason` where nothing can be left out.  geometric: the same for geometry alone.  rms_high,
     max_high: upper 95 % limits, of the worst part and of the part with the largest distance [mm].
+    missed: parts that could not be judged, None where an earlier version did not tell.  sought:
+    whether effects were sought anew without each part; None without effects.  trusted: where
+    held-out points stand out, which judge as well.
     """
 
     folds: tuple[Fold, ...] = ()
@@ -56,6 +72,20 @@ class Beyond:
     reason: str = ""
     rms_high_mm: float = math.nan
     max_high_mm: float = math.nan
+    missed: tuple[str, ...] | None = ()
+    sought: bool | None = None
+    trusted: Trusted | None = None
+
+    @property
+    def judged(self) -> str:
+        """How many parts judged, of how many, where that is not all."""
+        count = len(self.folds)
+        return f"{count} of {count + len(self.missed)} parts" if self.missed else ""
+
+    @property
+    def kept(self) -> str:
+        """That the effects were given, a clause for people; empty where they were sought anew."""
+        return ", effects not sought anew" if self.sought is False else ""
 
     @property
     def worst(self) -> Fold | None:
@@ -76,9 +106,16 @@ class Beyond:
         """For the headline, empty where there is no claim."""
         if not self.worst:
             return ""
+        parts = "each part left out in turn"
+        if self.missed:
+            parts = f"{self.judged} left out in turn (the fit cannot do without the others)"
+        less = ""
+        if self.trusted:
+            worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
+            less = f"; without the points that stand out at worst {worst}"
         return (
-            f"Beyond the measured poses, each part left out in turn: RMS {self.typical_mm:.3f} mm, "
-            f"at worst {self.worst_mm:.3f} mm ({self.worst.where})."
+            f"Beyond the measured poses, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
+            f"at worst {self.worst_mm:.3f} mm ({self.worst.where}){less}."
         )
 
     def table(self) -> Table:
@@ -86,12 +123,20 @@ class Beyond:
         shown = sorted(self.folds, key=lambda fold: -fold.rms_mm)[:SHOWN]
         count = sum(fold.poses for fold in self.folds)
         most = max((fold.max_mm for fold in self.folds), default=math.nan)
-        whole = (f"all {len(self.folds)} parts", count, self.typical_mm, most)
-        rows = tuple((f.where, f.poses, f.rms_mm, f.max_mm, f.geometric_mm) for f in shown)
+        whole = self.judged or f"all {len(self.folds)} parts"
+        rows: list[tuple[Cell, ...]] = [
+            (f.where, f.poses, f.rms_mm, f.max_mm, f.geometric_mm) for f in shown
+        ]
+        if rows:
+            rows.append((whole, count, self.typical_mm, most, self.geometric_typical_mm))
+        if rows and self.trusted:
+            typical = self.trusted.typical_mm
+            rows.append((f"{whole}, without suspects", count, typical, math.nan, math.nan))
+        how = f"each part judged by a fit without it{self.kept}"
         return Table(
-            "beyond the measured poses: each part judged by a fit without it, the worst ones",
+            f"beyond the measured poses: {how}, the worst ones",
             ("left out", "poses", "RMS mm", "max mm", "geometry alone RMS mm"),
-            (*rows, (*whole, self.geometric_typical_mm)) if rows else (),
+            tuple(rows),
             ("", "d", ".4f", ".4f", ".4f"),
         )
 
@@ -104,6 +149,9 @@ class Beyond:
             "worst_high95_mm": finite(self.rms_high_mm),
             "max_high95_mm": finite(self.max_high_mm),
             "folds": [vars(fold) for fold in self.folds],
+            "not_judged": None if self.missed is None else list(self.missed),
+            "effects_sought_anew": self.sought,
+            "without_suspects": vars(self.trusted) if self.trusted else None,
             "geometric": {
                 "typical_mm": finite(self.geometric_typical_mm),
                 "worst_mm": finite(self.geometric_worst_mm),
@@ -114,29 +162,60 @@ class Beyond:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of parts that were left out: names, and (k, m_i, 3) of each [m]."""
+    """Errors of parts that were left out: names, and (k, m_i, 3) of each [m].
+
+    trusted: the same without points that stand out, NaN there.  missed: parts that cannot judge.
+    """
 
     names: list[str] = field(default_factory=list)
     final: list[Array] = field(default_factory=list)
     geometric: list[Array] = field(default_factory=list)
+    trusted: list[Array] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
 
-    def add(self, name: str, final: Array, geometric: Array) -> None:
-        """One part."""
+    def add(self, name: str, final: Array, geometric: Array, doubted: Array | None = None) -> None:
+        """One part.  doubted: (k, m_i) True for points that stand out."""
         self.names.append(name)
         self.final.append(final)
         self.geometric.append(geometric)
+        out = np.zeros(final.shape[:2], dtype=bool) if doubted is None else doubted
+        self.trusted.append(np.where(out[..., None], np.nan, final))
 
-    def beyond(self, reason: str = NOTHING_LEFT) -> Beyond:
-        """The claim.  reason: why there is none, if there is none."""
+    def miss(self, name: str) -> None:
+        """One part without which there is no fit."""
+        self.missed.append(name)
+
+    def beyond(self, reason: str = NOTHING_LEFT, sought: bool | None = None) -> Beyond:
+        """The claim.  reason: why there is none, if there is none.  sought: see `Beyond`."""
         if not self.names:
-            return Beyond(reason=reason)
+            return Beyond(reason=reason, missed=tuple(self.missed))
         every = [accuracy(error) for error in self.final]
         plain = [accuracy(error) for error in self.geometric]
         folds = tuple(
             Fold(name, one.poses, one.rms_mm, one.max_mm, other.rms_mm)
             for name, one, other in zip(self.names, every, plain, strict=True)
         )
-        return Beyond(folds, pooled(every), pooled(plain), "", *self.limits(folds))
+        return Beyond(
+            folds,
+            pooled(every),
+            pooled(plain),
+            "",
+            *self.limits(folds),
+            missed=tuple(self.missed),
+            sought=sought,
+            trusted=self.without_suspects(),
+        )
+
+    def without_suspects(self) -> Trusted | None:
+        """The claim of points that do not stand out, where others do."""
+        lost = [np.isnan(less).sum() - np.isnan(error).sum()
+                for less, error in zip(self.trusted, self.final, strict=True)]  # fmt: skip
+        every = [accuracy(error) for error in self.trusted]
+        told = [i for i, one in enumerate(every) if sum(one.counts)]
+        if not any(lost) or not told:
+            return None
+        worst = max(told, key=lambda i: every[i].rms_mm)
+        return Trusted(pooled(every), every[worst].rms_mm, self.names[worst])
 
     def limits(self, folds: Sequence[Fold]) -> tuple[float, float]:
         """Upper 95 % limits of the largest RMS and of the largest distance [mm]."""
@@ -149,7 +228,8 @@ class Errors:
             rms_interval(self.final[worst], rng=rng),
             max_interval(self.final[far], rng=rng),
         )
-        return 1e3 * rms.high, 1e3 * largest.high
+        seen = 1e-3 * folds[worst].rms_mm, 1e-3 * folds[far].max_mm
+        return 1e3 * told(rms, seen[0]).high, 1e3 * told(largest, seen[1]).high
 
 
 def pooled(every: Sequence[Accuracy]) -> float:
@@ -158,16 +238,20 @@ def pooled(every: Sequence[Accuracy]) -> float:
     return math.sqrt(total / count) if count else math.nan
 
 
-def needed(poses: Poses, part: Array) -> bool:
-    """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,).
+def needed(poses: Poses, part: Array, of: Array | None = None) -> bool:
+    """Whether a fit loses parameters, or much sureness, without some poses.
 
-    What all poses hardly tell, as a gear's curve beside the joint's compliance, no part costs.
+    part: mask (m,).  of: (p,) True for the parameters asked about, the others left out; all unless
+    given.  What all poses hardly tell, as a gear's curve beside the joint's compliance, no part
+    costs.
     """
-    gram = poses.bread
+    gram, less = poses.bread, poses.gram_of(part)
+    if of is not None:
+        gram, less = gram[np.ix_(of, of)], less[np.ix_(of, of)]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     whole, rest = (
         np.sqrt(np.maximum(np.linalg.eigvalsh(one / np.outer(scale, scale)), 0.0))
-        for one in (gram, gram - poses.gram_of(part))
+        for one in (gram, gram - less)
     )
     had, kept = (int((one > RANK * one[-1]).sum()) for one in (whole, rest))
     return bool(kept < had or rest[-1] * whole[-had] > WORSE * whole[-1] * rest[-had])
@@ -180,24 +264,77 @@ def step_without(poses: Poses, part: Array) -> Array:
     return solve_normal(poses.bread - gram, left[:, None])[:, 0]
 
 
-def without(estimator: Estimator, state: State, parts: Sequence[Array]) -> list[State | None]:
-    """The fit without each of some parts, None where the part is needed.
+def without(
+    estimator: Estimator, state: State, parts: Sequence[Array], frames: int = 0
+) -> list[State | None]:
+    """The fit without each of some parts, None where there is none.
 
-    One step of Gauss and Newton from the whole fit, which is near: a second changes the RMS of a
-    part by less than 0.5 % on the real arms tried.  The weights of targets and points stay as they
-    were.  parts: masks (m,) of the fit's poses.
+    That is where the rest loses geometry: base, links, targets and the frames of further sessions.
+    Parameters of effects that the rest does not tell it gives up, as a calibration of the rest
+    would.  One step of Gauss and Newton from the whole fit is taken for the answer where a second
+    would hardly move the part that is left out; else the search goes on to its end.  The weights of
+    targets and points stay as they were.
+
+    parts: masks (m,) of the fit's poses.  frames: how many of the effects' parameters, the first,
+    are those of the frames.
     """
-    poses = Poses.of(estimator, state)
+    poses, model = Poses.of(estimator, state), estimator.model
+    geometry = np.flatnonzero(model.active) < model.names.geometric + frames
     out: list[State | None] = []
     for part in parts:
         if not part.any():
             out.append(state)
-            continue
-        if needed(poses, part):
+        elif needed(poses, part, geometry):
             out.append(None)
-            continue
-        out.append(moved(estimator, state, step_without(poses, part)))
+        else:
+            out.append(fit_of_rest(poses, part, untold(poses, part, ~geometry)))
     return out
+
+
+def untold(poses: Poses, part: Array, asked: Array) -> Array:
+    """(p,) True for parameters that poses outside a part do not tell, as `identify.identify` asks.
+
+    part: mask (m,).  asked: (p,) those that may be given up.
+    """
+    out = np.zeros(len(asked), dtype=bool)
+    if asked.any():
+        gram = poses.bread - np.diag(poses.prior) - poses.gram_of(part)
+        own = np.maximum(np.diag(gram), 0.0)
+        gram[np.diag_indices_from(gram)] = np.where(poses.prior > 0.0, 2.0 * own, own)
+        out[redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK)] = True
+    return out
+
+
+def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
+    """The fit of the poses outside a part, None where the search does not end.
+
+    part: mask (m,).  gone: (p,) True for free parameters that then keep their nominal value.
+    """
+    estimator, state = poses.estimator, poses.state
+    if not gone.any():
+        near = moved(estimator, state, step_without(poses, part))
+        if arrived(poses, near, part):
+            return near
+    rest = estimator.at(np.flatnonzero(~part)).whole
+    active, free = rest.active.copy(), np.flatnonzero(rest.active)
+    active[free[gone]] = False
+    effects, nominal = state.effects.copy(), rest.prior.mean[rest.names.geometric :]
+    dropped = free[gone] - rest.names.geometric
+    effects[dropped] = nominal[dropped]
+    found = nearby(rest.only(active), replace(state, effects=effects))
+    return found.x.take(np.array(0)) if found.status[0] is Status.CONVERGED else None
+
+
+def arrived(poses: Poses, near: State, part: Array) -> bool:
+    """Whether a further step of the fit without a part hardly moves the part's points.
+
+    poses: at the whole fit, whose error there is what counts.  near: a step from it.  part: (m,).
+    """
+    there = Poses.of(poses.estimator, near)
+    step = step_without(there, part)
+    motion = float(step @ there.gram_of(part) @ step)
+    error = float(poses.estimator.whole.take(part).cost(poses.state).sum())
+    return motion <= NEAR**2 * error  # not so where the step is no number
 
 
 def moved(estimator: Estimator, state: State, step: Array) -> State:
@@ -213,21 +350,27 @@ def left_out(
     train: Array,
     parts: Sequence[Region],
     error_of: Callable[[State, Array], Array],
+    doubted: Array,
     geometric: tuple[Estimator, State] | None = None,
+    frames: int = 0,
 ) -> Beyond:
     """Every part judges the fit of the training poses outside it.
 
     train: (m,) True for training poses, of all.  error_of: errors (k, r, 3) of a state at some rows
-    of all poses [m].  geometric: the fit without effects, where the fit has some.
+    of all poses [m].  doubted: (k, m) True for points that stand out.  geometric: the fit without
+    effects, where the fit has some.  frames: as `without`.
     """
     masks = [part.rows[train] for part in parts]
-    fits = without(estimator, state, masks)
-    plain = without(*geometric, masks) if geometric else fits
+    fits = without(estimator, state, masks, frames)
+    plain = without(*geometric, masks, frames) if geometric else fits
     errors = Errors()
     for part, fit, other in zip(parts, fits, plain, strict=True):
-        if not (fit and other):
-            continue
-        final = error_of(fit, part.rows)
-        if np.isfinite(final).any():  # else every point of the part stands out
-            errors.add(part.name, final, error_of(other, part.rows) if geometric else final)
-    return errors.beyond() if parts else Beyond(reason="the poses are too few or too much alike")
+        if fit and other:
+            final = error_of(fit, part.rows)
+            alone = error_of(other, part.rows) if geometric else final
+            errors.add(part.name, final, alone, doubted[:, part.rows])
+        else:
+            errors.miss(part.name)
+    if not parts:
+        return Beyond(reason="the poses are too few or too much alike")
+    return errors.beyond(sought=False if geometric else None)

@@ -20,6 +20,7 @@ from minimax_cal.fitting.claims import (
     contradiction,
     crossed_of,
     is_crossed,
+    unjudged,
     unseen_suspects,
 )
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
@@ -256,7 +257,9 @@ def judged(
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
-    cross = is_crossed(options, poses.held)
+    crossed = NOT_CROSSED
+    if is_crossed(options, poses.held):
+        crossed = crossed_of(robot, options, data, held, solved)
     wrong = contradiction(robot, data, after, held, suspects)
     alarming = tuple(alarms(robot, poses, solved, before[:, ~held]))
     notices = (
@@ -267,6 +270,7 @@ def judged(
         *(fault.text for fault in faults.session_jumps(data, after)),
         *alarming,
         *bad_rows(suspects, data.source),
+        *unjudged(data, crossed),
         *([wrong] if wrong else []),
     )
     fit = Fit(
@@ -302,7 +306,7 @@ def judged(
         widening=solved.widening,
         provenance=Provenance.of(robot, data, options.settings()),
         claim=partial(beyond_of, robot, options, data, held, solved, suspects),
-        error_crossed=crossed_of(robot, options, data, held, solved) if cross else NOT_CROSSED,
+        error_crossed=crossed,
     )
     return fit, alarming
 

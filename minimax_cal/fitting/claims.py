@@ -29,6 +29,7 @@ from minimax_cal.robots.robot import Robot
 FLOORS = 50.0  # times the floor, likewise
 LEAST_FLOOR = 5e-3  # no arm does better [mm]
 GROSS = 0.01  # of the reach: a fit that misses by more contradicts its own data
+LISTED = 5  # lines that a notice names
 LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 
 
@@ -50,12 +51,30 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
     """Notice of held-out points that stand out: they judge the fit."""
     held = [one for one in suspects if one.held]
     if held:
-        named = ", ".join(f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held[:5])
-        more = f" and {len(held) - 5} more" if len(held) > 5 else ""
+        named = ", ".join(
+            f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held[:LISTED]
+        )
+        more = f" and {len(held) - LISTED} more" if len(held) > LISTED else ""
         yield (
             f"{source}: held-out points that stand out: {named}{more}; they stay in the held-out "
-            "accuracy, which also stands there without them"
+            "accuracy and beyond the measured poses, which also stand there without them"
         )
+
+
+def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
+    """Notice of poses that the fit cannot do without, so that none judges them.
+
+    crossed: (k, m, 3) errors by a fit without each pose, NaN where there is none; may be empty.
+    """
+    if crossed.size:
+        lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(0, 2))
+        if lost.any():
+            named = ", ".join(str(line) for line in data.line[lost][:LISTED])
+            more = f" and {lost.sum() - LISTED} more" if lost.sum() > LISTED else ""
+            yield (
+                f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
+                f"that none without them judges them: line {named}{more}"
+            )
 
 
 def contradiction(
@@ -110,8 +129,15 @@ def crossed_of(
 ) -> Array:
     """Errors (k, m, 3) of every pose by a fit without it [m]."""
     group = grouped(data, options.holdout_by)
-    return crossed(solved.estimator, solved.state, held, group, errors_of(robot, data, solved),
-                   options.seed)  # fmt: skip
+    return crossed(
+        solved.estimator,
+        solved.state,
+        held,
+        group,
+        errors_of(robot, data, solved),
+        options.seed,
+        steps_of(data.frames),
+    )
 
 
 def beyond_of(
@@ -124,10 +150,11 @@ def beyond_of(
 ) -> Beyond:
     """How the fit does on parts of the poses that it has not seen.
 
-    held: (m,) not of the fit; points that stand out among them do not judge it here.
+    held: (m,) not of the fit; points that stand out among them judge it, and are set aside beside.
     """
+    points = np.moveaxis(data.y, 1, 0)
     wrong = [one for one in suspects if one.held]
-    data = data.with_y(np.moveaxis(aside(np.moveaxis(data.y, 1, 0), data, wrong), 0, 1))
+    doubted = np.isnan(aside(points, data, wrong)).any(axis=-1) & data.seen.T
     every, free = solved.effects.terms, of_sessions(data.frames)
     geometric = None
     if len(every) > len(free):
@@ -136,4 +163,13 @@ def beyond_of(
         model, state = refitted(robot, train, solved.state, active)
         geometric = Estimator(model, np.ones(len(names))), state
     found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
-    return left_out(solved.estimator, solved.state, ~held, found, error_of, geometric)
+    return left_out(
+        solved.estimator,
+        solved.state,
+        ~held,
+        found,
+        error_of,
+        doubted,
+        geometric,
+        steps_of(data.frames),
+    )

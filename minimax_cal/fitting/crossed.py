@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.fitting.beyond import without
-from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval
+from minimax_cal.fitting.intervals import UNKNOWN, Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
@@ -33,7 +33,7 @@ class Within:
     """How the arm did on poses that its fit had not seen, and before.
 
     poses: that count by themselves; repeats and clusters count once.  where: which, in words.
-    rms, largest: 95 % intervals [m].
+    rms, largest: 95 % intervals [m].  missed: poses that no fit without them judges.
     """
 
     before: Accuracy
@@ -42,6 +42,7 @@ class Within:
     poses: int = 0
     rms: Interval = UNKNOWN
     largest: Interval = UNKNOWN
+    missed: int = 0
 
 
 def crossed(
@@ -51,18 +52,19 @@ def crossed(
     group: Array,
     error_of: Callable[[State, Array], Array],
     seed: int,
+    frames: int = 0,
 ) -> Array:
     """(k, m, 3) errors of every pose by a fit without it, NaN where no fit can do without [m].
 
-    As in `beyond`, a fit without a part is one step from the whole one.  held: (m,) True where the
-    fit has not seen the pose.  group: (m,) poses with one number are left out together.
-    error_of: errors (k, r, 3) of a state at some rows [m].
+    Fits without a part are those of `beyond.without`.  held: (m,) True where the fit has not seen
+    the pose.  group: (m,) poses with one number are left out together.  error_of: errors (k, r, 3)
+    of a state at some rows [m].  frames: as `beyond.without`.
     """
     names = np.unique(group[~held])
     drawn = np.random.default_rng(seed).permutation(len(names)) % min(FOLDS, len(names))
     fold = np.where(held, -1, drawn[np.minimum(np.searchsorted(names, group), len(names) - 1)])
     masks = [fold == number for number in range(int(drawn.max(initial=-1)) + 1)]
-    fits = without(estimator, state, [mask[~held] for mask in masks])
+    fits = without(estimator, state, [mask[~held] for mask in masks], frames)
     out = np.full_like(error_of(state, np.arange(len(held))), np.nan)
     for mask, fit in zip([held, *masks], [state, *fits], strict=True):
         if fit:
@@ -71,9 +73,13 @@ def crossed(
 
 
 def intervals_of(error: Array, group: Array, seed: int) -> tuple[Interval, Interval]:
-    """95 % intervals of the RMS and of the largest of errors (k, m, 3) [m].  group: (m,)."""
-    rng = np.random.default_rng(seed)
-    return rms_interval(error, group, rng=rng), max_interval(error, group, rng=rng)
+    """95 % intervals of the RMS and of the largest of errors (k, m, 3) [m], as they are told.
+
+    group: (m,).
+    """
+    rng, found = np.random.default_rng(seed), accuracy(error)
+    rms, largest = rms_interval(error, group, rng=rng), max_interval(error, group, rng=rng)
+    return told(rms, 1e-3 * found.rms_mm), told(largest, 1e-3 * found.max_mm)
 
 
 def few_poses(train: Measurements, parameters: int) -> str:

@@ -20,7 +20,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval
+from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
@@ -428,18 +428,32 @@ class Fit:
 
     @cached_property
     def intervals(self) -> Mapping[str, tuple[Interval, Interval]]:
-        """95 % intervals of RMS and largest error on poses like those held out, by key."""
+        """95 % intervals of RMS and largest error on poses like those held out, by key.
+
+        As they are told to people: open above where the poses tell no upper end.
+        """
         if self.stated is not None:
             return self.stated
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
         return {
             key: (
-                rms_interval(self.errors[key], group, rng=rng),
-                max_interval(self.errors[key], group, rng=rng),
+                told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * seen.rms_mm),
+                told(max_interval(self.errors[key], group, rng=rng), 1e-3 * seen.max_mm),
             )
             for key in ("nominal", "holdout")
+            for seen in [self.accuracy[key]]
         }
+
+    @property
+    def unjudged(self) -> Array:
+        """Lines of the poses that no fit without them judges, where it is cross-validated."""
+        if not self.error_crossed.size:
+            return np.zeros(0, dtype=int)
+        told, judged = (
+            np.isfinite(error).any(axis=(0, 2)) for error in (self.error, self.error_crossed)
+        )
+        return np.asarray(self.data.line[told & ~judged])
 
     @cached_property
     def within(self) -> Within:
@@ -448,9 +462,11 @@ class Fit:
         if self.error_crossed.size:
             judged = np.isfinite(self.error_crossed).any(axis=(0, 2))
             before, after = accuracy(self.error_nominal[:, judged]), accuracy(self.error_crossed)
-            where = f"{after.poses} poses, each judged by a fit without it"
+            missed = len(self.unjudged)
+            of = f" of {after.poses + missed}" if missed else ""
+            where = f"{after.poses}{of} poses, each judged by a fit without it"
             ends = intervals_of(self.error_crossed, group, self.options.seed)
-            return Within(before, after, where, len(np.unique(group[judged])), *ends)
+            return Within(before, after, where, len(np.unique(group[judged])), *ends, missed)
         before, after, where = before_and_after(self.accuracy)
         if not self.accuracy["holdout"].poses:
             return Within(before, after, where)
@@ -506,9 +522,11 @@ class Fit:
             for a, (rms, largest) in [(self.accuracy[key], self.intervals[key])]
             if math.isfinite(rms.low)
         )  # fmt: skip
+        dash = any(np.isnan([row[3], row[6]]).any() for row in rows)
+        why = "; a dash: too few poses, or too unlike each other, to tell an upper end"
         return Table(
             "held out, with 95 % intervals: of the RMS over such poses, of the largest error of as "
-            "many new ones",
+            f"many new ones{why if dash else ''}",
             ("robot", "RMS mm", "from", "to", "max mm", "from", "to"),
             rows,
             ("", *[".4f"] * 6),

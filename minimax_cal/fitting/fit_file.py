@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from minimax_cal.fitting.beyond import Beyond, Fold
+from minimax_cal.fitting.beyond import Beyond, Fold, Trusted
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.crossed import NOT_CROSSED
 from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
@@ -94,12 +94,24 @@ class BeyondPart(Part):
     reason: str = ""
     worst_high95_mm: Number = math.nan
     max_high95_mm: Number = math.nan
+    not_judged: tuple[str, ...] | None = None
+    effects_sought_anew: bool | None = None
+    without_suspects: Recorded[Trusted] | None = None
 
     def beyond(self) -> Beyond:
         """As the code has it."""
         plain = self.geometric.get("typical_mm", math.nan)
         high = self.worst_high95_mm, self.max_high95_mm
-        return Beyond(self.folds, self.typical_mm, plain, self.reason, *high)
+        return Beyond(
+            self.folds,
+            self.typical_mm,
+            plain,
+            self.reason,
+            *high,
+            missed=self.not_judged,
+            sought=self.effects_sought_anew,
+            trusted=self.without_suspects,
+        )
 
 
 class AccuraciesPart(Part):
@@ -249,10 +261,14 @@ def ends(fit: Fit, key: str) -> dict[str, list[float | None]]:
 def crossed_to_dict(fit: Fit) -> dict[str, Any]:
     """The cross-validated accuracy."""
     names = ("rms_ci95_mm", "max_ci95_mm")
-    return fit.within.after.to_dict() | {
-        name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
-        for name, interval in zip(names, (fit.within.rms, fit.within.largest), strict=True)
-    }
+    return (
+        fit.within.after.to_dict()
+        | {"not_judged": [int(x) for x in fit.unjudged]}
+        | {
+            name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
+            for name, interval in zip(names, (fit.within.rms, fit.within.largest), strict=True)
+        }
+    )
 
 
 def minimax_to_dict(worst: WorstCase) -> dict[str, Any]:

@@ -20,18 +20,28 @@ DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the wi
 PIVOTS = 4000  # simulated samples behind the interval of the largest error
 TAIL = 100  # no more than so many of the largest errors tell the tail
 BUNDLES = 2000  # more poses than these are drawn in bundles
+FARTHEST = 10.0  # times what was seen: an end beyond it is of the assumed law, not of the poses
 TINY = 1e-9  # of the mean square: an error that is exactly zero has no logarithm
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Two ends, NaN where too little is known."""
+    """Two ends, NaN each where too little is known."""
 
     low: float
     high: float
 
 
 UNKNOWN = Interval(math.nan, math.nan)
+
+
+def told(interval: Interval, seen: float) -> Interval:
+    """An interval as it is told to people: open above where the poses give no upper end.
+
+    Of few poses, or where one is nearly all of the error, the samples that lack it leave the end to
+    the tail of an assumed law: it covers, and says nothing.  seen: the value itself [m].
+    """
+    return interval if interval.high <= FARTHEST * seen else Interval(interval.low, math.nan)
 
 
 def rms_interval(

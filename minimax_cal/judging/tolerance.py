@@ -16,6 +16,7 @@ CLAIMS = ("within", "beyond")
 KINDS = {"rms": "RMS", "max": "largest"}  # as people write it, and as they read it
 CHANCE = 0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
 FEWEST = math.ceil(1.0 / CHANCE - 1.0)  # poses: `chance_of_larger` is then small enough
+NAMED = 3  # parts that could not be judged
 LIMIT = re.compile(r"\s*(rms|max)\s*[:=<]?\s*([0-9.eE+-]+)\s*(mm)?\s*", re.IGNORECASE)
 
 
@@ -40,7 +41,9 @@ class Claim:
     """What is claimed of poses that no fit has seen.
 
     name: within or beyond.  before: of the nominal arm [mm], by kind.  poses: that count by
-    themselves.  where: in words.  reason: why there is no claim, if there is none.
+    themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
+    could not be judged, so that nothing is passed by the rest; empty where all was.  sets:
+    the poses of RMS and of the largest in two words, for a table.
     """
 
     name: str
@@ -50,6 +53,8 @@ class Claim:
     where: str
     before: tuple[float, float] = (math.nan, math.nan)
     reason: str = ""
+    open: str = ""
+    sets: tuple[str, str] = ("", "")
 
     def bound(self, kind: str) -> Bound:
         """Of rms or max."""
@@ -99,8 +104,14 @@ def within(
     after: Accuracy,
     intervals: tuple[Interval, Interval] = (UNKNOWN, UNKNOWN),
     poses: int | None = None,
+    missed: int = 0,
+    kind: str = "held out",
 ) -> Claim:
-    """The claim for poses between the measured ones.  name: of these poses, in words."""
+    """The claim for poses between the measured ones.
+
+    name: of these poses, in words.  missed: how many more no fit without them judges.  kind: how
+    they came to be judged.
+    """
     rms, largest = intervals
     return Claim(
         "within",
@@ -110,6 +121,8 @@ def within(
         name,
         (before.rms_mm, before.max_mm),
         "" if after.poses else "no pose was held out",
+        f"{missed} poses, which the fit needs, could not be judged" if missed else "",
+        (f"{after.poses} {kind}",) * 2,
     )
 
 
@@ -119,21 +132,37 @@ def beyond(found: Beyond) -> Claim:
     if worst is None:
         nothing = Bound(math.nan, math.nan)
         return Claim("beyond", nothing, nothing, 0, "", reason=found.reason)
-    largest = max(fold.max_mm for fold in found.folds)
+    far = max(found.folds, key=lambda fold: fold.max_mm)
+    of = f"; {found.judged} could be judged" if found.judged else ""
+    kept = "; effects not sought anew" if found.sought is False else ""
     return Claim(
         "beyond",
         Bound(worst.rms_mm, found.rms_high_mm),
-        Bound(largest, found.max_high_mm),
+        Bound(far.max_mm, found.max_high_mm),
         worst.poses,
         f"beyond the measured poses, in the worst part that was left out ({worst.where}, "
-        f"{worst.poses} poses)",
+        f"{worst.poses} poses{of}{kept})",
+        open=open_of(found),
+        sets=(f"{worst.poses} left out", f"{far.poses} left out"),
     )
+
+
+def open_of(found: Beyond) -> str:
+    """What could not be judged beyond the measured poses."""
+    if found.missed is None:
+        return "an earlier version wrote this file and does not tell which parts were not judged"
+    if not found.missed:
+        return ""
+    named = ", ".join(found.missed[:NAMED])
+    more = f" and {len(found.missed) - NAMED} more" if len(found.missed) > NAMED else ""
+    return f"only {found.judged} could be judged, not {named}{more}, which the fit needs"
 
 
 def judge(limit: Limit, claim: Claim) -> Judgement:
     """A requirement against a claim.
 
-    What was seen above the limit is not passed, however few the poses are.
+    What was seen above the limit is not passed, however few the poses are; and nothing is passed
+    while something could not be judged, for it is what the fit rests on most.
     """
     bound = claim.bound(limit.kind)
 
@@ -150,11 +179,30 @@ def judge(limit: Limit, claim: Claim) -> Judgement:
             f"{claim.poses} poses are too few for a maximum: at least {FEWEST} are needed",
         )
     if math.isnan(bound.high):
-        return told(NOT_STATED, "no 95 % limit is known")
+        return told(
+            NOT_STATED,
+            f"{bound.value:.3f} mm seen, and no 95 % limit is known: {claim.poses} poses are too "
+            "few, or too unlike each other, to tell one",
+        )
     seen = f"{bound.value:.3f} mm seen, 95 % limit {bound.high:.3f} mm"
+    if bound.high < limit.size_mm and claim.open:
+        return told(NOT_STATED, f"{seen}, but {claim.open}")
     if bound.high < limit.size_mm:
         return told(PASSED, seen)
     return told(NOT_PASSED, f"{seen}: more poses may narrow it")
+
+
+def elsewhere(judged: Judgement, other: Claim) -> str:
+    """What a requirement that is passed should not hide: another claim is above it; else empty."""
+    seen, limit = other.bound(judged.limit.kind).value, judged.limit.size_mm
+    if judged.verdict != PASSED or other.reason or not seen > limit:
+        return ""
+    asked = next(name for name in CLAIMS if name != other.name)
+    kind = {"rms": "RMS", "max": "largest"}[judged.limit.kind]
+    return (
+        f"Passed {asked} the measured poses alone: {other.name} them the {kind} error is "
+        f"{seen:.3f} mm, more than the {limit:g} mm required"
+    )
 
 
 def overall(judged: tuple[Judgement, ...]) -> str:

@@ -6,10 +6,19 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.beyond import RANK, needed
+from minimax_cal.fitting.beyond import (
+    RANK,
+    arrived,
+    moved,
+    needed,
+    step_without,
+    untold,
+    without,
+)
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 
@@ -33,8 +42,8 @@ def test_effects_stand_beside_geometry_alone(robot: mc.Robot) -> None:
     fit = mc.calibrate(robot, soft, "sum", effects=("joint_compliance:all",))
     plain = mc.calibrate(robot, soft, "sum")
     assert fit.beyond.typical_mm < 0.6 * fit.beyond.geometric_typical_mm
-    # parts that one fit needs are not judged by it, so that the folds may differ
     shared = {fold.where: fold.rms_mm for fold in plain.beyond.folds}
+    assert [fold.where for fold in fit.beyond.folds] == list(shared)  # an effect costs no part
     for fold in fit.beyond.folds:
         assert_allclose(fold.geometric_mm, shared[fold.where], rtol=5e-3)
 
@@ -67,6 +76,76 @@ def test_a_fit_that_extrapolates_badly_says_so(robot: mc.Robot) -> None:
     fit = mc.calibrate(robot, data, "sum")
     assert fit.beyond.worst_mm > 1.3 * fit.accuracy["holdout"].rms_mm
     assert "joint 2" in fit.beyond.worst.where
+
+
+def one_end(robot: mc.Robot, poses: int = 40, half: float = 0.6) -> Measurements:
+    """A last joint that turns a little about zero, but for four poses at its high end."""
+    rng, ideal = np.random.default_rng(5), simulate(robot, poses, seed=5)
+    q = ideal.data.q.copy()
+    q[:, 5] = rng.uniform(-half, half, poses)
+    q[:4, 5] = rng.uniform(2.0, 2.6, 4)
+    noise = 2e-5 * rng.normal(size=ideal.data.y.shape)
+    return replace(ideal.data, q=q).with_y(ideal.cell.predict(q) + noise)
+
+
+def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_would(
+    robot: mc.Robot,
+) -> None:
+    """Without one end of joint 6 its gear's harmonics are not told: the rest gives them up."""
+    data, gear = one_end(robot), ("gear_error:J6:orders=3",)
+    fit = mc.calibrate(robot, data, "sum", effects=gear)
+    lost = Poses.of(fit.estimator, fit.cell.state)
+    every = {part.name: part.rows for part in parts(fit.data)}
+    assert [fold.where for fold in fit.beyond.folds] == list(every)
+    assert fit.beyond.missed == ()
+    asked = [fold for fold in fit.beyond.folds if needed(lost, every[fold.where][~fit.held])]
+    assert "joint 6 at its high end" in [fold.where for fold in asked]
+    for fold in asked:
+        rows = every[fold.where]
+        labels = {"split": np.where(rows | fit.held, "holdout", "train")}
+        again = mc.calibrate(robot, replace(data, columns=labels), "sum", effects=gear)
+        error = again.cell.error(again.data)[:, rows]
+        assert_allclose(fold.rms_mm, 1e3 * np.sqrt((error**2).sum(axis=-1).mean()), rtol=0.01)
+    assert "effects not sought anew" in fit.headline()
+    assert fit.within.missed == 0
+    assert "40 poses, each judged" in fit.headline()
+
+
+def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> None:
+    data = one_end(robot, 36, half=0.5)
+    effects = ("joint_compliance:all", "gear_error:J6:orders=3")
+    fit = mc.calibrate(robot, data, "sum", effects=effects)
+    estimator, state = fit.estimator, fit.cell.state
+    poses, far = Poses.of(estimator, state), 0
+    effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
+    for part in (part.rows[~fit.held] for part in parts(fit.data)):
+        near = moved(estimator, state, step_without(poses, part))
+        if untold(poses, part, effects_of).any() or arrived(poses, near, part):
+            continue
+        far += 1
+        (found,) = without(estimator, state, [part])
+        assert found is not None
+        there = Poses.of(estimator, found)
+        step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
+        motion, left = (float(one @ there.bread @ one) for one in (step, more))
+        assert motion < 1e-6 * left  # a further step leads nowhere
+    assert far
+
+
+def test_parts_that_none_can_judge_are_counted_and_named(robot: mc.Robot) -> None:
+    """Joint 6 stands still but at a few poses, which geometry cannot do without."""
+    ideal = simulate(robot, 60, seed=5)
+    q = ideal.data.q.copy()
+    q[:, 5] = np.random.default_rng(5).uniform(-0.02, 0.02, 60)
+    q[:8, 5] += 2.0
+    data = replace(ideal.data, q=q).with_y(ideal.cell.predict(q))
+    found = mc.calibrate(robot, data, "sum", holdout=0.0).beyond
+    assert found.missed
+    made = len(found.folds) + len(found.missed)
+    assert f"{len(found.folds)} of {made} parts left out in turn" in found.sentence()
+    assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
+    assert found.to_dict()["not_judged"] == list(found.missed)
+    assert found.to_dict()["effects_sought_anew"] is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,10 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     clean = mc.calibrate(robot, noisy.data, "sum")
     # the same arm judged by the rows that are left
     assert_allclose(fit.trusted.rms_mm, clean.accuracy["holdout"].rms_mm, rtol=0.15)
-    assert fit.beyond.worst_mm < 3.0 * clean.beyond.worst_mm
+    assert fit.beyond.worst_mm > 20.0  # they judge beyond the measured poses as well
+    assert fit.beyond.trusted is not None
+    assert_allclose(fit.beyond.trusted.worst_mm, clean.beyond.worst_mm, rtol=0.3)
+    assert "without the points that stand out at worst" in fit.headline()
 
 
 def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:
@@ -71,5 +74,5 @@ def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_pa
     again = mc.load_fit(tmp_path / "fit.json")
     keys = [[(s.line, s.target, s.pose, s.held) for s in one.suspects] for one in (fit, again)]
     assert keys[0] == keys[1]
-    assert again.beyond == fit.beyond
+    assert again.beyond.to_dict() == fit.beyond.to_dict()
     assert again.trusted == fit.trusted

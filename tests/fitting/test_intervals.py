@@ -12,6 +12,7 @@ from minimax_cal.fitting.intervals import (
     chance_of_larger,
     max_interval,
     rms_interval,
+    told,
     top_of_normal,
 )
 from minimax_cal.ground.arrays import Array
@@ -66,6 +67,18 @@ def test_too_few_poses_tell_nothing() -> None:
         assert np.isnan(both(np.ones((2, m, 3)))).all()
     assert rms_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
     assert max_interval(np.zeros((1, 5, 3)), rng=rng_of()) == Interval(0.0, 0.0)
+
+
+def test_an_upper_end_of_the_law_alone_is_not_told() -> None:
+    """Seven poses of which one is nearly all of the error: no sample without it tells anything."""
+    error = np.zeros((1, 7, 3))
+    error[0, :, 0] = [2.09, 0.31, 0.35, 0.4, 0.29, 0.38, 0.33]
+    for interval, seen in ((rms_interval, np.sqrt((error**2).sum() / 7)), (max_interval, 2.09)):
+        found = interval(error, rng=rng_of())
+        assert found.high > 10.0 * seen
+        assert told(found, seen).low == found.low
+        assert np.isnan(told(found, seen).high)
+    assert told(Interval(0.5, 2.0), 1.0) == Interval(0.5, 2.0)
 
 
 def test_many_normal_errors_give_the_chi_square_interval(rng: np.random.Generator) -> None:

@@ -23,7 +23,7 @@ def test_a_fit_comes_back_whole_from_another_process() -> None:
     fit = mc.calibrate("irb120", mc.simulate("irb120", 40, 1, 0).data)
     again = pickle.loads(pickle.dumps(fit))
     assert_array_equal(again.error, fit.error)
-    assert again.beyond == fit.beyond
+    assert again.beyond.to_dict() == fit.beyond.to_dict()
 
 
 def test_robots_and_data_are_as_many() -> None:

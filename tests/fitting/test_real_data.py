@@ -104,3 +104,22 @@ def test_turning_and_moving_the_frame(times: int, name: str) -> None:
         assert max(other.accuracy["train"].sse_mm2) == pytest.approx(
             max(worst.accuracy["train"].sse_mm2), rel=1e-8
         )
+
+
+def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived() -> None:
+    """One step from the whole fit says 258 mm at an end of joint 6; files without it say 0.14."""
+    robot, path = shared("fanuc_r2000")
+    effects = ("joint_compliance:all", "gear_error:J6:orders=3")
+    fit = mc.calibrate(robot, path, effects=effects)
+    plain = mc.calibrate(robot, path)
+    assert [f.where for f in fit.beyond.folds] == [f.where for f in plain.beyond.folds]
+    assert fit.beyond.missed == plain.beyond.missed
+    end = next(f for f in fit.beyond.folds if f.where == "joint 6 at its high end")
+    assert end.rms_mm == pytest.approx(0.144, rel=0.05)
+    assert fit.within.missed == 0
+    assert fit.within.after.poses == 36
+    # the pose that stands out judges beyond the measured poses as well, and in no fit
+    worst = next(f for f in plain.beyond.folds if f.where == "joint 2 at its high end")
+    assert worst.poses == 4
+    assert plain.beyond.trusted is not None
+    assert plain.beyond.trusted.worst_mm < 0.6 * plain.beyond.worst_mm

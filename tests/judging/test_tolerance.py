@@ -15,6 +15,7 @@ from minimax_cal.judging.tolerance import (
     Claim,
     Limit,
     beyond,
+    elsewhere,
     judge,
     limits_of,
     overall,
@@ -69,6 +70,32 @@ def test_beyond_is_of_the_worst_part() -> None:
     assert (nothing.verdict, nothing.why) == (NOT_STATED, "no part can be spared")
 
 
+def test_nothing_is_passed_beyond_while_parts_could_not_be_judged() -> None:
+    folds = (Fold("one end", 20, 0.2, 0.9, 0.2),)
+    some = Beyond(folds, 0.2, 0.2, "", 0.3, 1.2, missed=("joint 2 at its low end",))
+    found = judge(Limit("rms", 0.5), beyond(some))
+    assert found.verdict == NOT_STATED
+    assert "only 1 of 2 parts could be judged, not joint 2 at its low end" in found.why
+    assert "1 of 2 parts could be judged" in beyond(some).where
+    assert judge(Limit("rms", 0.1), beyond(some)).verdict == NOT_PASSED  # seen is seen
+    old = judge(Limit("rms", 0.5), beyond(Beyond(folds, 0.2, 0.2, "", 0.3, 1.2, missed=None)))
+    assert (old.verdict, "earlier version" in old.why) == (NOT_STATED, True)
+
+
+def test_what_is_passed_does_not_hide_what_is_seen_beyond() -> None:
+    inside = claim(30)
+    passed, failed = (judge(Limit("rms", size), inside) for size in (0.2, 0.12))
+    away = beyond(Beyond((Fold("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2))
+    assert elsewhere(passed, away) == (
+        "Passed within the measured poses alone: beyond them the RMS error is 0.300 mm, more than "
+        "the 0.2 mm required"
+    )
+    assert elsewhere(failed, away) == ""
+    assert elsewhere(judge(Limit("rms", 0.35), inside), away) == ""
+    assert elsewhere(passed, inside) == ""
+    assert elsewhere(passed, beyond(Beyond(reason="none"))) == ""
+
+
 def test_limits_are_read() -> None:
     assert limits_of("rms 0.2, max 0.5") == (Limit("rms", 0.2), Limit("max", 0.5))
     assert limits_of("MAX=1mm") == (Limit("max", 1.0),)
@@ -94,4 +121,4 @@ def test_the_upper_limits_of_beyond_are_in_the_file(robot: mc.Robot) -> None:
     assert fit.beyond.worst is not None
     assert fit.beyond.rms_high_mm > fit.beyond.worst_mm
     assert fit.beyond.max_high_mm > max(fold.max_mm for fold in fit.beyond.folds) * 0.9
-    assert mc.Fit.from_dict(fit.to_dict()).beyond == fit.beyond
+    assert mc.Fit.from_dict(fit.to_dict()).beyond.to_dict() == fit.beyond.to_dict()
