@@ -1,5 +1,6 @@
 """The page to sign: which number, which verdict, what limits it; facts from a TOML."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,13 @@ from test_report import WORDING, Seen
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.judging.tolerance import limits_of
+from minimax_cal.measuring.floor import AT_MOST, Floor
 from minimax_cal.reporting import report
 from minimax_cal.reporting.html import compose, page, read_sources
 from minimax_cal.reporting.html.document import Wording
 from minimax_cal.reporting.html.facts import FACTS
+from minimax_cal.reporting.html.first_page import left_now, limits_now, signed
+from minimax_cal.reporting.html.sources import Sources
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +49,8 @@ def test_requirement_result_and_verdict(
         assert stdout.splitlines()[0] == verdict
         assert f"written: {out}" in stderr
         seen = Seen(out.read_text())
-        before, after, limit, asked, said = rows(seen)["RMS, within measured poses"]
+        poses, before, after, limit, asked, said = rows(seen)["RMS, within measured poses"]
+        assert poses == f"{fit.within.after.poses} cross-validated"
         assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
                                    f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
         assert (limit, asked, said) == (f"{high:.3f}", f"{size:.3g}", verdict)
@@ -78,11 +83,47 @@ def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None
     both = rendered(WORDING, whole, results / "gap.json")
     assert any(title == "Model: geometry, joint compliance" for title in both.tables)
     assert "Signed is the calibration" not in both.text["verdict"]
-    assert "What limits it now: the noise of the measurements" in both.text["verdict"]
+    # all that these data tell of the noise is that it is no larger than what the model leaves
+    assert "that follows nothing known; noise alone would leave at most" in both.text["verdict"]
     # parameters of effects stand once: with the fit if it has them
     assert "parameters of the effects" in plain.tables
     assert "parameters of the effects" not in both.tables
     assert "effects beyond geometry" in both.tables
+
+
+def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path) -> None:
+    fit, gap = mc.load_fit(results / "fit.json"), load_diagnosis(results / "gap.json")
+
+    def limiting(verdict: str, share: float) -> str:
+        found = tuple(replace(one, share=share) for one in gap.findings)
+        told = Sources(fit, replace(gap, verdict=verdict, findings=found))
+        return limits_now(told, signed(told, (), "within", None))
+
+    cause = "gearboxes wind up under gravity"
+    assert limiting("named", 0.9).startswith(f"{cause} (joint compliance of the whole arm), which")
+    for verdict in ("unknown", "not_repeatable"):
+        guess = limiting(verdict, 0.9)
+        assert "establishes" not in guess
+        assert f"verdict of the diagnosis: {verdict.replace('_', ' ')}" in guess
+        assert f"best guess, which this model leaves out: {cause}" in guess
+    assert cause not in limiting("named", -0.001)  # a cause that closes nothing limits nothing
+
+
+def test_a_floor_that_is_an_upper_bound_is_no_cause(results: Path) -> None:
+    gap = load_diagnosis(results / "gap.json")
+    assert gap.remainder is not None
+    rest = replace(gap.remainder, predictable_mm=0.026)
+    sure = Floor(0.043, 0.04, 0.046, "the instrument")
+    open_ = Floor(0.043, 0.0, 0.043, AT_MOST)
+    assert (sure.certain, open_.certain) == (True, False)
+    near = 0.05
+    assert left_now(replace(gap, floor=sure), near) == (
+        "the noise of the measurements, which alone leaves 0.043\N{NO-BREAK SPACE}mm."
+    )
+    told = left_now(replace(gap, floor=open_, remainder=rest), near)
+    assert told.startswith("a remainder that no known effect explains (0.026")
+    assert "at most 0.043" in told
+    assert "do not tell how much it is" in told
 
 
 def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
@@ -90,7 +131,8 @@ def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
         found = rows(rendered(wording, results / "gap.json"))["RMS, within measured poses"]
-        assert found[1] == f"{step.holdout.rms_mm:.3f}"
+        assert found[0] == f"{step.holdout.poses} held out"
+        assert found[2] == f"{step.holdout.rms_mm:.3f}"
     with pytest.raises(mc.OptionError, match="no rung 7"):
         mc.report(gap, tmp_path / "a.html", rung=7)
     with pytest.raises(mc.OptionError, match="only a report of a diagnosis alone has rungs"):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis, Finding
+from minimax_cal.diagnosing.sentences import NOTHING_MM
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
@@ -21,6 +22,7 @@ from minimax_cal.judging.tolerance import (
     Judgement,
     Limit,
     beyond,
+    elsewhere,
     judge,
     overall,
     within,
@@ -32,6 +34,8 @@ from minimax_cal.reporting.html.content import Block, Note, text
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
 
+CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
+CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
 NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
 NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
 
@@ -49,9 +53,16 @@ class Signed:
         """passed, not passed or not stated; empty without a requirement."""
         return overall(self.judged) if self.judged else ""
 
+    @property
+    def besides(self) -> list[str]:
+        """What a requirement that is passed should not hide: a claim that is above it."""
+        pairs = ((one, claim) for one in self.judged for claim in self.claims)
+        return [said for said in (elsewhere(one, claim) for one, claim in pairs) if said]
+
     def lines(self) -> list[str]:
         """For a terminal."""
-        return [self.verdict, *(one.sentence() for one in self.judged)] if self.judged else []
+        said = [one.sentence() for one in self.judged]
+        return [self.verdict, *said, *self.besides] if self.judged else []
 
 
 def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | None) -> Signed:
@@ -88,7 +99,15 @@ def claims_of(fit: Fit) -> tuple[Claim, ...]:
     """Of a calibration."""
     seen = fit.within
     held = fit.accuracy["holdout"].poses > 0 or bool(fit.error_crossed.size)
-    inside = within(seen.where, seen.before, seen.after, (seen.rms, seen.largest), seen.poses)
+    inside = within(
+        seen.where,
+        seen.before,
+        seen.after,
+        (seen.rms, seen.largest),
+        seen.poses,
+        seen.missed,
+        "cross-validated" if fit.error_crossed.size else "held out",
+    )
     if not held:
         inside = Claim("within", inside.rms, inside.largest, 0, seen.where, inside.before,
                        "no pose was held out, and training errors are too small")  # fmt: skip
@@ -141,6 +160,7 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
     banner = found.verdict[:1].upper() + found.verdict[1:] if found.verdict else NO_LIMIT
     lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
+    lines += [Note(f"{said}.", "warning") for said in found.besides]
     lines += [result_table(sources, found), text(basis(found))]
     lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
     if limiting := limits_now(sources, found):
@@ -164,12 +184,12 @@ def result_table(sources: Sources, found: Signed) -> Table:
             bound = claim.bound(kind)
             one = named.get((bound, kind))
             asked = one.limit.size_mm if one else math.nan
-            rows.append((f"{KINDS[kind]}, {title}", claim.before[i], bound.value, bound.high, asked,
-                         one.verdict if one else ""))  # fmt: skip
+            rows.append((f"{KINDS[kind]}, {title}", claim.sets[i], claim.before[i], bound.value,
+                         bound.high, asked, one.verdict if one else ""))  # fmt: skip
     rows += iso_rows(sources.fit) if sources.fit else ()
-    header = ("error of position", "before mm", "result mm", "95 % limit mm", "required mm",
-              "verdict")  # fmt: skip
-    return Table(f"Model: {found.model}", header, tuple(rows), ("", *[".3f"] * 3, ".3g", ""))
+    header = ("error of position", "poses", "before mm", "result mm", "95 % limit mm",
+              "required mm", "verdict")  # fmt: skip
+    return Table(f"Model: {found.model}", header, tuple(rows), ("", "", *[".3f"] * 3, ".3g", ""))
 
 
 def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
@@ -184,8 +204,8 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
     if not all(np.isfinite(size).any() for size in sizes):
         return []
     return [
-        (f"AP of ISO 9283, {name}", *(float(take(size)) for size in sizes), math.nan,
-         math.nan, "")
+        (f"AP of ISO 9283, {name}", f"{np.isfinite(sizes[1]).sum()} held out",
+         *(float(take(size)) for size in sizes), math.nan, math.nan, "")
         for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
     ]  # fmt: skip
 
@@ -199,26 +219,32 @@ def basis(found: Signed) -> str:
         out += f"Beyond: {away.where.removeprefix('beyond the measured poses, in ')}. "
     elif away:
         out += f"Beyond them nothing is claimed: {away.reason}. "
-    return out + (
+    out += (
         "The 95 % limits are upper ends: of the RMS over such poses, and of the largest error of "
         "as many new ones."
     )
+    told = [claim for claim in found.claims if not claim.reason]
+    if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):
+        out += " A dash: the poses are too few, or too unlike each other, to tell a limit."
+    return out
 
 
 def limits_now(sources: Sources, found: Signed) -> str:
     """The one thing that keeps the error from being smaller; empty where nobody knows."""
     left = found.claims[0].rms.value
     if sources.gap:
-        lacking = [f for f in causes(sources.gap) if not holds(sources, f)]
-        if lacking:
+        lacking = [f for f in causes(sources.gap) if not (holds(sources, f) or f.share < CLOSES)]
+        if lacking and sources.gap.verdict in CERTAIN:
             return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
-        floor = sources.gap.floor
-        alone = f"{'' if floor.certain else 'at most '}{number(floor.value)}"
-        if left <= NEAR_NOISE * floor.value:
-            return f"the noise of the measurements, which alone leaves {alone}."
-        rest = sources.gap.remainder
-        known = f" ({number(rest.predictable_mm)} of it follow the pose)" if rest else ""
-        return f"a remainder that no known effect explains{known}; noise alone would leave {alone}."
+        if lacking:
+            return (
+                f"the cause is not known (verdict of the diagnosis: "
+                f"{sources.gap.verdict.replace('_', ' ')}). Its best guess, which this model "
+                f"leaves out: {said_of(lacking)}."
+            )
+        guess = sources.gap.verdict == "unknown" and causes(sources.gap)
+        names = " The diagnosis calls the names in this model a best guess." if guess else ""
+        return left_now(sources.gap, left) + names
     if sources.fit:
         few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
         if few:
@@ -228,6 +254,25 @@ def limits_now(sources: Sources, found: Signed) -> str:
             "measurements tells its cause."
         )
     return ""
+
+
+def left_now(gap: Diagnosis, left: float) -> str:
+    """What remains beneath the causes that were found.  left: RMS [mm].
+
+    A floor that is only the most that noise may be tells no cause: it is what the model leaves.
+    """
+    floor, rest = gap.floor, gap.remainder
+    if floor.certain and left <= NEAR_NOISE * floor.value:
+        return f"the noise of the measurements, which alone leaves {number(floor.value)}."
+    noise = f"noise alone would leave {'' if floor.certain else 'at most '}{number(floor.value)}"
+    if not floor.certain:
+        noise += ", and these data do not tell how much it is"
+    if rest and not rest.predictable_mm < NOTHING_MM:
+        known = f"{number(rest.predictable_mm)} of it follow the pose"
+        return f"a remainder that no known effect explains ({known}); {noise}."
+    if rest and not floor.certain:
+        return f"a remainder of {number(left)} that follows nothing known; {noise}."
+    return f"a remainder that no known effect explains; {noise}."
 
 
 def causes(gap: Diagnosis) -> list[Finding]:

@@ -26,8 +26,10 @@ def number(value: float) -> str:
 def within(interval: Interval) -> str:
     """An interval, nothing where it is not known."""
     low, high = 1e3 * interval.low, 1e3 * interval.high
-    if math.isnan(low) or math.isnan(high):
+    if math.isnan(low):
         return ""
+    if math.isnan(high):
+        return f" (95 % interval from {low:.3f}\N{NO-BREAK SPACE}mm; no upper end is known)"
     return f", 95 % interval {low:.3f} to {high:.3f}\N{NO-BREAK SPACE}mm"
 
 
