@@ -330,10 +330,12 @@ def arrived(poses: Poses, near: State, part: Array) -> bool:
 
     poses: at the whole fit, whose error there is what counts.  near: a step from it.  part: (m,).
     """
-    there = Poses.of(poses.estimator, near)
-    step = step_without(there, part)
-    motion = float(step @ there.gram_of(part) @ step)
-    error = float(poses.estimator.whole.take(part).cost(poses.state).sum())
+    there, whole = Poses.of(poses.estimator, near), poses.estimator.whole
+    own, (gram, pull) = whole.take(part), there.sums_of(~part)
+    left = pull + there.prior * there.off
+    step = solve_normal(gram + np.diag(there.prior), left[:, None])[:, 0]
+    motion = float(step @ own.normal(near, whole.active).gram.sum(axis=0) @ step)
+    error = float(own.cost(poses.state).sum())
     return motion <= NEAR**2 * error  # not so where the step is no number
 
 

@@ -79,7 +79,8 @@ def calibrated(job: Job) -> Row:
     if fit.status is Status.FAILED:
         raise CalibrationError(f"the fit failed: {fit.status.advice}")
     found = fit.within
-    claim = within(found.where, found.before, found.after, (found.rms, found.largest), found.poses)
+    ends = found.rms, found.largest
+    claim = within(found.where, found.before, found.after, ends, found.poses, found.missed)
     judged = tuple(judge(limit, claim) for limit in limits_of(told.tolerance))
     changed: tuple[str, ...] = ()
     said = [one.sentence() for one in judged]
