@@ -15,6 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from .problem import COLD, EMPTY, BackendError, Solution, Status, nothing
+from .quiet import ungreeted
 from .rows import multipliers, split
 from .traits import reason, settings
 
@@ -59,7 +60,7 @@ def solve(
     chosen = check(method)
     rows = split(problem)
     small = problem.q.size * (problem.q.size + problem.l.size) <= LARGEST_COMPILED
-    with _lock, warnings.catch_warnings():
+    with _lock, warnings.catch_warnings(), ungreeted(chosen):
         warnings.simplefilter("ignore")
         if small and not problem.has_sparse:
             model = _compiled(problem.q.size, rows.h.size, rows.b.size)

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from . import child
 from .problem import COLD, EMPTY, BackendError, Solution, Status, dense
+from .quiet import ungreeted
 from .rows import Rows, multipliers, parts, split
 from .traits import TRAITS, Trait, reason, settings
 
@@ -80,7 +81,7 @@ def _warm(trait: Trait, rows: Rows, guess: Solution, size: int) -> dict[str, Any
 
 def _run(qp: qpsolvers.Problem, method: str, chosen: dict[str, Any]) -> Any:
     """One call of the solver, its warnings silenced: the judge looks at the answer anyway."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), ungreeted(method):
         warnings.simplefilter("ignore")
         return qpsolvers.solve_problem(qp, method, **chosen)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import time
 import warnings
 
@@ -122,6 +124,20 @@ def test_unbounded_problems_are_recognised(name):
     assert_allclose(problem.P @ ray, 0.0, rtol=0, atol=1e-9)
     assert problem.q @ ray < -1e-3
     assert problem.A @ ray <= 1e-9
+
+
+@pytest.mark.parametrize("name", [*INSTALLED, *CVXPY, *(["cvxpy:HIGHS"] * ("highs" in INSTALLED))])
+def test_a_backend_says_nothing(name, capfd):
+    """Nor do those that take over: stdout is for what a command answers."""
+    rng = np.random.default_rng(6)
+    impossible = Problem(np.eye(1), [0.0], [[1.0], [1.0]], [-INF, 1.0], [0.0, INF])
+    endless = Problem(np.zeros((1, 1)), [-1.0], [[1.0]], [0.0], [INF])
+    for problem in (epigraph(rng), random_problem(rng), impossible, endless):
+        solve(problem, name)
+        solve(problem, name, tolerance=1e-300)  # nobody is good enough: all are asked
+    if sys.platform != "win32":
+        ctypes.CDLL(None).fflush(None)  # what is printed from C waits in a buffer of its own
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("name", EXACT)
