@@ -118,9 +118,7 @@ def arm_of(
     poses = still(q, cell.target_names, robot) if measured is None else measured
     scene = cell.scene(poses)
     begun = stiff(robot, masses or masses_of(robot, LEAST_MASS))
-    parts = Parts(replace(begun, spots=cell.target_positions))
-    for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
-        ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
+    parts = parts_of(cell, scene, replace(begun, spots=cell.target_positions))
     change = np.zeros(sum(len(values) for _, values in parts.firm))
     if parts.exact and not (parts.soft and masses):
         for sag, drawn in parts.tools:
@@ -222,6 +220,21 @@ class Parts:
         return replace(self.arm, mapped=mapped, left_out=tuple(self.left_out))
 
 
+def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
+    """What is to hold each effect of a cell; those of 0 need nothing.  arm: to begin with."""
+    parts = Parts(arm)
+    for term, values in zip(cell.effects.terms, cell.effects.values, strict=True):
+        if values.any():
+            ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
+    return parts
+
+
+def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:
+    """Those effects of a cell that, with its values, only a command map can hold."""
+    parts = parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))
+    return tuple(term for term, _ in parts.mapped if term in cell.effects.terms)
+
+
 Element = Callable[[Parts, Scene, Term, Array], None]
 
 
@@ -264,7 +277,7 @@ def compliance(parts: Parts, scene: Scene, term: Term, values: Array) -> None:
         if value > 0.0:
             turn[part // 4] += value
             parts.soft.append((one, np.array([value])))
-        else:
+        elif value < 0.0:
             parts.mapped.append((one, np.array([value])))
     parts.put(turn=turn)
 

@@ -1,4 +1,4 @@
-"""What a calibration says is wrong with an arm, as a series of fits: geometry, then each effect."""
+"""What a calibration says is wrong with an arm, and fits of the same poses with some of it."""
 
 from __future__ import annotations
 
@@ -22,27 +22,37 @@ from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.robots.robot import Robot
-from minimax_cal.simulators.arm import ELEMENTS, assumed
+from minimax_cal.simulators.arm import ELEMENTS, assumed, why_not
 from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.given import told_masses
 
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """names: of the rungs from geometry on.  fits: of each; the last holds what can be mapped too.
+    """given: the fit that others are made of.  geometry: the same without effects.
 
+    firm: effects of which a simulator may have an element, in order.  turning: others that turn
+    joints only, for a command map.  left_out: what is neither, and why.
     data: the measurements that the simulator is judged by, with their history; held: (m,) True
     where held out.  floor: what noise alone would leave, None untold.  same: whether these are the
     poses of the fits.
     """
 
-    names: tuple[str, ...]
-    fits: tuple[Fit, ...]
-    whole: Fit
+    given: Fit
+    geometry: Fit
+    firm: tuple[Term, ...]
+    turning: tuple[Term, ...]
+    left_out: tuple[str, ...]
     data: Measurements
     held: Array
     floor: Floor | None
     same: bool
+
+    def fitted(self, terms: Sequence[Term]) -> Fit:
+        """The same poses fitted with these effects and no others: values belong together."""
+        if [t.text for t in terms] == [t.text for t in self.given.cell.effects.terms]:
+            return self.given
+        return again(self.given, effects=tuple(t if t.choice else t.label for t in terms))
 
 
 def causes_of(
@@ -74,18 +84,16 @@ def causes_of(
         terms = carried_over(terms, robot)
         fit = weighed(fit, chain, [t.label if not t.choice else t for t in terms])
         terms = fit.cell.effects.terms
-    firm = [term for term in terms if term.effect in ELEMENTS]
-    labels = list(dict.fromkeys(term.label for term in firm))
-    fits = [fit if not fit.cell.effects.terms else again(fit, effects=())]
-    for i in range(len(labels)):
-        progress(f"fit with {labels[i]}")
-        fits.append(fitted(fit, [t for t in firm if t.label in labels[: i + 1]]))
-    others = [term for term in terms if term not in firm and maps(term, fit)]
-    whole = fitted(fit, [*firm, *others]) if others else fits[-1]
+    geometry = fit if not fit.cell.effects.terms else again(fit, effects=())
+    firm = tuple(term for term in terms if term.effect in ELEMENTS)
+    others = [term for term in terms if term.effect not in ELEMENTS]
+    turning = tuple(term for term in others if maps(term, fit))
+    left_out = tuple(
+        f"{term.label}: {why_not(EFFECTS[term.effect])}" for term in others if term not in turning
+    )
     rows, held, same = judged_by(fit, data, chosen)
     floor = told.floor if told else None
-    names = ("calibrated geometry", *(f"+ {label.replace(':', ' ')}" for label in labels))
-    return Causes(names, tuple(fits), whole, rows, held, floor, same)
+    return Causes(fit, geometry, firm, turning, left_out, rows, held, floor, same)
 
 
 def weighed(fit: Fit, chain: Chain, effects: Sequence[Term | str]) -> Fit:
@@ -127,13 +135,6 @@ def rests_on_guesses(term: Term) -> bool:
     return bool({"assumed", "tool"} & term.choice.keys()) or any(
         part % 4 != WHOLE for part in parts
     )
-
-
-def fitted(fit: Fit, terms: Sequence[Term]) -> Fit:
-    """The same poses fitted with some effects; that fit itself where they are its own."""
-    if [t.text for t in terms] == [t.text for t in fit.cell.effects.terms]:
-        return fit
-    return again(fit, effects=tuple(t if t.choice else t.label for t in terms))
 
 
 def maps(term: Term, fit: Fit) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from minimax_cal.correcting.exporters.job import Export
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
@@ -21,8 +21,9 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.transforms import inverse
-from minimax_cal.simulators.arm import Arm, arm_of, assumed
+from minimax_cal.simulators.arm import Arm, arm_of, assumed, unheld
 from minimax_cal.simulators.causes import Causes, causes_of
 from minimax_cal.simulators.chain import Chain, chain_of, mujoco
 from minimax_cal.simulators.commands import Commands
@@ -33,6 +34,9 @@ from minimax_cal.simulators.rest import at_rest
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
 
+AGREES, AGREES_MM = 0.1, 0.002  # of an error by a fit's formulas, and the simulator's [-, mm]
+WORSE = 0.01  # relative rise of an error that is one
+COMMANDED = ".commands.xml"  # ending of a model that a command map belongs to
 TRAINING = 200  # poses that place base and targets
 
 
@@ -71,23 +75,26 @@ def simulator_gap(
     if not causes.held.any():
         raise OptionError(f"{causes.data.source}: no pose is held out; give holdout=0.2")
     run = Run(given, chain, causes, progress)
-    rungs = [*run.before(), *run.corrected()]
-    failed = causes.fits[-1].status is Status.FAILED
+    rungs, best = run.before(), run.corrected()
+    failed = best.fit.status is Status.FAILED
     path = None if write is None or failed else Path(write)
-    made = run.last(rungs[-1], path)
+    made = run.last(best, path)
+    rungs += [*best.rungs[:-1], made.rung]
+    notices = (*rows.notices, *run.notices, *made.notices,
+               *disagreement([*rungs, *([made.commands] if made.commands else [])]))  # fmt: skip
     return SimulatorGap(
         model=str(model),
         robot=chain.robot.name,
-        rungs=(*rungs[:-1], made.rung),
+        rungs=tuple(rungs),
         commands=made.commands,
         floor=causes.floor.value if causes.floor else float("nan"),
         floor_from=causes.floor.source if causes.floor else "",
         train_poses=int((~causes.held).sum()),
         holdout_poses=int(causes.held.sum()),
-        status=causes.fits[-1].status,
-        beyond=causes.fits[-1].beyond.to_dict(),
-        left_out=made.arm.left_out,
-        notices=tuple(dict.fromkeys((*rows.notices, *run.notices, *made.notices))),
+        status=best.fit.status,
+        beyond=best.fit.beyond.to_dict(),
+        left_out=made.left_out,
+        notices=tuple(dict.fromkeys(notices)),
         written="" if path is None else str(path),
         seconds=time.perf_counter() - began,
         provenance=Provenance.of(chain.robot, rows, {"model": str(model), "holdout": holdout,
@@ -96,12 +103,25 @@ def simulator_gap(
 
 
 @dataclass(frozen=True, eq=False)
+class Best:
+    """What the simulator is best with.  rungs: from geometry on.  fit: with their effects together.
+
+    mapped: effects for a command map.  left_out: what is in neither, and why.
+    """
+
+    rungs: tuple[Rung, ...]
+    fit: Fit
+    mapped: tuple[Term, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Last:
     """The last rung, measured from the file that holds it, and with its command map."""
 
     rung: Rung
     commands: Rung | None
-    arm: Arm
+    left_out: tuple[str, ...]
     notices: tuple[str, ...]
 
 
@@ -115,7 +135,7 @@ class Run:
         self.rows = np.sort(np.concatenate([some, np.flatnonzero(causes.held)]))
         self.data = causes.data.take(self.rows)
         self.held = causes.held[self.rows]
-        self.nominal = causes.fits[0].before
+        self.nominal = causes.geometry.before
         self.notices: list[str] = []
 
     def before(self) -> list[Rung]:
@@ -136,47 +156,68 @@ class Run:
             replace(stiff, why="gains that hold the arm where it is commanded"),
         ]
 
-    def corrected(self) -> list[Rung]:
-        """A rung for geometry, and for each effect that has an element."""
-        out = []
-        for name, fit in zip(self.causes.names, self.causes.fits, strict=True):
+    def corrected(self) -> Best:
+        """A rung for geometry, and for each effect that the simulator holds and gains by.
+
+        Each is fitted with those before it and with nothing else: the values of a fit hold
+        together, and an element with those of a fit that had more does not do what that fit says.
+        """
+        fit, taken = self.causes.geometry, list[Term]()
+        mapped, left_out = list(self.causes.turning), list(self.causes.left_out)
+        rungs = [self.fitted("calibrated geometry", fit)]
+        for term in self.causes.firm:
+            self.progress(f"fit with {term.label}")
+            more = self.causes.fitted([*taken, term])
+            if unheld(more.cell, more.train):
+                mapped.append(term)
+                continue
+            rung = self.fitted(f"+ {term.label.replace(':', ' ')}", more)
+            if worse(rung, rungs[-1]):
+                change = f"{rungs[-1].holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
+                left_out.append(f"{term.label}: the simulated arm is worse with it ({change})")
+                continue
+            fit, taken = more, [*taken, term]
+            rungs.append(rung)
+        return Best(tuple(rungs), fit, tuple(mapped), tuple(left_out))
+
+    def last(self, best: Best, path: Path | None) -> Last:
+        """The last rung from its file, with targets, and what a command map does."""
+        fit, arm, before = best.fit, self.arm(best.fit), best.rungs[-1]
+        tree, notices = self.tree(arm, fit)
+        rung = self.rung(before.name, self.saved(tree, path), fit.cell, arm, fit)[0]
+        commands = None
+        if best.mapped:
+            fit = self.causes.fitted([*fit.cell.effects.terms, *best.mapped])
             arm = self.arm(fit)
-            out.append(self.rung(name, self.of(self.tree(arm, fit)), fit.cell, arm, fit)[0])
-        return out
+        if arm.mapped.terms:
+            commands = self.with_commands(arm, fit, path)
+        left_out = (*best.left_out, *arm.left_out)
+        notices = (*notices, *told(replace(arm, remainder=0.0, left_out=left_out)))
+        return Last(replace(rung, why=before.why), commands, left_out, notices)
 
-    def last(self, before: Rung, path: Path | None) -> Last:
-        """The last rung from its file, with targets, and what its command map does."""
-        cell = self.causes.fits[-1].cell
-        whole = self.arm(self.causes.whole)
-        arm = self.arm(self.causes.fits[-1])
-        tree, notices = corrected(
-            self.given, self.chain, self.nominal.robot, arm, cell.target_names
-        )
+    def saved(self, tree: ET.Element, path: Path | None) -> Chain:
+        """The arm in a changed tree, from the file where one is written."""
         content = text_of(moved_to(tree, self.given.folder, path))
-        made = Export(content, (), beside(self.causes.whole.cell, whole))
-        chain = self.chain_in(self.given.compiled(tree))
-        if path is not None:
-            write_whole(path, made.content)
-            for ending, more in made.beside.items():
-                write_whole(path.with_suffix(ending), more)
-            chain = self.chain_in(mujoco().MjModel.from_xml_path(str(path)))
-        rung, _ = self.rung(before.name, chain, cell, arm, self.causes.fits[-1])
-        mapped = None
-        if whole.mapped.terms:
-            mapped = self.with_commands(whole)
-        return Last(
-            replace(rung, why=before.why),
-            mapped,
-            whole,
-            (*notices, *told(replace(whole, remainder=0.0))),
-        )
+        if path is None:
+            return self.of(tree)
+        write_whole(path, content)
+        return self.chain_in(mujoco().MjModel.from_xml_path(str(path)))
 
-    def with_commands(self, whole: Arm) -> Rung:
-        """The arm with all effects, driven with mapped commands."""
-        fit = self.causes.whole
-        tree = self.tree(whole, fit)
+    def with_commands(self, whole: Arm, fit: Fit, path: Path | None) -> Rung:
+        """The arm with all effects, driven with mapped commands.
+
+        It is another arm than that of the last rung: what commands take over changes the rest.
+        """
+        model = None if path is None else path.with_suffix(COMMANDED)
+        chain = self.saved(self.tree(whole, fit)[0], model)
+        if path is not None and model is not None:
+            for ending, content in beside(fit.cell, whole).items():
+                write_whole(path.with_suffix(ending), content)
+            self.notices.append(
+                f"{model}: the model that the command map belongs to; {path} is the best without"
+            )
         commands = Commands(replace(fit.cell, effects=whole.mapped)).follow(self.data)
-        rung, _ = self.rung("with its command map", self.of(tree), fit.cell, whole, fit, commands)
+        rung, _ = self.rung("with its command map", chain, fit.cell, whole, fit, commands)
         return replace(rung, why="commands corrected for " + ", ".join(
             dict.fromkeys(term.label for term in whole.mapped.terms)))  # fmt: skip
 
@@ -188,10 +229,16 @@ class Run:
         some = fit.train.take(np.arange(0, fit.train.poses, max(1, fit.train.poses // TRAINING)))
         return arm_of(fit.cell, masses=own, measured=some)
 
-    def tree(self, arm: Arm, fit: Fit) -> ET.Element:
-        """The model's tree with an arm and its targets in it."""
+    def fitted(self, name: str, fit: Fit) -> Rung:
+        """The simulator with the arm of a fit."""
+        arm = self.arm(fit)
+        return self.rung(name, self.of(self.tree(arm, fit)[0]), fit.cell, arm, fit)[0]
+
+    def tree(self, arm: Arm, fit: Fit) -> tuple[ET.Element, tuple[str, ...]]:
+        """The model's tree with an arm and its targets in it, and notices."""
         names = fit.cell.target_names
-        return corrected(self.given, self.chain, self.nominal.robot, arm, names)[0]
+        tree, notices = corrected(self.given, self.chain, self.nominal.robot, arm, names)
+        return tree, tuple(notices)
 
     def of(self, tree: ET.Element) -> Chain:
         """The arm in a changed tree."""
@@ -232,8 +279,9 @@ class Run:
         held, train = accuracy(error[:, self.held]), accuracy(error[:, ~self.held])
         told = fit.accuracy["holdout"].rms_mm if fit and self.causes.same else float("nan")
         off = np.abs(rested.q - asked)[:, ~chain.robot.prismatic]
-        return Rung(name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
-                    1e3 * float(off.max(initial=0.0)), told), rested.driven  # fmt: skip
+        rung = Rung(name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
+                    1e3 * float(off.max(initial=0.0)), told)  # fmt: skip
+        return rung, rested.driven
 
     def tell(self, name: str, moving: Array, touching: Array) -> None:
         """Notices on poses that did not come to rest, or where something touched the arm."""
@@ -243,6 +291,25 @@ class Run:
                 self.notices.append(
                     f"{name}: the simulated arm {what} at {rows.sum()} poses (lines {lines})"
                 )
+
+
+def disagreement(rungs: Sequence[Rung]) -> list[str]:
+    """A notice on each rung at which the simulator does other than the formulas of its fit."""
+    return [
+        f"{rung.name}: the simulated arm misses by {rung.holdout_rms_mm:.4f} mm where the fit "
+        f"says {rung.predicted_rms_mm:.4f} mm"
+        for rung in rungs
+        if abs(rung.holdout_rms_mm - rung.predicted_rms_mm)
+        > max(AGREES * rung.predicted_rms_mm, AGREES_MM)
+    ]
+
+
+def worse(rung: Rung, before: Rung) -> bool:
+    """Whether the simulator misses by more than before, on the training poses or the others."""
+    return (
+        rung.train_rms_mm > (1.0 + WORSE) * before.train_rms_mm
+        or rung.holdout_rms_mm > (1.0 + WORSE) * before.holdout_rms_mm
+    )
 
 
 def guess(cell: Cell, pose: Array, q: Array) -> tuple[Array, Array]:

@@ -33,8 +33,8 @@ def told(arm: Arm) -> list[str]:
     if arm.mapped.terms:
         named = ", ".join(dict.fromkeys(term.label for term in arm.mapped.terms))
         out.append(
-            f"{named}: no element of a simulator; the file beside (*{COMMANDS}) corrects commands: "
-            "ctrl = mc.load_commands(PATH)(q)"
+            f"{named}: no element of a simulator; the file beside (*{COMMANDS}) corrects commands, "
+            "and the model counts on it: ctrl = mc.load_commands(PATH)(q)"
         )
     out += [f"not in the file: {text}" for text in arm.left_out]
     if arm.remainder:

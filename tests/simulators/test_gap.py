@@ -1,28 +1,33 @@
 """The gap in a simulator: rung by rung what the fit says, and the corrected file keeps it."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import Fitted, Term, terms
 from minimax_cal.robots.gravity import tubes
-from minimax_cal.simulators.result import SimulatorGap, load_simulator_gap
+from minimax_cal.robots.sampling import random_poses
+from minimax_cal.simulators.result import Rung, SimulatorGap, load_simulator_gap
 from tests.conftest import run, shared
 from tests.problems_mjcf import published_like
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
 from experiments import simulator_gap as study  # noqa: E402
+from minimax_cal.simulators import ladder  # noqa: E402
 from minimax_cal.simulators.causes import carried_over  # noqa: E402
 from minimax_cal.simulators.chain import chain_of  # noqa: E402
 from minimax_cal.simulators.given import read_model  # noqa: E402
 
 AGREES = 0.01  # between simulator and fit, held-out RMS [mm]
+PLACED = 0.15  # of an error that the poses it is judged by have placed
 WITHIN = 1.1  # of the rung that holds only effects with an element
 KEYS = {"name", "holdout_rms_mm", "holdout_max_mm"}
 
@@ -128,6 +133,98 @@ def test_the_study_in_its_quick_form() -> None:
     for rung in result.gap.rungs[2:]:
         assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
     assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < AGREES
+
+
+@pytest.fixture(scope="module")
+def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An arm whose second joint gives way to light loads most, which no spring does, and a fit."""
+    folder = tmp_path_factory.mktemp("stiffening")
+    robot = study.weighed(mc.load_robot("irb2600"))
+    rng = np.random.default_rng(0)
+    plain = mc.simulate(robot, 3, seed=0, truth=mc.Truth(noise=0.0)).cell
+    q = random_poses(robot, 100, rng, 2.0)
+    effects = ("joint_compliance:all", "joint_compliance:J2:within=60", "base_flex:frame")
+    scene = plain.scene(mc.measurements(q, plain.predict(q)))
+    found = terms(scene, effects)
+    sizes = (3e-6, 1e-5, 5e-7)
+    values = tuple(
+        np.full(len(t.columns(scene).names), c) for t, c in zip(found, sizes, strict=True)
+    )
+    y = replace(plain, effects=Fitted(found, values)).predict(q)
+    data = mc.measurements(q, y + 10e-6 * rng.normal(size=y.shape))
+    mc.export(robot, "mjcf", folder / "arm.xml", notify=lambda notice: None)
+    mc.write_measurements(folder / "poses.csv", data)
+    mc.calibrate(robot, folder / "poses.csv", "sum", effects=effects).save(folder / "fit.json")
+    return folder
+
+
+def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_is_not_used(
+    stiffening: Path,
+) -> None:
+    written = stiffening / "corrected.xml"
+    ways = {"data": stiffening / "poses.csv", "fit": stiffening / "fit.json"}
+    gap = mc.simulator_gap(stiffening / "arm.xml", **ways, write=written)
+    names = [rung.name for rung in gap.rungs[2:]]
+    assert names == ["calibrated geometry", "+ joint_compliance all", "+ base_flex frame"]
+    held = [rung.holdout_rms_mm for rung in gap.rungs[2:]]
+    assert sorted(held, reverse=True) == held
+    assert gap.commands is not None
+    assert gap.commands.holdout_rms_mm < 0.7 * held[-1]
+    for rung in (*gap.rungs[2:], gap.commands):
+        assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < AGREES
+    assert not any("where the fit says" in notice for notice in gap.notices)
+    # the model that is driven with the map is another file than the best one without
+    commands = mc.load_commands(stiffening / "corrected.commands.json")
+    fit = mc.load_fit(stiffening / "fit.json")
+    told = {"corrected.xml": (gap.rungs[-1], lambda q: q),
+            "corrected.commands.xml": (gap.commands, commands)}  # fmt: skip
+    for name, (rung, asked) in told.items():
+        alone = driven(stiffening / name, fit, asked)
+        assert abs(alone - rung.holdout_rms_mm) < PLACED * rung.holdout_rms_mm
+
+
+def driven(path: Path, fit: mc.Fit, asked: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Held-out RMS of a file where it rests, placed as well as can be [mm]."""
+    model, points = mujoco.MjModel.from_xml_path(str(path)), []
+    data, names = mujoco.MjData(model), fit.data.target_names
+    for q in fit.data.q[fit.held]:
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = asked(q)
+        for i in range(6):
+            data.joint(f"joint{i + 1}").qpos[0] = q[i]
+        mujoco.mj_step(model, data, 1500)
+        points += [data.site(name).xpos.copy() for name in names]
+    seen, real = np.array(points), fit.data.y[fit.held].reshape(-1, 3)
+    _, off = Rotation.align_vectors(real - real.mean(axis=0), seen - seen.mean(axis=0))
+    return float(1e3 * off / np.sqrt(len(real)))
+
+
+def test_what_makes_the_simulator_worse_is_not_written(
+    stiffening: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ladder, "WORSE", -0.9)  # no rung is so much better
+    monkeypatch.setattr(ladder, "AGREES_MM", -1.0)
+    gap = mc.simulator_gap(
+        stiffening / "arm.xml", stiffening / "poses.csv", fit=stiffening / "fit.json",
+        write=tmp_path / "corrected.xml",
+    )  # fmt: skip
+    assert gap.rungs[-1].name == "calibrated geometry"
+    assert any(
+        text.startswith("joint_compliance:all: the simulated arm is worse with it")
+        for text in gap.left_out
+    )
+    assert any("not in the file: base_flex:frame" in text for text in gap.notices)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml"))
+    assert "base_flex_x" not in [model.joint(i).name for i in range(model.njnt)]
+
+
+def test_a_simulator_that_does_other_than_the_fit_says_so() -> None:
+    rung = Rung("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
+    (said,) = ladder.disagreement([rung, replace(rung, predicted_rms_mm=0.0900)])
+    assert said == (
+        "+ base_flex frame: the simulated arm misses by 0.0950 mm where the fit says 0.0800 mm"
+    )
+    assert not ladder.disagreement([replace(rung, predicted_rms_mm=float("nan"))])
 
 
 @pytest.mark.slow
