@@ -24,8 +24,8 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.stations import Sessions
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Term, names_of
+from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
+from minimax_cal.modelling.effects.table import NOTHING, Term, names_of
 from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
@@ -34,8 +34,6 @@ from minimax_cal.solvers.least_squares import solve_normal
 
 PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
 SETTLED = 1e-4  # relative change of the weighed square that ends them
-ROUNDING = 1e-9  # of a parameter's largest value
-FARTHEST = 0.02  # of the reach: no effect of a body moves a point farther
 WORSE = 1e-3  # relative rise of the training error that is none
 
 
@@ -158,6 +156,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
         state = moved(Estimator(model, np.ones(len(model.y))), state, step)
         if gain <= SETTLED * square:
             break
+    state = replace(state, effects=settled(state.effects, allowed))
     model, state = extended(base, robot, data, state, terms) if terms else (base, state)
     model = believing(model, weight)
     return Joint(study, terms, state, model, at_bounds(state.effects, allowed))
@@ -168,26 +167,3 @@ def believing(model: Model, weight: Array) -> Model:
     whole = model.prior.weight.copy()
     whole[len(whole) - len(weight) :] += weight
     return replace(model, prior=replace(model.prior, weight=whole))
-
-
-def at_bounds(values: Array, allowed: Array) -> Array:
-    """(e,) True for parameters that lie at one of their bounds (e, 2), but for rounding."""
-    most = np.abs(allowed).max(axis=1, keepdims=True)
-    near = ROUNDING * np.where(np.isfinite(most), most, 0.0)
-    return np.asarray((np.abs(values[:, None] - allowed) <= near).any(axis=1))
-
-
-def bounds(scene: Scene, terms: Sequence[Term]) -> Array:
-    """(e, 2) between which the parameters of effects must lie: of compliances not below 0."""
-    out = [np.zeros((0, 2))]
-    for term in terms:
-        columns = term.columns(scene)
-        if len(columns.ridge):  # a prior holds them
-            out.append(np.full((len(columns.names), 2), np.inf) * [-1.0, 1.0])
-            continue
-        fields = columns.displacement(scene)
-        size = np.sqrt((fields**2).sum(axis=2)).max(axis=(1, 2))
-        most = FARTHEST * scene.robot.reach() / np.maximum(size, 1e-300)
-        least = np.where(EFFECTS[term.effect].upward(columns), 0.0, -most)
-        out.append(np.stack([least, most], axis=1))
-    return np.concatenate(out)

@@ -378,7 +378,8 @@ def parameters_of(solved: Solved) -> Parameters:
         return replace(x, effects=effects).along(solved.nominal.rotation)
 
     before = values(solved.nominal, solved.start)
-    after = np.where(known.active, values(solved.state, solved.frames), before)
+    found = known.active | (np.arange(solved.names.count) >= solved.names.geometric)
+    after = np.where(found, values(solved.state, solved.frames), before)
     every = link_by_link(solved.names, sure.units, before, after, sure.sigma, known)
     return Parameters(every, sure.dof)
 
@@ -417,7 +418,7 @@ def worst_case(
                 kept.pairs,
                 kept.mean,
                 kept.tolerance,
-                best.lam if len(best.lam) else np.zeros(len(kept.mean)),
+                best.lam[: len(kept.mean)] if len(best.lam) else np.zeros(len(kept.mean)),
                 strict=True,
             )
         ),

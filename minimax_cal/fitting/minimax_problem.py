@@ -86,14 +86,32 @@ class MinimaxProblem:
 
     @cached_property
     def lower(self) -> Array:
-        """Lower bounds of the scaled distance deviations."""
+        """Lower bounds of the scaled distance deviations, and of the effects' parameters."""
         count = len(self.distances.mean)
-        return np.full(count, -1.0 if self.form == "two-sided" else -np.inf)
+        least = np.full(count, -1.0 if self.form == "two-sided" else -np.inf)
+        return np.concatenate([least, self.room[:, 0]])
 
     @cached_property
     def upper(self) -> Array:
-        """Upper bounds of the scaled distance deviations."""
-        return np.ones(len(self.distances.mean))
+        """Upper bounds of the same."""
+        return np.concatenate([np.ones(len(self.distances.mean)), self.room[:, 1]])
+
+    @cached_property
+    def held(self) -> Array:
+        """(b,) the free parameters, by their place among these, that have bounds."""
+        model = self.model
+        ends = np.full((model.names.count, 2), np.inf) * [-1.0, 1.0]
+        if len(model.room):
+            ends[model.names.geometric :] = model.room
+        return np.flatnonzero(np.isfinite(ends[model.active]).any(axis=1))
+
+    @cached_property
+    def room(self) -> Array:
+        """(b, 2) their bounds, scaled."""
+        if not len(self.held):
+            return np.zeros((0, 2))
+        which = np.flatnonzero(self.model.active)[self.held] - self.model.names.geometric
+        return np.asarray(self.model.room[which] * self.scale[self.held, None])
 
     @cached_property
     def squared_scale(self) -> Array:
@@ -107,7 +125,17 @@ class MinimaxProblem:
         return first + 3 * self.distances.pairs.T[..., None] + np.arange(3)
 
     def deviation(self, x: State) -> tuple[Array, Array]:
-        """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p)."""
+        """Model minus measured distance, over the tolerance: (l,), and its derivative (l, p).
+
+        Below them the parameters that have bounds, scaled.
+        """
+        value = self.model.values(x)[self.model.active][self.held] * self.scale[self.held]
+        apart, jacobian = self.distance(x)
+        own = np.eye(len(self.scale))[self.held]
+        return np.concatenate([apart, value]), np.concatenate([jacobian, own])
+
+    def distance(self, x: State) -> tuple[Array, Array]:
+        """The part of `deviation` that is about distances."""
         kept = self.distances
         count = len(kept.mean)
         if not count:

@@ -26,6 +26,7 @@ from minimax_cal.measuring.history import Clock
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import Frames, Sessions, seen_from
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term, names_of, of_sessions
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import extended, fitted, scene_of
@@ -54,6 +55,7 @@ PRIOR_ROUNDS = 20  # of weighing a prior against the noise that remains
 FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
+AT_BOUND = "at its bound"
 EXACT = 1e-9  # an error below is rounding: data that were computed, not measured [m]
 HOPELESS = 10.0 * POOR_FIT  # worst errors above this share of the reach: no calibration, so that
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
@@ -233,18 +235,21 @@ def fit_cell(
     believed = np.where(stage.robust.weights.T[..., None] > DOUBTED, data.y, np.nan)
     distances = measured_distances(data.with_y(believed), options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
-    state = optimum.x if optimum else stage.state
+    state, identification = optimum.x if optimum else stage.state, stage.identification
+    if len(model.room):
+        rests = at_bounds(state.effects, model.room)
+        identification = without_resting(identification, model.names, rests)
     effects, units = NOTHING, tuple[str, ...]()
     if stage.terms:
         scene = scene_of(robot, data, model, state)
         effects, units = fitted(stage.terms, scene, state.effects), names_of(stage.terms, scene)[1]
     plain = replace(stage.base, weight=model.weight / task.share[:, None])
-    plain = plain.only(stage.identification.active).with_prior(model.prior)
+    plain = plain.only(identification.active).with_prior(model.prior)
     rounds = int(stage.squares.iterations[0]) + stage.robust.rounds
     return Solved(
         nominal=task.frame.state,
         state=state,
-        identification=stage.identification,
+        identification=identification,
         estimator=Estimator(plain, shares(task, model, optimum), mix),
         group=clusters(data),
         status=optimum.status if optimum else stage.squares.status[0],
@@ -381,13 +386,33 @@ def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, St
         task, plain = replace(task, base=replace(task.base, y=y)), replace(robust.plain, y=y)
         active = identification.active
         model, begin = extended(plain.only(active), robot, task.data, here, terms)
+        model = replace(model, room=room_of(task, model, begin, terms))
         identification = task.identified(model, begin)
         known = identification.active[task.base.names.count :]
         begin = replace(begin, effects=np.where(known, begin.effects, 0.0))
         model, squares = task.squares(model.only(identification.active), begin)
         robust = task.robust(model, squares)
-    base = replace(task.base, names=model.names, fields=model.fields, moved=model.moved)
+    base = replace(
+        task.base, names=model.names, fields=model.fields, moved=model.moved, room=model.room
+    )
     return task, Stage(base, identification, robust, robust.fit, terms, stage.notices)
+
+
+def room_of(task: Task, model: Model, state: State, terms: tuple[Term, ...]) -> Array:
+    """(e, 2) bounds of the effects' parameters; frames of sessions are wherever they stood."""
+    scene = scene_of(task.robot, task.data, model, state)
+    out = [np.zeros((0, 2))]
+    for term in terms:
+        allowed = bounds(scene, [term])
+        out.append(np.full(allowed.shape, np.inf) * [-1.0, 1.0] if term.frees_frames else allowed)
+    return np.concatenate(out)
+
+
+def without_resting(known: Identification, names: Names, rests: Array) -> Identification:
+    """The parameters that the poses tell, without those of effects (e,) that rest at a bound."""
+    gone = np.pad(rests, (names.geometric, 0)) & known.active
+    said = dict.fromkeys((names.all[i] for i in np.flatnonzero(gone)), AT_BOUND)
+    return replace(known, active=known.active & ~gone, reasons={**known.reasons, **said})
 
 
 def of_poses(task: Task, model: Model, stage: Stage) -> LeastSquares[State]:
@@ -413,6 +438,9 @@ def worst_case(
     if problem.size > (HOPELESS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
     optimum = minimax.solve(problem, state, qp, settings)
+    if len(model.room):
+        effects = settled(optimum.x.effects, model.room)
+        optimum = replace(optimum, x=replace(optimum.x, effects=effects))
     if optimum.status is Status.STALLED and optimum.value * problem.size < EXACT**2:
         optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left
     certificate = None

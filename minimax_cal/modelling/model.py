@@ -85,6 +85,7 @@ class Model:
     by, so that the sum of squares weighs position and orientation; empty for plain points.
     fields: (e, k, 3, m) motion of the points, in base axes, per unit of each effect's parameter.
     moved: (k, 3, m) by how much more they are known to move [m]; empty for not at all.
+    room: (e, 2) bounds of the effects' parameters; empty for none.
     """
 
     q: Array
@@ -97,6 +98,7 @@ class Model:
     mix: Array = field(default_factory=lambda: NO_MIX)
     fields: Array = field(default_factory=lambda: NO_FIELDS)
     moved: Array = field(default_factory=lambda: NO_MIX)
+    room: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     @cached_property
     def counts(self) -> Array:

@@ -10,12 +10,13 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.causes import entire, whole
 from minimax_cal.diagnosing.gap import climbed, folds
-from minimax_cal.diagnosing.joint import at_bounds, bounds, joint
+from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.modelling.effects.bounds import at_bounds, bounds
 from minimax_cal.modelling.effects.scene import mask_of
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.simulate import simulate
