@@ -11,6 +11,7 @@ from minimax_cal.cli.options import DATA, FIT, RUNG, InGroups, Output, result_op
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.files import json_text
+from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import read_measurements
@@ -30,14 +31,16 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
     measured = read_measurements(data)
     opened = open_result(fit, rung)
     cell, _, said = opened.placed_by(measured)
-    found = accuracy(cell.error(measured))
-    doubts = checks.outliers(measured, np.linalg.norm(cell.error(measured), axis=-1))
+    error = cell.error(measured)
+    found = accuracy(error)
+    count, mixed = training_poses(measured, opened, error)
+    doubts = checks.outliers(measured, np.linalg.norm(error, axis=-1))
     if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
         doubts.append(
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
-    to.notice(*measured.notices, *said, *strangers(cell, measured), *doubts)
+    to.notice(*measured.notices, *said, *strangers(cell, measured), *mixed, *doubts)
     content = {
         "schema": 1,
         "kind": "evaluation",
@@ -45,6 +48,7 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
         "rung": opened.rungs[opened.number].name,
         "data": str(data),
         "data_sha256": measured.digest,
+        "training_poses": count,
         "accuracy": found.to_dict(),
     }
     if to.deliver(lambda: json_text(content)):

@@ -119,6 +119,25 @@ def unseen(data: Measurements, known: Opened) -> tuple[Array, tuple[str, ...]]:
     return held, (said,)
 
 
+def training_poses(data: Measurements, known: Opened, error: Array) -> tuple[int, tuple[str, ...]]:
+    """How many of the poses a fit was made of, and a notice that they are no new ones.
+
+    error: (k, m, 3) of the poses [m].
+    """
+    if not known.data.poses:
+        return 0, ()
+    held = unseen(data, known)[0]
+    count = int((~held).sum())
+    if not count:
+        return 0, ()
+    said = f"{data.source}: {count} of {data.poses} poses are training poses of the fit, which it "
+    said += "meets better than new ones"
+    if held.any():
+        others = accuracy(error[:, held])
+        said += f"; the others: RMS {others.rms_mm:.4f} mm, largest {others.max_mm:.4f} mm"
+    return count, (said,)
+
+
 def check_own(known: Opened) -> None:
     """Raise DataError if the poses in a file do not give back the errors in it."""
     told = known.rungs[known.number].error

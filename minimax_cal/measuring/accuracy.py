@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +19,7 @@ class Accuracy:
 
     sse_mm2, counts: per target, the sum of squares F_i and at how many poses it was measured.
     worst: (pose, target) of the largest distance, (-1, -1) without points.
+    means_mm, largest_mm: per target, empty where a file does not tell them.
     """
 
     rms_mm: float
@@ -28,6 +29,8 @@ class Accuracy:
     sse_mm2: tuple[float, ...]
     counts: tuple[int, ...]
     worst: tuple[int, int] = (-1, -1)
+    means_mm: tuple[float, ...] = field(default=(), compare=False)
+    largest_mm: tuple[float, ...] = field(default=(), compare=False)
 
     def by_target(self) -> tuple[float, ...]:
         """RMS of each target, NaN where it was not measured [mm]."""
@@ -38,10 +41,10 @@ class Accuracy:
 
     def table(self, title: str, targets: tuple[str, ...]) -> Table:
         """As a table, a row a target and one for all."""
-        rows: list[tuple[Cell, ...]] = [
-            (name, count, math.sqrt(sse / count) if count else math.nan, math.nan, math.nan, sse)
-            for name, count, sse in zip(targets, self.counts, self.sse_mm2, strict=True)
-        ]
+        untold = (math.nan,) * len(targets)
+        means, largest = self.means_mm or untold, self.largest_mm or untold
+        columns = (targets, self.counts, self.by_target(), means, largest, self.sse_mm2)
+        rows: list[tuple[Cell, ...]] = list(zip(*columns, strict=True))
         total = (sum(self.counts), self.rms_mm, self.mean_mm, self.max_mm, sum(self.sse_mm2))
         return Table(
             title,
@@ -82,6 +85,8 @@ def accuracy(error: Array) -> Accuracy:
         sse_mm2=sse,
         counts=counts,
         worst=(pose, target),
+        means_mm=tuple((known.sum(axis=1) / np.where(counts, counts, np.nan)).tolist()),
+        largest_mm=tuple(np.where(counts, known.max(axis=1), np.nan).tolist()),
     )
 
 

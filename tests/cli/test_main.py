@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 from csv import reader
@@ -52,10 +53,22 @@ def test_output_file_figure_and_evaluate(
     assert json.loads(fit.read_text())["schema"] == 1
     capsys.readouterr()
     assert run("evaluate", fit, csv, "--json") == 0
-    whole = json.loads(capsys.readouterr().out)["accuracy"]
+    found, own = json.loads(capsys.readouterr().out), json.loads(fit.read_text())["accuracy"]
+    whole = found["accuracy"]
     assert whole["poses"] == 60
+    assert found["training_poses"] == own["train"]["poses"]
     assert run("evaluate", fit, csv) == 0
-    assert f"{whole['rms_mm']:.4f}" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert f"{whole['rms_mm']:.4f}" in said.out
+    assert not re.search(r"smr\d .*  -", said.out)  # mean and largest of each target too
+    assert f"{own['train']['poses']} of 60 poses are training poses of the fit" in said.err
+    assert f"the others: RMS {own['holdout']['rms_mm']:.4f} mm" in said.err
+    new = tmp_path / "new.csv"
+    mc.write_measurements(new, mc.simulate("irb2600", 20, seed=9).data)
+    assert run("evaluate", fit, new, "--json") == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["training_poses"] == 0
+    assert "training poses" not in said.err
 
 
 def test_every_option_reaches_the_fit(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,8 @@ def test_all_points_and_each_target() -> None:
     one, other, every = found.table("title", ("smr1", "smr2")).rows
     assert one[:3] == ("smr1", 2, pytest.approx(math.sqrt(12.5)))
     assert other[:3] == ("smr2", 3, pytest.approx(math.sqrt(3.0)))
+    assert one[3:5] == pytest.approx((2.5, 5.0), rel=1e-14)
+    assert other[3:5] == pytest.approx((5.0 / 3.0, 2.0), rel=1e-14)
     assert every == ("all", 5, found.rms_mm, found.mean_mm, found.max_mm, pytest.approx(34.0))
 
 
