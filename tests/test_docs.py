@@ -209,6 +209,22 @@ def test_pages_print_what_they_say(
             assert (tmp_path / made).stat().st_size > 1000, made
 
 
+def test_numbers_in_the_words_of_the_tutorial_stand_in_what_it_prints() -> None:
+    text = (DOCS / "tutorial.md").read_text()
+    printed_numbers = [
+        float(number)
+        for language, body in blocks(DOCS / "tutorial.md")
+        if language == "text"
+        for number in re.findall(r"\d+\.\d+", body)
+    ]
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.S | re.M)
+    told = re.findall(r"(\d+\.(\d+))\s+(?:mm|rad)\b", prose)
+    assert told
+    for number, digits in told:
+        rounded = (round(one, len(digits)) for one in printed_numbers)
+        assert float(number) in rounded, f"tutorial.md: no command prints {number}"
+
+
 def test_a_wrong_number_is_noticed() -> None:
     assert same("0.5741", "0.5742")
     assert not same("0.5741", "0.5751")

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,25 @@ def test_the_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
     assert mc.load_cell(tmp_path / "fit.json").target_names == ("smr1", "smr2", "smr3")
+
+
+def test_all_brings_what_is_said() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+
+    def parts(name: str) -> set[str]:
+        inner = [re.fullmatch(r"minimax-cal\[(.*)\]", need) for need in extras[name]]
+        named = [part for one in inner if one for part in one[1].split(",")]
+        return {name}.union(*map(parts, named))
+
+    (said,) = re.findall(r"No index has the package yet.*?\n\n", README, flags=re.S)
+    several, _, rest = said.partition('`".[all]"`')
+    (left_out,) = re.findall(r"all of these but `(\w+)`", rest)
+    assert {*re.findall(r"\.\[(\w+)\]", several)} - parts("all") == {left_out}
+    (backends,) = re.findall(r"QP backends ([\w,\s]+);", rest)
+    assert set(re.split(r",\s+|\s+and\s+", backends)) == parts("backends") - {"backends"}
+    assert "backends" in parts("all")
 
 
 def test_the_example_is_what_its_script_makes(

@@ -188,6 +188,7 @@ def test_the_library_is_listed(here: Path, capsys: pytest.CaptureFixture[str]) -
     assert all(name in out for name in EFFECTS)
     assert run("effects", "--json") == 0
     listed = {e["effect"]: e for e in json.loads(capsys.readouterr().out)["effects"]}
+    assert not any("the file" in entry["needs"] for entry in listed.values())  # none was given
     assert listed.keys() == EFFECTS.keys()
     assert "order" in listed["settling"]["needs"]
     assert listed["backlash"]["law"] == EFFECTS["backlash"].law

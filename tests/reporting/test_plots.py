@@ -26,6 +26,17 @@ CASES: dict[str, tuple[str, str, dict[str, float], list[float]]] = {
 }
 
 
+def test_a_long_name_stays_in_its_picture() -> None:
+    pytest.importorskip("matplotlib")
+    robot = replace(ROBOT, name="A robot of a make and of a type with a name that goes on " * 3)
+    fit = mc.calibrate(robot, simulate(ROBOT, 40).data, "sum")
+    figure = figures.errors_figure(fit)
+    figure.canvas.draw()
+    (title,) = [text for text in figure.texts if text.get_text().startswith("A robot")]
+    box = title.get_window_extent()
+    assert 0.0 < box.x0 < box.x1 < figure.bbox.width
+
+
 @cache
 def diagnosed(case: str, targets: int = 3) -> Diagnosis:
     """A UR10 with one effect, or none."""

@@ -104,9 +104,9 @@ class Scene:
 
     @property
     def untold(self) -> str:
-        """A clause where the file tells no order of its poses, else nothing."""
+        """A clause where the file tells no order of its poses, which takes two, else nothing."""
         followed = self.data.columns.get("followed")
-        timed = self.has("clock") or followed is None or bool(followed.any())
+        timed = self.has("clock") or followed is None or bool(followed.any()) or self.poses < 2
         return "" if timed else "; the file tells no order"
 
     @property

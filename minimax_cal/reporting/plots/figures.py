@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import catch_warnings, filterwarnings
@@ -148,5 +149,6 @@ def errors_figure(fit: Fit) -> Figure:
     figure.legend(*left.get_legend_handles_labels(), frameon=False, loc="outside lower center",
                   ncols=2)  # fmt: skip
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.suptitle(f"{fit.robot.name}, objective {fit.objective}", fontweight="bold")
+    title = textwrap.fill(f"{fit.robot.name}, objective {fit.objective}", 80)
+    figure.suptitle(title, fontweight="bold")
     return figure

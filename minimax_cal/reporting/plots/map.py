@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,8 @@ def save_map(found: WorkspaceMap, path: Path) -> None:
             in_millimetres(axes)
             axes.grid(visible=True, alpha=0.3)
             axes.set_facecolor(NOWHERE)
-    figure.suptitle(f"{found.robot}: position over the workspace, base frame", fontweight="bold")
+    title = textwrap.fill(f"{found.robot}: position over the workspace, base frame", 30 * columns)
+    figure.suptitle(title, fontweight="bold")
     figure.supxlabel(legend(found), fontsize="small")
     save(figure, path)
 

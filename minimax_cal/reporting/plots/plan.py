@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,11 @@ def save_plan(plan: Plan, path: Path) -> None:
     side, above, growth = figure.subplots(1, 3, width_ratios=(1.0, 1.2, 1.1))
     views(plan, side, above)
     grown(plan, growth)
-    figure.suptitle(
+    title = (
         f"{plan.cell.robot.name}: {plan.poses} poses by criterion {plan.criterion}, at least "
-        f"{100.0 * plan.efficiency:.0f} % of the best possible",
-        fontweight="bold",
+        f"{100.0 * plan.efficiency:.0f} % of the best possible"
     )
+    figure.suptitle(textwrap.fill(title, 120), fontweight="bold")
     save(figure, path)
 
 
