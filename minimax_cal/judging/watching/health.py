@@ -19,7 +19,8 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
 from minimax_cal.judging.watching.moved import Search, search
-from minimax_cal.judging.watching.opening import in_names, own_rows, watched_of
+from minimax_cal.judging.watching.opening import in_names, own_poses, watched_of
+from minimax_cal.judging.watching.placing import Placing
 from minimax_cal.judging.watching.prospects import hidden, prospects
 from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
@@ -27,7 +28,6 @@ from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
-from minimax_cal.modelling.parameters import State
 
 KNOWN = ("frame", "targets")  # what may still be where it was
 SURE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
@@ -66,10 +66,11 @@ def check(
     data = data if isinstance(data, Measurements) else read_measurements(data)
     watched, said = watched_of(fit, data, known)
     links = in_names(fit, watched, fit.identification.active)
-    found = search(watched, links, own_rows(fit, watched), seed)
-    error = watched_error(watched, found.first.state)
-    open_count = int(watched.open.sum())
-    verdicts = tuple(verdict(limit, error, watched.data, open_count, seed) for limit in limits)
+    found = search(watched, links, own_poses(fit, watched), seed)
+    error, after_it = (left(watched, placed) for placed in (found.before, found.after))
+    verdicts = tuple(
+        verdict(limit, error, watched.data, found.before.used, seed) for limit in limits
+    )
     after = refit(fit, watched, found)
     spread, enough, asked = prospects(watched, found)
     return Health(
@@ -77,8 +78,8 @@ def check(
         verdicts=verdicts,
         moved=found.named,
         hidden=tuple(hidden(watched, found)),
-        accuracy=accuracy(error),
-        refitted=after.accuracy["train"],
+        accuracy=accuracy(grown(error, found.before.used)),
+        refitted=accuracy(grown(after_it, found.after.used)),
         findable=spread,
         sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.robot.prismatic)),
         enough=enough,
@@ -93,23 +94,29 @@ def check(
 # ---- valid or not ------------------------------------------------------------------------------
 
 
-def watched_error(watched: Watched, state: State) -> Array:
-    """(k, m, 3) errors at a state [m]."""
+def left(watched: Watched, placed: Placing) -> Array:
+    """(k, m, 3) errors as placed [m]."""
+    state = placed.state
     model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
     return model.error(state) @ state.rotation.T
 
 
-def verdict(limit: Limit, error: Array, data: Measurements, free: int, seed: int) -> Verdict:
-    """One requirement against errors (k, m, 3) that `free` parameters were fitted to."""
+def grown(error: Array, used: float) -> Array:
+    """Errors (k, m, 3) with what placing took off them put back; used: as of `Placing`."""
     count = 3 * int(np.isfinite(error[..., 0]).sum())
-    grown = error * math.sqrt(count / max(count - free, 1))  # what placing took off
+    return np.asarray(error * math.sqrt(count / max(count - used, 1.0)))
+
+
+def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: int) -> Verdict:
+    """One requirement against errors (k, m, 3) that placing took up `used` coordinates of."""
+    larger = grown(error, used)
     group, rms = groups(data), limit.kind == "rms"
     kind = rms_interval if rms else max_interval
 
     def interval(level: float) -> Interval:
-        return kind(grown, group, level, rng=np.random.default_rng(seed))
+        return kind(larger, group, level, rng=np.random.default_rng(seed))
 
-    found = accuracy(grown)
+    found = accuracy(larger)
     value = found.rms_mm if rms else found.max_mm
     ends = interval(2.0 * SURE - 1.0)
     low, high = 1e3 * ends.low, 1e3 * ends.high

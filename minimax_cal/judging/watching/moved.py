@@ -18,7 +18,9 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files
-from minimax_cal.judging.watching.watched import Rows, Watched
+from minimax_cal.judging.watching.placing import Placing, predicts
+from minimax_cal.judging.watching.watched import Own, Rows, Watched
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import links_of
 from minimax_cal.solvers.least_squares import solve_normal
 
@@ -30,7 +32,6 @@ APART = 1e-6  # share of a motion that frame and reflectors do not imitate, of w
 CLEARER = 9.0  # by how much a link must explain more than a zero position, in squared sigmas
 LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
 MOST = 4  # parameters that are named; where more moved, the arm wants a calibration
-SAMPLES = 200  # of the calibration's own poses, as many at a time as are new
 
 
 @dataclass(frozen=True)
@@ -134,32 +135,29 @@ class Candidates:
         noise = np.maximum((rows.dof * rows.mean_square - square) / dof, 1.0)
         return np.asarray(np.sqrt(square / noise) / self.wider), dof
 
-    def widened(self, own: Rows, poses: int, rng: np.random.Generator) -> Candidates:
-        """The same with `wider` from samples of so many of the calibration's own poses.
-
-        own: of these, about the calibration itself.
-        """
-        gram, counts = own.by_pose(self.column)
-        drawn = np.zeros((SAMPLES, len(gram)))
-        for row in drawn:
-            row[rng.permutation(len(gram))[: min(poses, len(gram) // 2)]] = 1.0
-        whole, c = np.tensordot(drawn, gram, 1), len(self.column)
+    def widened(self, own: Own, poses: int, rng: np.random.Generator) -> Candidates:
+        """The same with `wider` from samples of so many of the calibration's own poses."""
+        whole, counts = own.samples(self.column, poses, rng)
+        c, free = len(self.column), int(own.rows.active.sum())
         q = whole.shape[-1] - c - 1  # what is free, and what was not known
-        r = own.latent.shape[1]
-        whole[:, q - r : q, q - r : q] += np.eye(r)
         kept, rest = whole[:, :q, :q], whole[:, :q, q:]
         left = whole[:, q:, q:] - np.swapaxes(rest, 1, 2) @ solve_normal(kept, rest)
         score, size = left[:, :c, c], np.einsum("dcc->dc", left)[:, :c]
-        dof = np.maximum(drawn @ counts - (q - r) - 1.0, 1.0)[:, None]
+        dof = np.maximum(counts - free - 1.0, 1.0)[:, None]
         square = score**2 / np.where(size > 0.0, size, np.inf)
         noise = np.maximum((left[:, c, c, None] - square) / dof, 1.0)
         return replace(self, wider=np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
 
-    def clearest(self, rows: Rows) -> tuple[int, float, tuple[int, ...]] | None:
-        """The one that explains most, its p-value and its rivals; None where all may be chance."""
+    def clearest(self, rows: Rows, group: Array) -> tuple[int, float, tuple[int, ...]] | None:
+        """The one that explains most, its p-value and its rivals; None where all may be chance.
+
+        Only one that helps poses it was not estimated from: what mends nothing has not moved.
+        group: (m,) poses that are left out at once.
+        """
         size, dof = self.sizes(rows)
         p_value = np.asarray(2.0 * stats.t.sf(size, dof))
         passed = p_value <= self.level
+        passed[passed] = [predicts(rows, int(i), group) for i in self.column[passed]]
         if not passed.any():
             return None
         pick, near = picked(size**2, passed, self.zero)
@@ -170,21 +168,31 @@ class Candidates:
 class Search:
     """What was looked for and what was found.
 
-    named: what moved, the clearest first.  first: the rows with nothing moved; last: with all that
-    did free.  looked: what was looked for.
+    named: what moved, the clearest first.  before: placed as if nothing had moved; after: with all
+    that did.  looked: what was looked for.
     """
 
     named: tuple[Moved, ...]
-    first: Rows
-    last: Rows
+    before: Placing
+    after: Placing
     looked: Candidates
 
+    @property
+    def first(self) -> Rows:
+        """With nothing moved."""
+        return self.before.rows
 
-def search(watched: Watched, links: Array, own: Rows | None, seed: int) -> Search:
+    @property
+    def last(self) -> Rows:
+        """With all that moved free."""
+        return self.after.rows
+
+
+def search(watched: Watched, links: Array, own: Own | None, seed: int) -> Search:
     """What moved.
 
-    links: (p,) as in `Candidates.of`.  own: rows of the calibration's own poses, where they are
-    known.  seed: of samples of these.  Raises DataError for too few poses.
+    links: (p,) as in `Candidates.of`.  own: the calibration's own poses, where they are known.
+    seed: of samples of these.  Raises DataError for too few poses.
     """
     _, state = watched.start
     rows = first = watched.rows(watched.open, state)
@@ -197,16 +205,18 @@ def search(watched: Watched, links: Array, own: Rows | None, seed: int) -> Searc
     if own is not None:
         looked = looked.widened(own, watched.data.poses, np.random.default_rng(seed))
     names = watched.names.all
+    group = groups(watched.data)
     chosen: list[int] = []
     found: list[Moved] = []
-    while len(chosen) < MOST and (picked := looked.without(chosen).clearest(rows)):
+    while len(chosen) < MOST and (picked := looked.without(chosen).clearest(rows, group)):
         column, p_value, others = picked
         chosen.append(column)
         found.append(Moved(names[column], 0.0, 0.0, "", p_value, tuple(names[i] for i in others)))
         active = watched.open.copy()
         active[chosen] = True
         rows = watched.rows(active, rows.state)
-    return Search(sized(watched, rows, found), first, rows, looked)
+    before, after = Placing(first), Placing(rows)
+    return Search(sized(watched, after, found), before, after, looked)
 
 
 def critical(level: float, dof: float) -> float:
@@ -214,11 +224,11 @@ def critical(level: float, dof: float) -> float:
     return float(stats.t.isf(0.5 * level, dof))
 
 
-def sized(watched: Watched, rows: Rows, found: list[Moved]) -> tuple[Moved, ...]:
+def sized(watched: Watched, placed: Placing, found: list[Moved]) -> tuple[Moved, ...]:
     """The same with how far each moved, all of them together, and how sure that is."""
-    names, state = watched.names, rows.state.step(rows.step)
-    change = links_of(state.mdh - watched.cell.robot.mdh)
-    sigma = np.linalg.norm(rows.factor(np.zeros_like(watched.root)), axis=1)
+    names = watched.names
+    change = links_of(placed.state.mdh - watched.cell.robot.mdh)
+    sigma = np.linalg.norm(placed.factor(np.zeros_like(watched.root)), axis=1)
     out = []
     for each in found:
         i = names.index(each.parameter)

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.watched import PLENTY, Rows, Watched
+from minimax_cal.judging.watching.watched import PLENTY, Own, Watched
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -20,6 +20,7 @@ from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 
 LEAST_FOOT = 3  # reflectors on the foot tell where it stands
 LEAST_OWN = 12  # poses of the calibration, half of which tell how scores spread
+NOBODY = np.zeros((0, 3))  # no reflector on the foot
 LEAST_NOISE = 1e-9  # of a coordinate: data that were computed, not measured [m]
 
 
@@ -43,7 +44,7 @@ def watched_of(
             f"{data.source}: target {strange[0]} is not one of the calibration's; leave targets "
             "out of known"
         )
-    foot, foot_now = feet(fit, data)
+    foot, foot_now = (NOBODY, NOBODY) if frame else feet(fit, data)
     place = dict(zip(cell.target_names, cell.target_positions, strict=True))
     kept = [
         (term, value)
@@ -83,12 +84,23 @@ def feet(fit: Fit, data: Measurements) -> tuple[Array, Array]:
     None where they are too few to tell where the foot stands.
     """
     now, then = foot_of(data), foot_of(fit.data)
-    both = [name for name in now if name in then]
+    both = names_of_foot(fit, data)
     if len(both) < LEAST_FOOT:
-        return np.zeros((0, 3)), np.zeros((0, 3))
+        return NOBODY, NOBODY
     base = np.linalg.inv(fit.cell.base)
-    old = np.array([base[:3, :3] @ then[name] + base[:3, 3] for name in both])
-    return old, np.array([now[name] for name in both])
+    old = np.array([base[:3, :3] @ usual(then[name]) + base[:3, 3] for name in both])
+    return old, np.array([usual(now[name]) for name in both])
+
+
+def names_of_foot(fit: Fit, data: Measurements) -> list[str]:
+    """Reflectors on the foot that both saw."""
+    then = foot_of(fit.data)
+    return [name for name in foot_of(data) if name in then]
+
+
+def usual(place: Array) -> Array:
+    """(3,) where a reflector (m, 3) stood on the mean [m]."""
+    return np.asarray(np.nanmean(place, axis=0))
 
 
 def usual_u95(data: Measurements) -> float:
@@ -98,26 +110,32 @@ def usual_u95(data: Measurements) -> float:
 
 
 def foot_of(data: Measurements) -> dict[str, Array]:
-    """Where each reflector on the foot stood on the mean: (3,) by name [m]."""
+    """Where each reflector on the foot stood at each pose: (m, 3) by name, NaN unseen [m]."""
     stems = [name[:-2] for name in data.columns if name.startswith("base") and name.endswith("_x")]
     out = {}
     for stem in stems:
         names = [f"{stem}_{axis}" for axis in "xyz"]
         three = [data.columns[name] for name in names if name in data.columns]
         if len(three) == 3 and all(np.isfinite(column).any() for column in three):
-            out[stem] = np.array([np.nanmean(column) for column in three])
+            out[stem] = np.stack(three, axis=1)
     return out
 
 
-def own_rows(fit: Fit, watched: Watched) -> Rows | None:
+def own_poses(fit: Fit, watched: Watched) -> Own | None:
     """The calibration's own poses, with the same open; None where its file has none."""
     if fit.data.poses < LEAST_OWN:
         return None
     everything = np.zeros(fit.known.names.count, dtype=bool)
     some = np.linspace(0, fit.data.poses - 1, min(fit.data.poses, PLENTY)).astype(int)
-    own = replace(watched, cell=fit.cell, data=fit.data.take(some), foot=watched.foot[:0])
-    rows = own.rows(everything, fit.cell.state)
-    return replace(rows, active=own.open)
+    data, state = fit.data.take(some), fit.cell.state
+    stood = watched.foot @ state.rotation.T + state.origin
+    own = replace(watched, cell=fit.cell, data=data, foot_now=stood)
+    rows = replace(own.rows(everything, state), active=own.open)
+    if not len(stood):
+        return Own(rows, np.zeros((data.poses, 0)))
+    seen = foot_of(data)
+    each = np.stack([seen[name] for name in names_of_foot(fit, watched.data)], axis=1)
+    return Own(rows, own.foot_error(each, state))
 
 
 def in_names(fit: Fit, watched: Watched, flags: Array) -> Array:

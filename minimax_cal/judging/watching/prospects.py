@@ -70,7 +70,7 @@ def fewest(rows: Rows, zero: Array, wider: Array, level: float) -> int:
     r, c = rows.latent.shape[1], len(zero)
     q = gram.shape[1] - c - 1  # what is free, and what was not known
     fixed = np.diag(np.pad(np.ones(r), (q - r, c + 1)))
-    if foot := int(np.count_nonzero(rows.pose < 0)):
+    if foot := rows.foot:
         last = replace(rows, pose=np.where(rows.pose < 0, 0, -1), error=np.zeros_like(rows.error))
         fixed = fixed + last.by_pose(zero)[0].sum(axis=0)
     kept, many = np.arange(len(gram)), len(np.unique(rows.pose[rows.pose >= 0]))

@@ -25,6 +25,7 @@ from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
 
 PLENTY = 500  # poses that tell what more would
+SAMPLES = 200  # of the calibration's own poses, as many at a time as are new
 PLACINGS = 3  # passes that place an arm with effects
 
 
@@ -115,7 +116,7 @@ class Watched:
         jacobian = white[:, 1:]
         error, latent = white[:, 0], -jacobian @ self.root
         row = np.repeat(np.arange(m), r)
-        if len(self.foot) and not self.frame:
+        if len(self.foot):
             more, columns = self.of_foot(state)
             n = self.cell.robot.joints
             past = self.known[5 * n : 5 * n + 6]
@@ -124,7 +125,7 @@ class Watched:
             jacobian = np.concatenate([jacobian, columns])
             row = np.concatenate([row, np.full(len(more), -1)])
         count = 3 * int(model.counts.sum()) + 3 * len(self.foot)
-        return Rows(error, jacobian, latent, active, state, count, row)
+        return Rows(error, jacobian, latent, active, state, count, row, half)
 
     def of_foot(self, state: State) -> tuple[Array, Array]:
         """What the reflectors on the foot say of the base, in units of their noise: errors, slope.
@@ -132,13 +133,17 @@ class Watched:
         Each was seen once by then and once by now.
         """
         n, f = self.cell.robot.joints, len(self.foot)
-        error = (self.foot_now - state.origin) @ state.rotation - self.foot
+        error = self.foot_error(self.foot_now, state)
         slope = np.zeros((f, 3, self.names.count))
         slope[..., 5 * n : 5 * n + 3] = np.eye(3)
         turned = np.cross(np.eye(3)[None], self.foot[:, None])  # (f, turn, 3)
         slope[..., 5 * n + 3 : 5 * n + 6] = np.swapaxes(turned, 1, 2)
-        size = np.sqrt(2.0 * self.variance)
-        return error.reshape(-1) / size, slope.reshape(3 * f, -1) / size
+        return error, slope.reshape(3 * f, -1) / np.sqrt(2.0 * self.variance)
+
+    def foot_error(self, place: Array, state: State) -> Array:
+        """(..., 3f) how far the foot's reflectors (..., f, 3) are from where they were, as rows."""
+        off = (place - state.origin) @ state.rotation - self.foot
+        return np.asarray(off.reshape(*off.shape[:-2], -1) / np.sqrt(2.0 * self.variance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +152,8 @@ class Rows:
 
     error: (N,).  jacobian: (N, p).  latent: (N, r) by what the calibration did not know, each of
     variance 1.  active: (p,) what is free.  state: about which.  count: coordinates that were
-    measured.  pose: (N,) number of each row's pose, -1 for the foot.
+    measured.  pose: (N,) number of each row's pose, -1 for the foot, last.  half: (m, r, r) root of
+    each pose's noise [m].
     """
 
     error: Array
@@ -157,6 +163,7 @@ class Rows:
     state: State
     count: int
     pose: Array
+    half: Array
 
     @cached_property
     def whole(self) -> Array:
@@ -175,6 +182,11 @@ class Rows:
         """(N + r,) what they leave of the error."""
         error = np.pad(self.error, (0, self.latent.shape[1]))
         return np.asarray(error - self.basis @ (self.basis.T @ error))
+
+    @property
+    def foot(self) -> int:
+        """Coordinates of the foot."""
+        return int(np.count_nonzero(self.pose < 0))
 
     @property
     def dof(self) -> int:
@@ -197,14 +209,17 @@ class Rows:
         rest = motion - basis @ (basis.T @ motion)
         return np.asarray(rest - basis @ (basis.T @ rest))  # twice is enough
 
+    def columns(self, more: Array) -> Array:
+        """(N, q) what is free, what was not known, and some more parameters."""
+        return np.hstack([self.jacobian[:, self.active], self.latent, self.jacobian[:, more]])
+
     def by_pose(self, columns: Array, most: int = PLENTY) -> tuple[Array, Array]:
         """Products of each pose's rows: (m, q, q), and its coordinates: (m,).
 
         q: what is free, what was not known, some more parameters, and the error last.  most: of
         more poses so many are taken, evenly.
         """
-        free, more = self.jacobian[:, self.active], self.jacobian[:, columns]
-        every = np.concatenate([free, self.latent, more, self.error[:, None]], axis=1)
+        every = np.concatenate([self.columns(columns), self.error[:, None]], axis=1)
         poses = np.unique(self.pose[self.pose >= 0])
         poses = poses[np.linspace(0, len(poses) - 1, min(len(poses), most)).astype(int)]
         parts = [every[self.pose == pose] for pose in poses]
@@ -228,29 +243,34 @@ class Rows:
         size = np.where(size > 0.0, size, np.nan)
         return rest.T @ self.left / size, self.scale / np.sqrt(size)
 
-    @cached_property
-    def inverse(self) -> Array:
-        """(free + r, N + r) from errors, and zeros for what was not known, to parameters."""
-        norm = np.linalg.norm(self.whole, axis=0)
-        norm = np.where(norm > 0.0, norm, 1.0)
-        return np.asarray(np.linalg.pinv(self.whole / norm, rcond=1e-10) / norm[:, None])
 
-    @cached_property
-    def step(self) -> Array:
-        """(p,) from the state to where what is free explains the errors best, the rest kept."""
-        out = np.zeros(len(self.active))
-        found = self.inverse @ np.pad(self.error, (0, self.latent.shape[1]))
-        out[self.active] = found[: int(self.active.sum())]
-        return out
+@dataclass(frozen=True, eq=False)
+class Own:
+    """The calibration's own poses, as new ones would be seen.
 
-    def factor(self, root: Array) -> Array:
-        """F (p, r + N) with FF' the covariance of all parameters after `step`.
+    rows: about the calibration itself.  foot: (m, 3f) errors of the reflectors on the foot at each
+    pose, in units of noise, NaN where unseen.
+    """
 
-        root: (p, r) of what is kept, before.
+    rows: Rows
+    foot: Array
+
+    def samples(self, columns: Array, poses: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Products as of `Rows.by_pose`, of samples of so many poses: (s, q, q), coordinates: (s,).
+
+        The prior of what was not known is among them, and the foot as these poses see it.
         """
-        count, r = int(self.active.sum()), self.latent.shape[1]
-        noise, unknown = np.split(self.inverse[:count], [len(self.error)], axis=1)
-        out = np.concatenate([root, np.zeros((len(root), len(self.error)))], axis=1)
-        out[self.active, :r] -= unknown
-        out[self.active, r:] = self.scale * noise
-        return out
+        gram, counts = self.rows.by_pose(columns)
+        drawn = np.zeros((SAMPLES, len(gram)))
+        for row in drawn:
+            row[rng.permutation(len(gram))[: min(poses, len(gram) // 2)]] = 1.0
+        whole = np.tensordot(drawn, gram, 1)
+        place = np.arange(whole.shape[-1] - len(columns) - 1)[-self.rows.latent.shape[1] :]
+        whole[:, place, place] += 1.0
+        seen = np.isfinite(self.foot)
+        error = drawn @ np.where(seen, self.foot, 0.0) / np.maximum(drawn @ seen, 1.0)
+        slope = self.rows.columns(columns)[self.rows.pose < 0]
+        every = np.concatenate(
+            [np.broadcast_to(slope, (SAMPLES, *slope.shape)), error[..., None]], 2
+        )
+        return whole + np.swapaxes(every, 1, 2) @ every, drawn @ counts + self.foot.shape[1]

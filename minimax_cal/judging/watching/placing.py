@@ -1,0 +1,124 @@
+"""Frame, reflectors and what moved, placed where new poses have them, every point weighing alike.
+
+What moved is sought by rows in units of their noise, for they tell most.  What is written is used
+as it stands: its distances count.  Weights by noises alone would trust directions in which neither
+joints nor instrument are noisy, and there what the model lacks leads astray by more than is mended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.judging.watching.watched import Rows
+from minimax_cal.modelling.parameters import State
+from minimax_cal.solvers.least_squares import solve_normal
+
+TOLD = 1e-10  # share of the largest singular value below which a direction is not told
+
+
+@dataclass(frozen=True, eq=False)
+class Placing:
+    """Least squares of the distances over what is free in some rows, the rest as calibrated.
+
+    Reflectors on the foot hold the frame beside them, by their noise.
+    """
+
+    rows: Rows
+
+    @cached_property
+    def blocks(self) -> tuple[Array, Array, Array]:
+        """Errors (m, r) [m], their slopes (m, r, f) by what is free, noise's root (m, r, r) [m]."""
+        rows, half = self.rows, self.rows.half
+        m, r, _ = half.shape
+        whole = np.concatenate([rows.error[:, None], rows.jacobian[:, rows.active]], axis=1)
+        plain = half @ whole[: m * r].reshape(m, r, -1)
+        return plain[..., 0], plain[..., 1:], half
+
+    @cached_property
+    def size(self) -> float:
+        """Of a coordinate that is left, what model and noises both leave [m]."""
+        error, slope, half = self.blocks
+        dof = self.rows.count - self.rows.foot - slope.shape[-1]
+        least = float((half[:, 0] ** 2).sum(axis=-1).min())  # no less than a coordinate's noise
+        return float(np.sqrt(max(float((error**2).sum()) / max(dof, 1), least)))
+
+    @cached_property
+    def matrix(self) -> Array:
+        """(N, f) slopes in units of what is left, those of the foot last."""
+        slope = self.blocks[1]
+        foot = self.rows.jacobian[:, self.rows.active][self.rows.pose < 0]
+        return np.concatenate([slope.reshape(self.blocks[0].size, -1) / self.size, foot])
+
+    @cached_property
+    def error(self) -> Array:
+        """(N,) errors likewise."""
+        return np.concatenate(
+            [self.blocks[0].reshape(-1) / self.size, self.rows.error[self.rows.pose < 0]]
+        )
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(f, N) from errors to what is free."""
+        norm = np.linalg.norm(self.matrix, axis=0)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        return np.asarray(np.linalg.pinv(self.matrix / norm, rcond=TOLD) / norm[:, None])
+
+    @cached_property
+    def state(self) -> State:
+        """Where what is free explains the errors best."""
+        step = np.zeros(len(self.rows.active))
+        step[self.rows.active] = self.inverse @ self.error
+        return self.rows.state.step(step)
+
+    @property
+    def used(self) -> float:
+        """Coordinates of the poses that what is free takes up."""
+        poses = self.blocks[0].size
+        return float(np.einsum("nf,fn->", self.matrix[:poses], self.inverse[:, :poses]))
+
+    def factor(self, root: Array) -> Array:
+        """F (p, r + N) with FF' the covariance of all parameters there.
+
+        root: (p, r) of what is kept, before.
+        """
+        rows, (_, _, half) = self.rows, self.blocks
+        m, r, _ = half.shape
+        poses, foot = np.split(self.inverse, [m * r], axis=1)
+        coloured = np.einsum("fmr,mrs->fms", poses.reshape(-1, m, r), half) / self.size
+        noise = np.concatenate([coloured.reshape(poses.shape), foot], axis=1)
+        out = np.concatenate([root, np.zeros((len(root), noise.shape[1]))], axis=1)
+        out[rows.active, : root.shape[1]] += noise @ rows.latent
+        out[rows.active, root.shape[1] :] = rows.scale * noise
+        return out
+
+    def left_out(self, group: Array) -> float:
+        """Sum of squared errors of poses that others place [m^2].
+
+        group: (m,) poses that are left out at once.  What the others do not tell stays as it is.
+        """
+        error, slope, _ = self.blocks
+        norm = np.linalg.norm(self.matrix, axis=0)
+        scaled = self.matrix / np.where(norm > 0.0, norm, 1.0)
+        whole, right = scaled.T @ scaled, scaled.T @ self.error
+        parts = scaled[: error.size].reshape(*slope.shape)
+        own = np.zeros((int(group.max()) + 1, *whole.shape))
+        np.add.at(own, group, np.swapaxes(parts, 1, 2) @ parts)
+        told = np.zeros((len(own), len(right)))
+        np.add.at(told, group, np.einsum("mrf,mr->mf", parts, error / self.size))
+        found = solve_normal(whole - own, (right - told)[..., None], rescale=False)[group]
+        return float(((error - self.size * (parts @ found)[..., 0]) ** 2).sum())
+
+
+def predicts(rows: Rows, column: int, group: Array) -> bool:
+    """Whether a parameter's change brings poses nearer that it was not estimated from.
+
+    rows: with what is free so far.  group: (m,) poses that are left out at once.
+    """
+    active = rows.active.copy()
+    active[column] = True
+    with_it = Placing(replace(rows, active=active)).left_out(group)
+    return with_it < Placing(rows).left_out(group)
