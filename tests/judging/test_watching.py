@@ -120,7 +120,7 @@ def test_sigmas_of_the_search_are_those_of_many_runs(fit: mc.Fit, made: Simulati
         for kind, mdh, known in ((0, made.cell.robot.mdh, 0.0 * root), (1, wrong, root)):
             cell = replace(watched.cell, robot=watched.cell.robot.with_mdh(mdh))
             arm = replace(watched, cell=cell, known=known, variance=noise**2, jitter=0.0)
-            first = search(arm, np.zeros(arm.names.count, dtype=bool), None, 0).first
+            first = search(arm, np.zeros(arm.names.count, dtype=bool), None, 0).first.noise
             by, sigma = first.scores(arm.zeros[1:5])
             found[kind].append(by / sigma * first.scale)
     for kind in found:

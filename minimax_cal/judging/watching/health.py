@@ -84,7 +84,7 @@ def check(
         sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.robot.prismatic)),
         enough=enough,
         asked=asked,
-        noise=math.sqrt(found.last.mean_square),
+        noise=math.sqrt(found.after.rows.mean_square),
         poses=watched.data.poses,
         fit=replace(after, notices=(*after.notices, *said)),
         notices=(*data.notices, *said, *remarks(watched, found)),
@@ -149,9 +149,9 @@ def confidence(interval: Any, size: float, *, above: bool) -> float:
 
 def remarks(watched: Watched, found: Search) -> Iterator[str]:
     """What the reader should know."""
-    if found.last.mean_square > 1.0 + NOISIER * math.sqrt(2.0 / found.last.dof):
+    if found.after.rows.mean_square > 1.0 + NOISIER * math.sqrt(2.0 / found.after.rows.dof):
         yield (
-            f"what is left is {math.sqrt(found.last.mean_square):.2g} times as large as the "
+            f"what is left is {math.sqrt(found.after.rows.mean_square):.2g} times as large as the "
             "calibration's noise: the instrument is noisier now, or more changed than is named"
         )
     wider = float(found.looked.wider.max(initial=1.0))

@@ -19,10 +19,9 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.watching.placing import Placing, predicts
-from minimax_cal.judging.watching.watched import Own, Rows, Watched
+from minimax_cal.judging.watching.watched import Both, Own, Rows, Watched
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import links_of
-from minimax_cal.solvers.least_squares import solve_normal
 
 LEVEL = 0.005  # chance that anything at all is named on an arm that did not move
 ZEROS = (
@@ -31,6 +30,7 @@ ZEROS = (
 APART = 1e-6  # share of a motion that frame and reflectors do not imitate, of what can be told
 CLEARER = 9.0  # by how much a link must explain more than a zero position, in squared sigmas
 LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
+OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases
 MOST = 4  # parameters that are named; where more moved, the arm wants a calibration
 
 
@@ -102,13 +102,17 @@ class Candidates:
 
     column: (c,) which.  zero: (c,) True for zero positions.  level: (c,) chance that each is named
     where nothing moved.  wider: (c,) by how much its scores spread more than the noises say, as
-    the calibration's own poses have them: what the model lacks is no noise.
+    the calibration's own poses have them: what the model lacks is no noise.  alike: (c,) True where
+    rows with all coordinates alike are asked.  single: (c,) share of their coordinates that so many
+    independent ones would be.
     """
 
     column: Array
     zero: Array
     level: Array
     wider: Array
+    alike: Array
+    single: Array
 
     @staticmethod
     def of(watched: Watched, rows: Rows, links: Array) -> Candidates:
@@ -120,35 +124,63 @@ class Candidates:
         others = np.setdiff1d(np.flatnonzero(links & watched.names.links), zeros)
         kinds = [kind[rows.share(kind, watched.open) > APART] for kind in (zeros, others)]
         zero = np.repeat([True, False], [len(kind) for kind in kinds])
-        return Candidates(np.concatenate(kinds), zero, levels(zero), np.ones(len(zero)))
+        one, by_noise = np.ones(len(zero)), np.zeros(len(zero), dtype=bool)
+        return Candidates(np.concatenate(kinds), zero, levels(zero), one, by_noise, one)
 
     def without(self, chosen: list[int]) -> Candidates:
-        """Fewer."""
-        kept = ~np.isin(self.column, chosen)
+        """All but some."""
+        return self.only(self.column[~np.isin(self.column, chosen)])
+
+    def only(self, some: Array) -> Candidates:
+        """Some of them."""
+        kept = np.isin(self.column, some)
         return Candidates(*(part[kept] for part in vars(self).values()))
 
-    def sizes(self, rows: Rows) -> tuple[Array, int]:
-        """How large each score is, in sigmas, by the noise that the others leave: (c,); its dof."""
-        by, sigma = rows.scores(self.column)
-        square = np.nan_to_num((by / sigma * rows.scale) ** 2)
-        dof = max(rows.dof - 1, 1)  # what is explained is no noise
-        noise = np.maximum((rows.dof * rows.mean_square - square) / dof, 1.0)
-        return np.asarray(np.sqrt(square / noise) / self.wider), dof
+    def sizes(self, rows: Both) -> tuple[Array, Array]:
+        """How large each score is, in sigmas: (c,); its degrees of freedom: (c,)."""
+        noise, alike = (each.sizes(self.column) for each in (rows.noise, rows.alike))
+        return np.where(self.alike, alike, noise) / self.wider, self.dof(rows.noise)
 
-    def widened(self, own: Own, poses: int, rng: np.random.Generator) -> Candidates:
-        """The same with `wider` from samples of so many of the calibration's own poses."""
-        whole, counts = own.samples(self.column, poses, rng)
-        c, free = len(self.column), int(own.rows.active.sum())
-        q = whole.shape[-1] - c - 1  # what is free, and what was not known
-        kept, rest = whole[:, :q, :q], whole[:, :q, q:]
-        left = whole[:, q:, q:] - np.swapaxes(rest, 1, 2) @ solve_normal(kept, rest)
-        score, size = left[:, :c, c], np.einsum("dcc->dc", left)[:, :c]
-        dof = np.maximum(counts - free - 1.0, 1.0)[:, None]
-        square = score**2 / np.where(size > 0.0, size, np.inf)
-        noise = np.maximum((left[:, c, c, None] - square) / dof, 1.0)
-        return replace(self, wider=np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
+    def dof(self, rows: Rows) -> Array:
+        """(c,) of each score."""
+        taken = rows.count - rows.dof + 1  # what is explained is no noise
+        return np.asarray(np.maximum(self.single * rows.count - taken, 1.0))
 
-    def clearest(self, rows: Rows, group: Array) -> tuple[int, float, tuple[int, ...]] | None:
+    def sigmas(self, rows: Both) -> Array:
+        """(c,) of each parameter's change, where noises are what they were [SI]."""
+        noise, alike = (each.sigmas(self.column) for each in (rows.noise, rows.alike))
+        return np.asarray(np.where(self.alike, alike, noise) * self.wider)
+
+    def least(self, rows: Both) -> Array:
+        """(c,) smallest change that is found in 95 of 100 cases [SI]."""
+        return np.asarray(
+            self.sigmas(rows) * (critical(self.level, self.dof(rows.noise)) + OF_POWER)
+        )
+
+    def widened(self, rows: Both, own: Own, poses: int, seed: int) -> Candidates:
+        """The same with `wider` from samples of so many of the calibration's own poses.
+
+        Each is asked by the rows that tell it best then, which the new errors have no part in.
+        """
+        wider, single = own.spread(self.column, poses, seed), own.single
+        one, other = (
+            replace(
+                self,
+                wider=wider[row],
+                alike=np.full(len(self.alike), bool(row)),
+                single=np.full(len(self.alike), single[row]),
+            )
+            for row in (0, 1)
+        )
+        alike = other.least(rows) < one.least(rows)
+        return replace(
+            self,
+            wider=np.where(alike, other.wider, one.wider),
+            alike=alike,
+            single=np.where(alike, other.single, one.single),
+        )
+
+    def clearest(self, rows: Both, group: Array) -> tuple[int, float, tuple[int, ...]] | None:
         """The one that explains most, its p-value and its rivals; None where all may be chance.
 
         Only one that helps poses it was not estimated from: what mends nothing has not moved.
@@ -157,7 +189,7 @@ class Candidates:
         size, dof = self.sizes(rows)
         p_value = np.asarray(2.0 * stats.t.sf(size, dof))
         passed = p_value <= self.level
-        passed[passed] = [predicts(rows, int(i), group) for i in self.column[passed]]
+        passed[passed] = [predicts(rows.noise, int(i), group) for i in self.column[passed]]
         if not passed.any():
             return None
         pick, near = picked(size**2, passed, self.zero)
@@ -168,24 +200,15 @@ class Candidates:
 class Search:
     """What was looked for and what was found.
 
-    named: what moved, the clearest first.  before: placed as if nothing had moved; after: with all
-    that did.  looked: what was looked for.
+    named: what moved, the clearest first.  first: the rows with nothing moved.  before: placed as
+    if nothing had moved; after: with all that did.  looked: what was looked for.
     """
 
     named: tuple[Moved, ...]
+    first: Both
     before: Placing
     after: Placing
     looked: Candidates
-
-    @property
-    def first(self) -> Rows:
-        """With nothing moved."""
-        return self.before.rows
-
-    @property
-    def last(self) -> Rows:
-        """With all that moved free."""
-        return self.after.rows
 
 
 def search(watched: Watched, links: Array, own: Own | None, seed: int) -> Search:
@@ -195,15 +218,15 @@ def search(watched: Watched, links: Array, own: Own | None, seed: int) -> Search
     seed: of samples of these.  Raises DataError for too few poses.
     """
     _, state = watched.start
-    rows = first = watched.rows(watched.open, state)
-    if rows.count <= int(watched.open.sum()):
+    rows = first = watched.both(watched.open, state)
+    if rows.noise.count <= int(watched.open.sum()):
         raise DataError(
             f"{watched.data.source}: {watched.data.poses} poses do not even tell where instrument "
             "and reflectors are; measure more"
         )
-    looked = Candidates.of(watched, rows, links)
+    looked = Candidates.of(watched, rows.noise, links)
     if own is not None:
-        looked = looked.widened(own, watched.data.poses, np.random.default_rng(seed))
+        looked = looked.widened(rows, own, watched.data.poses, seed)
     names = watched.names.all
     group = groups(watched.data)
     chosen: list[int] = []
@@ -214,14 +237,14 @@ def search(watched: Watched, links: Array, own: Own | None, seed: int) -> Search
         found.append(Moved(names[column], 0.0, 0.0, "", p_value, tuple(names[i] for i in others)))
         active = watched.open.copy()
         active[chosen] = True
-        rows = watched.rows(active, rows.state)
-    before, after = Placing(first), Placing(rows)
-    return Search(sized(watched, after, found), before, after, looked)
+        rows = watched.both(active, rows.noise.state)
+    before, after = Placing(first.noise), Placing(rows.noise)
+    return Search(sized(watched, after, found), first, before, after, looked)
 
 
-def critical(level: float, dof: float) -> float:
-    """Sigmas that chance exceeds, either way, with the probability given [Student]."""
-    return float(stats.t.isf(0.5 * level, dof))
+def critical(level: Array, dof: Array) -> Array:
+    """Sigmas that chance exceeds, either way, with the probabilities given [Student]."""
+    return np.asarray(stats.t.isf(0.5 * level, dof))
 
 
 def sized(watched: Watched, placed: Placing, found: list[Moved]) -> tuple[Moved, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.watched import PLENTY, Own, Watched
+from minimax_cal.judging.watching.watched import PLENTY, Both, Own, Watched
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -57,6 +57,7 @@ def watched_of(
     said = (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
     ratio = usual_u95(data) / usual_u95(fit.data)
     variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
+    variance = max(variance, LEAST_NOISE**2)
     watched = Watched(
         cell=replace(
             cell,
@@ -68,14 +69,22 @@ def watched_of(
         data=cell.placed(data) if frame else data,
         known=known_by.root,
         names_old=known_by.names,
-        variance=max(variance, LEAST_NOISE**2),
+        variance=variance,
         jitter=known_by.noise.jitter,
+        left=max(variance, mean_square(fit)),
         frame=frame,
         tool=tool,
         foot=foot,
         foot_now=foot_now,
     )
     return watched, said if gone else ()
+
+
+def mean_square(fit: Fit) -> float:
+    """Of a coordinate of what the calibration left of its poses [m^2]."""
+    error = fit.error[np.isfinite(fit.error)]
+    dof = error.size - int(fit.identification.active.sum())
+    return float(error @ error) / max(dof, 1)
 
 
 def feet(fit: Fit, data: Measurements) -> tuple[Array, Array]:
@@ -130,7 +139,8 @@ def own_poses(fit: Fit, watched: Watched) -> Own | None:
     data, state = fit.data.take(some), fit.cell.state
     stood = watched.foot @ state.rotation.T + state.origin
     own = replace(watched, cell=fit.cell, data=data, foot_now=stood)
-    rows = replace(own.rows(everything, state), active=own.open)
+    found = own.both(everything, state)
+    rows = Both(*(replace(each, active=own.open) for each in (found.noise, found.alike)))
     if not len(stood):
         return Own(rows, np.zeros((data.poses, 0)))
     seen = foot_of(data)

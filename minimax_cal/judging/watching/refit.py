@@ -23,7 +23,7 @@ from minimax_cal.solvers.status import Status
 
 def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     """The calibration with what moved corrected, and placed where the new poses have it."""
-    rows, state = found.last, found.after.state
+    rows, state = found.after.rows, found.after.state
     names, data = watched.names, watched.data
     sure = spread_of(fit, watched, found)
     known = identified(fit, rows, sure)
@@ -94,7 +94,7 @@ def identified(fit: Fit, rows: Rows, sure: Uncertainty) -> Identification:
 
 def spread_of(fit: Fit, watched: Watched, found: Search) -> Uncertainty:
     """What is known about the parameters then."""
-    rows, names = found.last, watched.names
+    rows, names = found.after.rows, watched.names
     factor = found.after.factor(watched.root)
     covariance = factor @ factor.T
     known = in_names(fit, watched, fit.identification.active) | rows.active

@@ -23,9 +23,11 @@ from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.solvers.least_squares import solve_normal
 
 PLENTY = 500  # poses that tell what more would
 SAMPLES = 200  # of the calibration's own poses, as many at a time as are new
+TINY = 1e-300  # in place of a zero
 PLACINGS = 3  # passes that place an arm with effects
 
 
@@ -35,6 +37,7 @@ class Watched:
 
     cell: as calibrated, with the targets of the data.  known: (p_old, r) root of the calibration's
     covariance, p_old its parameters by `names_old`.  variance, jitter: of its noise [m^2, rad].
+    left: mean square of a coordinate that its fit left [m^2].
     frame, tool: whether the instrument stands, and the reflectors sit, where they did.
     foot: (f, 3) reflectors of the foot in the base as calibrated, and foot_now: as seen now [m].
     """
@@ -45,6 +48,7 @@ class Watched:
     names_old: Names
     variance: float
     jitter: float
+    left: float
     frame: bool
     tool: bool
     foot: Array
@@ -103,14 +107,21 @@ class Watched:
                 state = nearby(model, state).x.take(np.array(0))
         return model, state
 
-    def rows(self, active: Array, state: State) -> Rows:
-        """The errors linear about the best fit with some parameters free."""
+    def both(self, active: Array, state: State) -> Both:
+        """The errors linear about the best fit with some parameters free, weighed either way."""
+        return Both(*(self.rows(active, state, alike=alike) for alike in (False, True)))
+
+    def rows(self, active: Array, state: State, *, alike: bool = False) -> Rows:
+        """The same by the noises, or with every coordinate alike, as the fit left them."""
         model, state = self.fitted(active, state)
         every = model.only(np.ones(model.names.count, dtype=bool))
         poses = Poses.of(Estimator(every, np.ones(len(model.y))), state)
         m, r, p = poses.jacobian.shape
         wide = self.jitter**2 * poses.arm @ np.swapaxes(poses.arm, 1, 2)
-        half = np.linalg.cholesky(wide + self.variance * np.eye(r))
+        noise = wide + self.variance * np.eye(r)
+        half = np.linalg.cholesky(
+            np.broadcast_to(self.left * np.eye(r), noise.shape) if alike else noise
+        )
         whole = np.concatenate([poses.error[..., None], poses.jacobian], axis=2)
         white = np.linalg.solve(half, whole).reshape(m * r, p + 1)
         jacobian = white[:, 1:]
@@ -236,12 +247,36 @@ class Rows:
             rest = (off**2).sum(axis=0)
         return np.asarray(rest / np.where(size > 0.0, size, np.inf))
 
+    def sizes(self, columns: Array) -> Array:
+        """(c,) how large each score is, in sigmas, by the noise that the others leave."""
+        by, sigma = self.scores(columns)
+        square = np.nan_to_num((by / sigma * self.scale) ** 2)
+        dof = max(self.dof - 1, 1)  # what is explained is no noise
+        noise = np.maximum((self.dof * self.mean_square - square) / dof, 1.0)
+        return np.asarray(np.sqrt(square / noise))
+
+    def sigmas(self, columns: Array) -> Array:
+        """(c,) of each parameter's change if the noise is what it was [SI]."""
+        return replace(self, error=np.zeros_like(self.error)).scores(columns)[1]
+
     def scores(self, columns: Array) -> tuple[Array, Array]:
         """Each parameter's change if it alone moved besides, and its sigma: (c,) each [SI]."""
         rest = self.apart(columns, self.basis)
         size = (rest**2).sum(axis=0)
         size = np.where(size > 0.0, size, np.nan)
         return rest.T @ self.left / size, self.scale / np.sqrt(size)
+
+
+@dataclass(frozen=True, eq=False)
+class Both:
+    """The same errors by the noises that the calibration found, and with all coordinates alike.
+
+    The first tell most where noises are all there is; the second where the model lacks something in
+    directions in which nothing is noisy.
+    """
+
+    noise: Rows
+    alike: Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,25 +287,68 @@ class Own:
     pose, in units of noise, NaN where unseen.
     """
 
-    rows: Rows
+    rows: Both
     foot: Array
 
-    def samples(self, columns: Array, poses: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Products as of `Rows.by_pose`, of samples of so many poses: (s, q, q), coordinates: (s,).
+    @cached_property
+    def single(self) -> Array:
+        """(2,) share of the coordinates that so many independent ones would be [Box 1954].
+
+        Points of a pose err together: (tr C)^2 / tr C^2 of the covariance C of a pose's errors,
+        without bias from the number of poses.
+        """
+        return np.array([self.single_of(rows) for rows in (self.rows.noise, self.rows.alike)])
+
+    @staticmethod
+    def single_of(rows: Rows) -> float:
+        """Of rows weighed one way."""
+        m, r, _ = rows.half.shape
+        error = rows.error[: m * r].reshape(m, r)
+        square = (error**2).sum(axis=1)
+        pairs = float(((error.T @ error) ** 2).sum() - (square**2).sum()) / (m * (m - 1))
+        many = float(square.mean()) ** 2 / max(pairs, TINY)
+        return float(min(many * m / (rows.count - rows.foot), 1.0))
+
+    def spread(self, columns: Array, poses: int, seed: int) -> Array:
+        """(2, c) by how much scores spread more than noises say, in samples of so many poses."""
+        return np.array(
+            [
+                self.spread_of(rows, columns, poses, np.random.default_rng(seed))
+                for rows in (self.rows.noise, self.rows.alike)
+            ]
+        )
+
+    def spread_of(self, rows: Rows, columns: Array, poses: int, rng: np.random.Generator) -> Array:
+        """(c,) of rows weighed one way."""
+        whole, counts = self.samples(rows, columns, poses, rng)
+        c, free = len(columns), int(rows.active.sum())
+        q = whole.shape[-1] - c - 1  # what is free, and what was not known
+        kept, rest = whole[:, :q, :q], whole[:, :q, q:]
+        left = whole[:, q:, q:] - np.swapaxes(rest, 1, 2) @ solve_normal(kept, rest)
+        score, size = left[:, :c, c], np.einsum("dcc->dc", left)[:, :c]
+        dof = np.maximum(counts - free - 1.0, 1.0)[:, None]
+        square = score**2 / np.where(size > 0.0, size, np.inf)
+        noise = np.maximum((left[:, c, c, None] - square) / dof, 1.0)
+        return np.asarray(np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
+
+    def samples(
+        self, rows: Rows, columns: Array, poses: int, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Products as of `Rows.by_pose`: (s, q, q), and coordinates: (s,), of samples.
 
         The prior of what was not known is among them, and the foot as these poses see it.
         """
-        gram, counts = self.rows.by_pose(columns)
+        gram, counts = rows.by_pose(columns)
         drawn = np.zeros((SAMPLES, len(gram)))
         for row in drawn:
             row[rng.permutation(len(gram))[: min(poses, len(gram) // 2)]] = 1.0
         whole = np.tensordot(drawn, gram, 1)
-        place = np.arange(whole.shape[-1] - len(columns) - 1)[-self.rows.latent.shape[1] :]
-        whole[:, place, place] += 1.0
+        free = int(rows.active.sum())
+        prior = np.arange(free, free + rows.latent.shape[1])
+        whole[:, prior, prior] += 1.0
         seen = np.isfinite(self.foot)
         error = drawn @ np.where(seen, self.foot, 0.0) / np.maximum(drawn @ seen, 1.0)
-        slope = self.rows.columns(columns)[self.rows.pose < 0]
-        every = np.concatenate(
-            [np.broadcast_to(slope, (SAMPLES, *slope.shape)), error[..., None]], 2
-        )
-        return whole + np.swapaxes(every, 1, 2) @ every, drawn @ counts + self.foot.shape[1]
+        slope = rows.columns(columns)[rows.pose < 0]
+        slopes = np.broadcast_to(slope, (SAMPLES, *slope.shape))
+        foot = np.concatenate([slopes, error[..., None]], axis=2)
+        return whole + np.swapaxes(foot, 1, 2) @ foot, drawn @ counts + rows.foot
