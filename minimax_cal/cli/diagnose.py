@@ -56,7 +56,7 @@ def diagnose_command(robot: str, data: Path, in_rows: bool, to: Output, **chosen
     with to.stages() as progress:
         found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
     to.notice(*found.notices)
-    if to.deliver(found.json):
+    if to.deliver(found.json, found.status):
         options.terminal().print(found.headline() + "\n", markup=False)
         left = remainder_table(found)
         options.show(*found.tables(), *([left] if left.rows else []), *where_tables(found.where))

@@ -48,6 +48,7 @@ from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
+from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import FEW
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
@@ -73,6 +74,7 @@ from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers.status import Status
 
 NOT_ASKED = Beyond(reason="not asked for")
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
@@ -188,15 +190,16 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     beyond = NOT_ASKED
     if not options.quick:
         beyond = beyond_of(study, causes, judges, progress)
-    wrong = doubts(robot, study.fit, study.nominal.error(study.data))
+    wrong = against(robot, floor, steps[-1])
+    alarming = (*doubts(robot, study.fit, study.nominal.error(study.data)), *filter(None, [wrong]))
     told = (*asked.data.notices, *notices, *clean.remarks)
     if late:
         told = (*told, f"points that stand out beside all that was found: {listed(late)}")
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
-        status=study.fit.status,
-        verdict=verdict,
+        status=Status.FAILED if wrong else study.fit.status,
+        verdict="unknown" if wrong else verdict,
         findings=tuple(findings),
         ladder=tuple(steps),
         floor=floor,
@@ -209,7 +212,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure_in=structure_left[0],
         where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*told, *study.fit.notices, *foot_notices(ladder.last, clean.data), *wrong),
+        notices=(*told, *study.fit.notices, *foot_notices(ladder.last, clean.data), *alarming),
         provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
@@ -294,6 +297,13 @@ def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
     held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
     sound = of_lines(held.line, clean.data.line, clean.data.seen).T
     return Judges(train, held, held.seen.T & ~sound)
+
+
+def against(robot: Robot, floor: Floor, last: Step) -> str:
+    """Why the last rung contradicts the data; empty where it does not."""
+    known = (floor.value, floor.source) if floor.certain else None
+    scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
+    return too_far(robot, known, scores)
 
 
 def noise_mm(rows: Rows, noise: Noise) -> float:

@@ -7,10 +7,15 @@ from collections.abc import Sequence
 
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
 from minimax_cal.evidence.limits import STRUCTURE
+from minimax_cal.solvers.status import Status
 
 NOTHING_MM = 5e-4  # of a length that is told to three digits
 SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
 NO_CHANCE = f"below {STRUCTURE:g} is no accident"
+CONTRADICTED = (
+    "Verdict: unknown. The best fit contradicts the measurements: this is no calibration of this "
+    "arm, and no cause is to be read from it."
+)
 VERDICTS = {  # what stands first
     "none": "Verdict: none. Nothing beyond geometry and noise is established.",
     "named": "Verdict: named, and no rival explains the errors as well.",
@@ -22,7 +27,12 @@ VERDICTS = {  # what stands first
 
 
 def reasons(found: Diagnosis) -> tuple[str, ...]:
-    """Verdict, established causes, share, remainder, next measurement; then what is tentative."""
+    """Verdict, established causes, share, remainder, next measurement; then what is tentative.
+
+    Nothing but the verdict of a diagnosis that failed.
+    """
+    if found.status is Status.FAILED:
+        return (CONTRADICTED,)
     causes = [f for f in found.by_rung if f.established]
     tentative = [f for f in found.by_rung if not f.established]
     large = [f for f in causes if not f.share < SMALL] or causes[:1]

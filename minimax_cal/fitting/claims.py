@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.floor import known_floor
 from minimax_cal.measuring.grouping import clusters, grouped, parts
 from minimax_cal.measuring.measurements import Measurements
@@ -80,20 +80,33 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
 def contradiction(
     robot: Robot, data: Measurements, error: Array, held: Array, suspects: Sequence[Suspect]
 ) -> str:
-    """Why the fit contradicts its own data; empty where it does not.
+    """Why a fit contradicts its own data; empty where it does not.
 
     error: (k, m, 3) of all poses [m].  held: (m,).
     """
     rest = aside(error, data, suspects)
-    floor = known_floor(data, rest, robot.repeatability)
+    scores = {
+        name: (accuracy(error[:, rows]), accuracy(rest[:, rows]))
+        for name, rows in (("training", ~held), ("held-out", held))
+    }
+    return too_far(robot, known_floor(data, rest, robot.repeatability), scores)
+
+
+def too_far(
+    robot: Robot,
+    floor: tuple[float, str] | None,
+    scores: Mapping[str, tuple[Accuracy, Accuracy]],
+) -> str:
+    """Why a result contradicts its own data; empty where it does not.
+
+    floor: of noise [mm], and how it is known.  scores: of parts of the poses by their names, over
+    all points and without those that are suspect.
+    """
     limit, what = 1e3 * GROSS * robot.reach(), f"{100 * GROSS:g} % of the arm's reach"
     if floor and FLOORS * max(floor[0], LEAST_FLOOR) < limit:
         limit = FLOORS * max(floor[0], LEAST_FLOOR)
         what = f"{FLOORS:g} times the noise floor ({floor[1]})"
-    for name, rows in (("training", ~held), ("held-out", held)):
-        whole = left = accuracy(error[:, rows])
-        if suspects:
-            left = accuracy(rest[:, rows])
+    for name, (whole, left) in scores.items():
         few = sum(left.counts) < LEFT * sum(whole.counts)
         miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
         if miss > limit:

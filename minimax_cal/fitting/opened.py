@@ -185,7 +185,8 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     told = {GEOMETRIC: geometric, rungs[-1].name: final} if data.poses else {}
     rungs = tuple(Rung(r.name, r.cell, told.get(r.name)) for r in rungs)
     digest = str(content["provenance"]["data_sha256"])
-    return Opened(source, rungs, len(rungs) - 1, data, held, digest)
+    status = Status(content["status"]) if "status" in content else None
+    return Opened(source, rungs, len(rungs) - 1, data, held, digest, status=status)
 
 
 def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:

@@ -1,0 +1,51 @@
+"""A diagnosis that contradicts its own data: failed, and no robot comes of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run
+
+import minimax_cal as mc
+from minimax_cal.diagnosing.diagnose import against
+from minimax_cal.diagnosing.result import Step
+from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
+
+
+def mirrored(data: mc.Measurements) -> mc.Measurements:
+    """One coordinate of one target with the wrong sign."""
+    return data.with_y(data.y * np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]))
+
+
+def test_it_ends_with_one_and_writes_no_robot(
+    robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = tmp_path / "d.csv", tmp_path / "gap.json"
+    mc.write_measurements(data, mirrored(mc.simulate(robot, 60, 2, seed=5).data))
+    assert run("diagnose", "irb2600", data, "--quick", "--json", "-o", out) == 1
+    said = capsys.readouterr()
+    assert said.err.splitlines()[-1].startswith("error: failed: ")
+    assert not out.exists()
+    found = mc.Diagnosis.from_dict(json.loads(said.out))
+    assert (found.status, found.verdict) == ("failed", "unknown")
+    assert "no calibration of this arm" in found.headline()
+    assert "no calibration of this arm" in found.notices[-1]
+    with pytest.raises(mc.OptionError, match="contradicts its own data"):
+        mc.export(found, "json")
+
+
+def test_points_that_are_suspect_contradict_nothing(robot: mc.Robot) -> None:
+    def scores(rms: float, points: int) -> Accuracy:
+        return Accuracy(rms, rms, rms, points, (points * rms**2,), (points,))
+
+    fits, open_end = scores(0.1, 80), Floor(0.1, 0.0, 0.1, AT_MOST)
+    few_bad = Step("geometric", fits, scores(90.0, 20), scores(0.1, 16))
+    assert against(robot, open_end, few_bad) == ""
+    most_bad = Step("geometric", fits, scores(90.0, 20), scores(0.1, 8))
+    assert "misses the held-out poses by 90 mm" in against(robot, open_end, most_bad)
+    known = Floor(0.001, 0.001, 0.001, REPEATS)
+    off = Step("geometric", scores(0.4, 80), fits, fits)
+    assert "50 times the noise floor" in against(robot, known, off)
+    assert against(robot, open_end, off) == ""
