@@ -37,6 +37,7 @@ def fleet_command(
     """
     with to.stages() as progress:
         found = fleet(cells, out=out, page=path, processes=jobs, cluster=cluster, progress=progress)
+    to.notice(*(f"{row.cell}: {text}" for row in found.rows for text in row.notices))
     to.wrote(path)
     if to.deliver(found.json):
         show(found.table(), headline=found.headline())

@@ -46,6 +46,7 @@ from minimax_cal.fitting.options import (
     usable,
 )
 from minimax_cal.fitting.robust import SQUARE
+from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps, stationed, unplaced
@@ -65,10 +66,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
-WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
-WILD_LENGTH = 0.02  # nor a length, of its reach
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
-NAMED = 5  # implausible changes that are told one by one
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
 
@@ -350,15 +348,7 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
             f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
             "measurements, with their joint signs, zero positions and units"
         )
-    names = solved.names
-    change = links_of(solved.state.mdh - solved.nominal.mdh)
-    length = names.linear[: len(change)]
-    wild = np.abs(change) > np.where(length, WILD_LENGTH * reach, WILD_ANGLE)
-    if wild.any():
-        named = ", ".join(
-            f"{names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
-            for i in np.flatnonzero(wild)[:NAMED]
-        )
+    if named := wild(solved.names, links_of(solved.state.mdh - solved.nominal.mdh), reach):
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 

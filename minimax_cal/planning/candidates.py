@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from scipy.stats import qmc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.visibility import ARM, TRACKER, Room, Sight, View
 from minimax_cal.robots.robot import Robot
 
@@ -54,36 +55,53 @@ class Poses:
 
 
 def limits_of(
-    robot: Robot, narrow: Mapping[int, tuple[float, float]]
+    robot: Robot,
+    narrow: Mapping[int, tuple[float, float]],
+    measured: Sequence[Measurements] = (),
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """(n,) lower and upper limits [rad, m], and a notice where the robot file has none.
 
-    A joint turns at most once round.  narrow: limits by joint index that cut these.
-    Raises OptionError.
+    A joint turns at most once round; one without limits as far as it went in the poses at hand.
+    narrow: limits by joint index that cut these.  measured: poses at hand.  Raises OptionError.
     """
     most = np.where(robot.prismatic, SLIDE, np.pi)
     known = np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    lower = np.where(np.isfinite(robot.lower), robot.lower, -most)
-    upper = np.where(np.isfinite(robot.upper), robot.upper, most)
+    named = np.isin(np.arange(robot.joints), list(narrow))
+    at_hand = np.concatenate([np.zeros((0, robot.joints)), *(one.q for one in measured)])
+    least, largest = at_hand.min(axis=0, initial=np.inf), at_hand.max(axis=0, initial=-np.inf)
+    went = ~known & ~named & (least < largest)
+    lower = np.where(np.isfinite(robot.lower), robot.lower, np.where(went, least, -most))
+    upper = np.where(np.isfinite(robot.upper), robot.upper, np.where(went, largest, most))
     once = known & ~robot.prismatic & (np.maximum(lower, -np.pi) < np.minimum(upper, np.pi))
     lower = np.where(once, np.maximum(lower, -np.pi), lower)
     upper = np.where(once, np.minimum(upper, np.pi), upper)
-    for joint, (least, largest) in narrow.items():
-        lower[joint], upper[joint] = max(lower[joint], least), min(upper[joint], largest)
+    for joint, (low, high) in narrow.items():
+        lower[joint], upper[joint] = max(lower[joint], low), min(upper[joint], high)
         if not lower[joint] < upper[joint]:
             raise OptionError(
                 f"joint {joint + 1}: no range is left within the limits of {robot.name}; "
                 "give low:high, low below high, in deg (slides: mm)"
             )
-    open_ones = [i for i in np.flatnonzero(~known) if i not in narrow]
     notices = []
-    if open_ones:
-        names = ", ".join(str(i + 1) for i in open_ones)
+    if went.any():
+        notices.append(
+            f"{robot.name} has no limits for some joints: they go where the poses at hand went "
+            f"({', '.join(ranges(robot, lower, upper, went))}); set others with joints="
+        )
+    if (still := ~known & ~named & ~went).any():
+        names = ", ".join(str(i + 1) for i in np.flatnonzero(still))
         notices.append(
             f"{robot.name} has no limits for joint {names}: +-180 deg are taken (slides +-500 mm); "
             "narrow them with joints="
         )
     return lower, upper, tuple(notices)
+
+
+def ranges(robot: Robot, lower: Array, upper: Array, chosen: Array) -> Iterator[str]:
+    """Of some joints (n,) where they may go, as joints= takes it."""
+    for i in np.flatnonzero(chosen):
+        factor, unit = (1e3, "mm") if robot.prismatic[i] else (180.0 / np.pi, "deg")
+        yield f"J{i + 1}={factor * lower[i]:.0f}:{factor * upper[i]:.0f} {unit}"
 
 
 def free_poses(room: Room, count: int, seed: int) -> Array:

@@ -125,7 +125,7 @@ def planned(
     check_options(options, poses, robot)
     progress("start")
     ground = ground_of(robot, fit, data, options)
-    room, sight, said = surroundings(ground.cell, options)
+    room, sight, said = surroundings(ground.cell, options, ground.measured)
     progress("candidate poses")
     found = candidates(room, sight, options.candidates, options.seed)
     if len(found.q) < poses:

@@ -11,19 +11,21 @@ import numpy as np
 from minimax_cal.evidence.noise import Noise, linearised, restricted
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.opened import Result, open_result
-from minimax_cal.ground.errors import OptionError
+from minimax_cal.fitting.same_arm import check_arm, wild
+from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import fields_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import Names, State, links_of, zero_positions
 from minimax_cal.planning.candidates import limits_of
 from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.prospect import Instrument, cell_ahead, front, ring
 from minimax_cal.planning.visibility import THICK, Room, Sight, normals_of
 from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.status import Status
 
 APART = 3.0  # where the tracker stands unless told: so far off, or the arm's reach [m]
 EXACT = 1e-7  # noise below which data were computed, not measured [m]
@@ -63,8 +65,13 @@ def ground_of(
             f"the fit's robot has {cells[0].robot.joints} joints, but {robot.name} has "
             f"{robot.joints}"
         )
+    if cells:
+        check_same(robot, cells[0].robot)
     if own and not cells:
-        cells = [calibrate(robot, own[0], "sum", holdout=0.0).cell]
+        first = calibrate(robot, own[0], "sum", holdout=0.0)
+        if first.status is Status.FAILED:
+            raise DataError(f"{own[0].source}: {first.notices[-1]}")
+        cells = [first.cell]
         notices.append(
             "the poses at hand were calibrated first, geometry alone; fit= takes another model"
         )
@@ -75,6 +82,8 @@ def ground_of(
             )
         for one in own:
             check_joints(robot, one)
+            if data:
+                check_arm(cells[0].robot, one)
             strange = [name for name in one.target_names if name not in cells[0].target_names]
             if strange:
                 raise OptionError(f"{one.source}: target {strange[0]} is not one of the fit's")
@@ -86,6 +95,20 @@ def ground_of(
     notices += [text] if text else []
     noise, text = shown_noise(cell, (), options)
     return Ground(cell, (), noise, (*notices, text))
+
+
+def check_same(robot: Robot, calibrated: Robot) -> None:
+    """Raise OptionError where a fit is of another arm than the one to plan for.
+
+    Zeros of the joints may be anywhere: a calibration may have set them.
+    """
+    change = links_of(calibrated.mdh - robot.mdh)
+    change[zero_positions(robot.prismatic)] = 0.0
+    if named := wild(Names(robot.joints, ()), change, robot.reach()):
+        raise OptionError(
+            f"the fit is of {calibrated.name}, which is not {robot.name} ({named}); name the robot "
+            "of the fit, or give another fit"
+        )
 
 
 def assumed(robot: Robot, options: PlanOptions) -> tuple[Cell, str]:
@@ -109,16 +132,19 @@ def shown_noise(
     """The noise to plan with, and where it is from."""
     given = {name: getattr(options, name) for name in ("noise", "per_metre", "jitter")}
     told = {name: float(value) for name, value in given.items() if value is not None}
-    base, source = Instrument(), "assumed"
+    base, source = Instrument(), ", assumed"
     if measured and not told:
         noise = noise_of(cell, measured[0])
         if np.sqrt(noise.variance) > EXACT:
-            source = "as the poses at hand show it"
+            source = (
+                ", as the poses at hand show them: what the model leaves is in both; give noise= "
+                "and jitter= where you know them"
+            )
             base = Instrument(float(np.sqrt(noise.variance)), 0.0, noise.jitter)
     out = replace(base, **told)
     text = (
         f"noise of a coordinate {1e6 * out.noise:.3g} um + {1e6 * out.per_metre:.3g} um/m, jitter "
-        f"of a joint {1e6 * out.jitter:.3g} urad, {'as given' if told else source}"
+        f"of a joint {1e6 * out.jitter:.3g} urad{', as given' if told else source}"
     )
     return out, text
 
@@ -138,10 +164,12 @@ def noise_of(cell: Cell, data: Measurements) -> Noise:
     return restricted(rows, rows.of(fields))
 
 
-def surroundings(cell: Cell, options: PlanOptions) -> tuple[Room, Sight, tuple[str, ...]]:
-    """Where the arm may go and what the instrument sees."""
+def surroundings(
+    cell: Cell, options: PlanOptions, measured: Sequence[Measurements] = ()
+) -> tuple[Room, Sight, tuple[str, ...]]:
+    """Where the arm may go and what the instrument sees.  measured: poses at hand."""
     robot = cell.robot
-    lower, upper, notices = limits_of(robot, options.joints)
+    lower, upper, notices = limits_of(robot, options.joints, measured)
     radius = THICK * robot.reach() if options.body is None else options.body
     room = Room(
         robot, cell.target_positions, normals_of(cell.target_positions, options.normals), lower,

@@ -21,6 +21,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning, RobotError
 from minimax_cal.ground.files import json_text, once, read_text, write_whole
 from minimax_cal.robots import kinematics
+from minimax_cal.robots.angle_units import check_angles, check_limits
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 from minimax_cal.robots.kinematics import MDH_NAMES
 
@@ -247,8 +248,12 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     def optional(values: list[float | None], default: float) -> Array:
         return np.array([default if value is None else value for value in values], dtype=float)
 
-    lower = optional([j.lower for j in joints], -np.inf) * unit
-    upper = optional([j.upper for j in joints], np.inf) * unit
+    angles = np.array([[j.theta, j.alpha, j.beta] for j in joints])
+    lower = optional([j.lower for j in joints], -np.inf)
+    upper = optional([j.upper for j in joints], np.inf)
+    check_angles(angles, schema.units.angle, source)
+    check_limits(lower, upper, prismatic, schema.units.angle, source)
+    lower, upper = lower * unit, upper * unit
     if np.any(lower >= upper):
         number = int(np.argmax(lower >= upper)) + 1
         raise RobotError(f"{source}: joint {number}: lower must be less than upper")

@@ -13,7 +13,9 @@ from minimax_cal.diagnosing.result import Diagnosis, load_diagnosis
 from minimax_cal.fitting.calibrate import again, calibrate
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.options import Progress
+from minimax_cal.fitting.same_arm import check_arm
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import held_out
 from minimax_cal.measuring.history import with_history
@@ -152,8 +154,13 @@ def marked(data: Measurements, held: Array) -> Measurements:
 def judged_by(
     fit: Fit, data: Measurements, chosen: tuple[float, int]
 ) -> tuple[Measurements, Array, bool]:
-    """The poses to judge by, which of them are held out, and whether they are those of the fit."""
+    """The poses to judge by, which of them are held out, and whether they are those of the fit.
+
+    Raises DataError for poses that cannot be of its arm.
+    """
     if fit.data.poses and fit.provenance.data_sha256 == data.digest:
         return with_history(fit.data), fit.held, True
+    check_joints(fit.robot, data)
+    check_arm(fit.robot, data)
     data = with_history(data)
     return data, held_out(data, *chosen)[0], False

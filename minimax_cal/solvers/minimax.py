@@ -11,7 +11,8 @@ The solver knows no robot; problem and iterate are the caller's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Generic, Protocol, TypeVar
@@ -28,6 +29,7 @@ Solver = Callable[[Problem], Solution]
 HESSIANS = ("gauss-newton", "bfgs")
 
 EVEN: Array = np.zeros(0)
+NUMBER = re.compile(r"\d[\d.]*(e[+-]?\d+)?")
 
 # Differences of the merit function below this, relative, are rounding: the model is trusted there.
 ROUNDING = 1e-12
@@ -177,7 +179,7 @@ def solve(
             break
         hessian = at.hessian(settings.floor)
         plan = at.subproblem(hessian, qp)
-        notes += [note for note in plan.notes if note not in notes]
+        notes += plan.notes
         if not plan.usable:
             status = Status.FAILED
             break
@@ -201,8 +203,19 @@ def solve(
             break
     return Optimum(
         at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
-        tuple(notes),
+        told_once(notes),
     )  # fmt: skip
+
+
+def told_once(notes: Sequence[str]) -> tuple[str, ...]:
+    """Notes, of those that differ in nothing but numbers the first, with their count."""
+    alike: dict[str, list[str]] = {}
+    for note in notes:
+        alike.setdefault(NUMBER.sub("#", note), []).append(note)
+    return tuple(
+        same[0] if len(same) == 1 else f"{same[0]} (the first of {len(same)} alike)"
+        for same in alike.values()
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,3 +131,23 @@ def test_a_wrong_place_is_one_line(folder: Path, capsys: pytest.CaptureFixture[s
     assert run("fleet", cells, "--page", folder / "page.png") == 2
     assert run("fleet", folder / "none.toml") == 2
     assert len(capsys.readouterr().err.splitlines()) == 3
+
+
+def test_what_a_calibration_says_is_in_its_row(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A fleet of the wrong robot looked like any other."""
+    other = simulate("ur10", 24, 3, 1, Truth(compliance=0.0)).data
+    mc.write_measurements(tmp_path / "other.csv", other)
+    cells = tmp_path / "cells.toml"
+    cells.write_text(f"{CELLS}[[cells]]\nname = 'a'\ndata = '{folder / '1.csv'}'\n")
+    plain = mc.fleet(cells, processes=1).rows[0].notices
+    assert plain == mc.calibrate("irb120", folder / "1.csv", "sum").notices
+    cells.write_text("[defaults]\nrobot = 'irb2600'\n[[cells]]\nname = 'a'\ndata = 'other.csv'\n")
+    run("fleet", cells, "--jobs", "1", "--json", "--page", tmp_path / "page.html")
+    both = capsys.readouterr()
+    (row,) = json.loads(both.out)["rows"]
+    told = [text for text in row["notices"] if "the nominal robot misses by" in text]
+    assert told
+    assert f"notice: a: {told[0]}" in both.err
+    assert "the nominal robot misses by" in (tmp_path / "page.html").read_text()

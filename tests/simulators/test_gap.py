@@ -254,3 +254,12 @@ def test_laws_chosen_for_guessed_masses_are_chosen_anew_for_told_ones() -> None:
     ]  # fmt: skip
     assert carried_over((known, soft), mc.load_robot("irb2600")) == (known, soft)
     assert carried_over((known,), told) == (known,)
+
+
+def test_poses_of_another_arm_are_refused(arm: Path) -> None:
+    data = mc.simulate("irb2600", 30, 3, seed=1).data
+    with pytest.raises(mc.DataError, match="of the calibrated arm"):
+        mc.simulator_gap(arm / "arm.xml", data, fit=arm / "fit.json")
+    metres = mc.simulate("ur10", 30, 3, seed=1).data
+    with pytest.raises(mc.DataError, match="millimetres given as metres"):
+        mc.simulator_gap(arm / "arm.xml", metres.with_y(1e3 * metres.y), fit=arm / "fit.json")

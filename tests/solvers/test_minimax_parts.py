@@ -28,6 +28,7 @@ from minimax_cal.solvers.minimax import (
     read,
     search,
     solve,
+    told_once,
 )
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
@@ -289,12 +290,20 @@ def test_the_notes_of_backends_are_told_once() -> None:
     told = []
     hill = Curve(lambda x: x**4, lambda x: 4.0 * x**3)
     found = solve(hill, np.array([1.0]), qp, Sqp(hessian="bfgs", iterations=4), told.append)
-    assert found.notes == ("slow", "lost")
+    assert found.notes == ("slow (the first of 2 alike)", "lost (the first of 2 alike)")
     assert found.status is Status.ITERATION_LIMIT
     assert found.iterations == len(found.trace) == len(told) == 4
     assert [step.iteration for step in found.trace] == [1, 2, 3, 4]
     assert np.all(np.diff([step.value for step in found.trace]) < 0.0)
     assert replace(found, f=np.array([1.0, 3.0, 2.0])).value == 3.0
+
+
+def test_notes_that_differ_in_their_numbers_are_one() -> None:
+    notes = [f"daqp said infeasible, its relative residual is {r}" for r in ("1.2e-08", "4", "inf")]
+    first, other = told_once([*notes[:2], "slow", notes[1]])
+    assert first == f"{notes[0]} (the first of 3 alike)"
+    assert other == "slow"
+    assert told_once(notes[1:]) == tuple(notes[1:])
 
 
 def test_the_hessian_has_a_floor_and_is_damped() -> None:

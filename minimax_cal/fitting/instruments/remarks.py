@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.calibrate import WILD_ANGLE
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
@@ -15,6 +14,7 @@ from minimax_cal.fitting.instruments.identify import has_scale
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import TARGET
+from minimax_cal.fitting.same_arm import WILD_ANGLE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.robots.kinematics import MDH_NAMES

@@ -18,6 +18,7 @@ from scipy import stats
 
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.fitting.same_arm import wild
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.watching.compared import Comparison, Difference
@@ -77,6 +78,12 @@ def check_alike(one: Fit, other: Fit) -> None:
         raise OptionError(
             f"{a.name} ({a.joints} joints) and {b.name} ({b.joints}) differ in number, signs or "
             "types of joints; compare calibrations of one arm"
+        )
+    apart = links_of(other.before.robot.mdh - one.before.robot.mdh)
+    if named := wild(one.known.names, apart, a.reach()):
+        raise OptionError(
+            f"{a.name} and {b.name} are drawn as different arms ({named}); compare calibrations "
+            "that start from one drawing"
         )
 
 
@@ -215,5 +222,9 @@ def remarks(one: Fit, other: Fit) -> Iterator[str]:
     if effects[0] != effects[1]:
         told = " against ".join(", ".join(labels) or "none" for labels in effects)
         yield f"they hold different effects ({told}): geometry takes over part of what one lacks"
+    change = links_of(other.robot.mdh - one.robot.mdh)
+    change[zero_positions(one.robot.prismatic)] = 0.0  # a service may set them anew
+    if named := wild(one.known.names, change, one.robot.reach()):
+        yield f"implausibly large changes: {named}; are both of the same arm?"
     if np.abs(one.before.robot.mdh - other.before.robot.mdh).max() > ALIKE:
         yield "they start from different drawings: what neither identifies differs by that alone"

@@ -14,6 +14,7 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
+from minimax_cal.fitting.same_arm import check_arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
@@ -65,6 +66,7 @@ def check(
     fit = fit if isinstance(fit, Fit) else load_fit(fit)
     data = data if isinstance(data, Measurements) else read_measurements(data)
     watched, said = watched_of(fit, data, known)
+    check_arm(fit.robot, watched.data)
     links = in_names(fit, watched, fit.identification.active)
     found = search(watched, links, own_poses(fit, watched), seed)
     error, after_it = (left(watched, placed) for placed in (found.before, found.after))

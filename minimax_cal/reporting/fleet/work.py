@@ -32,6 +32,7 @@ class Row:
     work: calibrated or checked.  status: of the numbers, or failed.  verdict: of the tolerance, ""
     where none is required.  before, rms, largest: on poses that no fit had seen [mm], NaN where
     unknown.  changed: joints that moved, against the calibration given.  why: in a sentence.
+    notices: of the calibration or the check.
     """
 
     cell: str
@@ -45,6 +46,7 @@ class Row:
     changed: tuple[str, ...]
     file: str
     why: str
+    notices: tuple[str, ...] = ()
 
     @property
     def failed(self) -> bool:
@@ -58,15 +60,18 @@ class Row:
 
 def done(job: Job) -> Row:
     """One cell; what goes wrong with it is its row."""
-    work = "checked" if job.told.check else "calibrated"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CalibrationWarning)  # the result's notices say the same
             return checked(job) if job.told.check else calibrated(job)
     except (CalibrationError, np.linalg.LinAlgError, MemoryError) as error:
-        why = " ".join(str(error).split()) or "not enough memory"
-        nan = math.nan
-        return Row(job.told.name, "", work, FAILED, "", nan, nan, nan, (), "", why)
+        return without(job, " ".join(str(error).split()) or "not enough memory")
+
+
+def without(job: Job, why: str, robot: str = "", notices: tuple[str, ...] = ()) -> Row:
+    """The row of a cell without a result."""
+    work, nan = "checked" if job.told.check else "calibrated", math.nan
+    return Row(job.told.name, robot, work, FAILED, "", nan, nan, nan, (), "", why, notices)
 
 
 def calibrated(job: Job) -> Row:
@@ -77,21 +82,22 @@ def calibrated(job: Job) -> Row:
         seed=told.seed, effects=told.effects, fix=told.fix,
     )  # fmt: skip
     if fit.status is Status.FAILED:
-        raise CalibrationError(f"the fit failed: {fit.status.advice}")
+        return without(job, f"the fit failed: {fit.status.advice}", fit.robot.name, fit.notices)
     found = fit.within
     ends = found.rms, found.largest
     claim = within(found.where, found.before, found.after, ends, found.poses, found.missed)
     judged = tuple(judge(limit, claim) for limit in limits_of(told.tolerance))
     changed: tuple[str, ...] = ()
-    said = [one.sentence() for one in judged]
+    said, notices = [one.sentence() for one in judged], fit.notices
     if told.fit:
         other = compare(load_fit(job.path(told.fit)), fit)
         changed = other.joints
         said.append(other.headline())
+        notices = (*notices, *other.notices)
     return Row(
         told.name, fit.robot.name, "calibrated", str(fit.status),
         overall(judged) if judged else "", found.before.rms_mm, found.after.rms_mm,
-        found.after.max_mm, changed, saved(job, fit), " ".join(said),
+        found.after.max_mm, changed, saved(job, fit), " ".join(said), notices,
     )  # fmt: skip
 
 
@@ -103,7 +109,7 @@ def checked(job: Job) -> Row:
         told.name, found.robot, "checked", str(found.status), found.word, math.nan,
         found.accuracy.rms_mm, found.accuracy.max_mm,
         tuple(dict.fromkeys(m.joint for m in found.moved)), saved(job, found.fit),
-        found.headline(),
+        found.headline(), found.notices,
     )  # fmt: skip
 
 
