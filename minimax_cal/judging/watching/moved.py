@@ -18,8 +18,10 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.judging.watching.own import Own
 from minimax_cal.judging.watching.placing import Placing, predicts
-from minimax_cal.judging.watching.watched import Both, Own, Rows, Watched
+from minimax_cal.judging.watching.rows import Both, Rows
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.modelling.parameters import links_of
 

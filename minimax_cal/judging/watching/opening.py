@@ -11,7 +11,9 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.watched import PLENTY, Both, Own, Watched
+from minimax_cal.judging.watching.own import Own
+from minimax_cal.judging.watching.rows import PLENTY, Both
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.watched import Rows
+from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
 

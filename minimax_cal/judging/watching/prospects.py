@@ -18,7 +18,8 @@ from minimax_cal.judging.watching.moved import (
     joint_of,
 )
 from minimax_cal.judging.watching.result import SHIFT, Hidden
-from minimax_cal.judging.watching.watched import Both, Rows, Watched
+from minimax_cal.judging.watching.rows import Both, Rows
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.solvers.least_squares import solve_normal
 
 FEWEST, MOST = 2, 60  # poses among which is chosen

@@ -14,7 +14,8 @@ from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
-from minimax_cal.judging.watching.watched import Rows, Watched
+from minimax_cal.judging.watching.rows import Rows
+from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of

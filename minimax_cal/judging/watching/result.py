@@ -48,10 +48,11 @@ class Health:
 
     verdicts: of each requirement.  moved: parameters that have.  hidden: those that nobody could
     tell.  accuracy: of the calibrated arm, with what is open placed anew, as if nothing had moved;
-    refitted: with what moved corrected.  findable: smallest shift of each zero position that these
-    poses find in 95 of 100 cases [rad, m].  enough: how many of these poses would have been
-    enough to find SHIFT in every joint; asked: about how many would be, where these are not.
-    noise: by how much what is left is noisier than the calibration was.  fit: refitted.
+    refitted: with what moved corrected; of both, what placing took off is put back.  findable:
+    smallest shift of each zero position that these poses find in 95 of 100 cases [rad, m].
+    enough: how many of these poses would have been enough to find SHIFT in every joint; asked:
+    about how many would be, where these are not.  noise: by how much what is left is noisier than
+    the calibration was.  fit: refitted.
     """
 
     robot: str
@@ -108,7 +109,7 @@ class Health:
     def tables(self) -> tuple[Table, ...]:
         """What was required, what moved, what could have been found."""
         required = Table(
-            f"required of {self.robot}, on {self.poses} poses",
+            f"required of {self.robot}, placed anew on {self.poses} poses",
             ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
             tuple(
                 (KINDS[v.limit.kind], v.limit.size_mm, v.value_mm, v.low_mm, v.high_mm,

@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
+from minimax_cal.judging.watching.rows import Both, Rows
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
@@ -23,11 +23,7 @@ from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
-from minimax_cal.solvers.least_squares import solve_normal
 
-PLENTY = 500  # poses that tell what more would
-SAMPLES = 200  # of the calibration's own poses, as many at a time as are new
-TINY = 1e-300  # in place of a zero
 PLACINGS = 3  # passes that place an arm with effects
 
 
@@ -155,200 +151,3 @@ class Watched:
         """(..., 3f) how far the foot's reflectors (..., f, 3) are from where they were, as rows."""
         off = (place - state.origin) @ state.rotation - self.foot
         return np.asarray(off.reshape(*off.shape[:-2], -1) / np.sqrt(2.0 * self.variance))
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """New errors in units of their noise, linear in all parameters.
-
-    error: (N,).  jacobian: (N, p).  latent: (N, r) by what the calibration did not know, each of
-    variance 1.  active: (p,) what is free.  state: about which.  count: coordinates that were
-    measured.  pose: (N,) number of each row's pose, -1 for the foot, last.  half: (m, r, r) root of
-    each pose's noise [m].
-    """
-
-    error: Array
-    jacobian: Array
-    latent: Array
-    active: Array
-    state: State
-    count: int
-    pose: Array
-    half: Array
-
-    @cached_property
-    def whole(self) -> Array:
-        """(N + r, free + r) columns of what is free and of what was not known, with its prior."""
-        r = self.latent.shape[1]
-        free = self.jacobian[:, self.active]
-        return np.block([[free, self.latent], [np.zeros((r, free.shape[1])), np.eye(r)]])
-
-    @cached_property
-    def basis(self) -> Array:
-        """(N + r, q) orthonormal span of `whole`."""
-        return orthonormal(self.whole)
-
-    @cached_property
-    def left(self) -> Array:
-        """(N + r,) what they leave of the error."""
-        error = np.pad(self.error, (0, self.latent.shape[1]))
-        return np.asarray(error - self.basis @ (self.basis.T @ error))
-
-    @property
-    def foot(self) -> int:
-        """Coordinates of the foot."""
-        return int(np.count_nonzero(self.pose < 0))
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of what is left."""
-        return max(self.count - int(self.basis.shape[1] - self.latent.shape[1]), 1)
-
-    @property
-    def mean_square(self) -> float:
-        """Of what is left, in units of the noise."""
-        return float(self.left @ self.left) / self.dof
-
-    @property
-    def scale(self) -> float:
-        """By how much the noise is larger than it was, at least 1."""
-        return float(np.sqrt(max(self.mean_square, 1.0)))
-
-    def apart(self, columns: Array, basis: Array) -> Array:
-        """(N + r, c) what of some parameters' motion a basis does not hold."""
-        motion = np.pad(self.jacobian[:, columns], ((0, self.latent.shape[1]), (0, 0)))
-        rest = motion - basis @ (basis.T @ motion)
-        return np.asarray(rest - basis @ (basis.T @ rest))  # twice is enough
-
-    def columns(self, more: Array) -> Array:
-        """(N, q) what is free, what was not known, and some more parameters."""
-        return np.hstack([self.jacobian[:, self.active], self.latent, self.jacobian[:, more]])
-
-    def by_pose(self, columns: Array, most: int = PLENTY) -> tuple[Array, Array]:
-        """Products of each pose's rows: (m, q, q), and its coordinates: (m,).
-
-        q: what is free, what was not known, some more parameters, and the error last.  most: of
-        more poses so many are taken, evenly.
-        """
-        every = np.concatenate([self.columns(columns), self.error[:, None]], axis=1)
-        poses = np.unique(self.pose[self.pose >= 0])
-        poses = poses[np.linspace(0, len(poses) - 1, min(len(poses), most)).astype(int)]
-        parts = [every[self.pose == pose] for pose in poses]
-        seen = [int(np.count_nonzero(part.any(axis=1))) for part in parts]
-        return np.array([part.T @ part for part in parts]), np.array(seen, dtype=float)
-
-    def share(self, columns: Array, held: Array) -> Array:
-        """(c,) share of each motion that other parameters, (p,) True in held, do not imitate."""
-        size = (self.jacobian[:, columns] ** 2).sum(axis=0)
-        rest = size
-        if held.any():
-            basis = orthonormal(self.jacobian[:, held])
-            off = self.jacobian[:, columns] - basis @ (basis.T @ self.jacobian[:, columns])
-            rest = (off**2).sum(axis=0)
-        return np.asarray(rest / np.where(size > 0.0, size, np.inf))
-
-    def sizes(self, columns: Array) -> Array:
-        """(c,) how large each score is, in sigmas, by the noise that the others leave."""
-        by, sigma = self.scores(columns)
-        square = np.nan_to_num((by / sigma * self.scale) ** 2)
-        dof = max(self.dof - 1, 1)  # what is explained is no noise
-        noise = np.maximum((self.dof * self.mean_square - square) / dof, 1.0)
-        return np.asarray(np.sqrt(square / noise))
-
-    def sigmas(self, columns: Array) -> Array:
-        """(c,) of each parameter's change if the noise is what it was [SI]."""
-        return replace(self, error=np.zeros_like(self.error)).scores(columns)[1]
-
-    def scores(self, columns: Array) -> tuple[Array, Array]:
-        """Each parameter's change if it alone moved besides, and its sigma: (c,) each [SI]."""
-        rest = self.apart(columns, self.basis)
-        size = (rest**2).sum(axis=0)
-        size = np.where(size > 0.0, size, np.nan)
-        return rest.T @ self.left / size, self.scale / np.sqrt(size)
-
-
-@dataclass(frozen=True, eq=False)
-class Both:
-    """The same errors by the noises that the calibration found, and with all coordinates alike.
-
-    The first tell most where noises are all there is; the second where the model lacks something in
-    directions in which nothing is noisy.
-    """
-
-    noise: Rows
-    alike: Rows
-
-
-@dataclass(frozen=True, eq=False)
-class Own:
-    """The calibration's own poses, as new ones would be seen.
-
-    rows: about the calibration itself.  foot: (m, 3f) errors of the reflectors on the foot at each
-    pose, in units of noise, NaN where unseen.
-    """
-
-    rows: Both
-    foot: Array
-
-    @cached_property
-    def single(self) -> Array:
-        """(2,) share of the coordinates that so many independent ones would be [Box 1954].
-
-        Points of a pose err together: (tr C)^2 / tr C^2 of the covariance C of a pose's errors,
-        without bias from the number of poses.
-        """
-        return np.array([self.single_of(rows) for rows in (self.rows.noise, self.rows.alike)])
-
-    @staticmethod
-    def single_of(rows: Rows) -> float:
-        """Of rows weighed one way."""
-        m, r, _ = rows.half.shape
-        error = rows.error[: m * r].reshape(m, r)
-        square = (error**2).sum(axis=1)
-        pairs = float(((error.T @ error) ** 2).sum() - (square**2).sum()) / (m * (m - 1))
-        many = float(square.mean()) ** 2 / max(pairs, TINY)
-        return float(min(many * m / (rows.count - rows.foot), 1.0))
-
-    def spread(self, columns: Array, poses: int, seed: int) -> Array:
-        """(2, c) by how much scores spread more than noises say, in samples of so many poses."""
-        return np.array(
-            [
-                self.spread_of(rows, columns, poses, np.random.default_rng(seed))
-                for rows in (self.rows.noise, self.rows.alike)
-            ]
-        )
-
-    def spread_of(self, rows: Rows, columns: Array, poses: int, rng: np.random.Generator) -> Array:
-        """(c,) of rows weighed one way."""
-        whole, counts = self.samples(rows, columns, poses, rng)
-        c, free = len(columns), int(rows.active.sum())
-        q = whole.shape[-1] - c - 1  # what is free, and what was not known
-        kept, rest = whole[:, :q, :q], whole[:, :q, q:]
-        left = whole[:, q:, q:] - np.swapaxes(rest, 1, 2) @ solve_normal(kept, rest)
-        score, size = left[:, :c, c], np.einsum("dcc->dc", left)[:, :c]
-        dof = np.maximum(counts - free - 1.0, 1.0)[:, None]
-        square = score**2 / np.where(size > 0.0, size, np.inf)
-        noise = np.maximum((left[:, c, c, None] - square) / dof, 1.0)
-        return np.asarray(np.maximum(np.sqrt((square / noise).mean(axis=0)), 1.0))
-
-    def samples(
-        self, rows: Rows, columns: Array, poses: int, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """Products as of `Rows.by_pose`: (s, q, q), and coordinates: (s,), of samples.
-
-        The prior of what was not known is among them, and the foot as these poses see it.
-        """
-        gram, counts = rows.by_pose(columns)
-        drawn = np.zeros((SAMPLES, len(gram)))
-        for row in drawn:
-            row[rng.permutation(len(gram))[: min(poses, len(gram) // 2)]] = 1.0
-        whole = np.tensordot(drawn, gram, 1)
-        free = int(rows.active.sum())
-        prior = np.arange(free, free + rows.latent.shape[1])
-        whole[:, prior, prior] += 1.0
-        seen = np.isfinite(self.foot)
-        error = drawn @ np.where(seen, self.foot, 0.0) / np.maximum(drawn @ seen, 1.0)
-        slope = rows.columns(columns)[rows.pose < 0]
-        slopes = np.broadcast_to(slope, (SAMPLES, *slope.shape))
-        foot = np.concatenate([slopes, error[..., None]], axis=2)
-        return whole + np.swapaxes(foot, 1, 2) @ foot, drawn @ counts + rows.foot
