@@ -22,7 +22,7 @@ from minimax_cal.cli.options import (
     result_options,
 )
 from minimax_cal.correcting.compensate import cells_of, compensate
-from minimax_cal.correcting.programs.program import is_program, read_program
+from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_program
 from minimax_cal.correcting.target_file import read_targets
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_text
@@ -39,6 +39,7 @@ HOW = "How targets are corrected"
 @plain_option(
     HOW,
     "--robot",
+    "nominal",
     help="The nominal robot of the controller, file or name [default: that of the fit].",
 )
 @options_of(
@@ -80,7 +81,7 @@ HOW = "How targets are corrected"
 def compensate_command(
     fit: Path,
     targets: Path,
-    robot: str | None,
+    nominal: str | None,
     tool: str,
     wobj: str,
     safe_cells: bool,
@@ -93,17 +94,18 @@ def compensate_command(
     KRL (.src, .dat), whose points alone are changed.  Without -o the corrected file goes to stdout,
     its summary to stderr.
     """
-    nominal = None if robot is None else load_robot(robot)
+    check_alike(targets, to.path)
+    robot = None if nominal is None else load_robot(nominal)
     if is_program(targets):
-        drawn = nominal or nominal_of(fit, chosen["rung"])
+        drawn = robot or nominal_of(fit, chosen["rung"])
         program = read_program(targets, drawn, tool, wobj)
-        found = compensate(fit, program.data, nominal, **chosen)
+        found = compensate(fit, program.data, robot, **chosen)
         text: str | bytes = program.corrected(found)
     else:
         if tool or wobj:
             raise OptionError("--tool and --wobj go with a program (.mod, .src, .dat)")
         given = read_targets(targets)
-        found = compensate(fit, given.data, nominal, **chosen)
+        found = compensate(fit, given.data, robot, **chosen)
         text = to.cells(given.corrected(found), safe_cells)
     to.notice(*found.notices)
     to.write_rows(lambda: text, lambda: json_text(found.to_dict()))
@@ -121,6 +123,19 @@ def compensate_command(
         click.echo(f"error: {found.complaint()}", err=True)
         return FAILED
     return 0
+
+
+def check_alike(targets: Path, out: Path | None) -> None:
+    """Raise OptionError for a program into a file that other endings name, or CSV into one."""
+    if out is None:
+        return
+    own = LANGUAGES.get(targets.suffix.lower())
+    other = LANGUAGES.get(out.suffix.lower())
+    if other is not own and (other or out.suffix.lower() == ".csv"):
+        end = targets.suffix.lower() if own else ".csv"
+        raise OptionError(
+            f"{out}: {targets} is corrected into a file of its own kind; end it {end}"
+        )
 
 
 def nominal_of(fit: Path, rung: int | None) -> Robot:

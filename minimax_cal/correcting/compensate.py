@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import ordered
-from minimax_cal.measuring.measurements import FARTHEST, Measurements
+from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_plausible
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
@@ -165,7 +166,8 @@ def compensate(
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None
     if robot is None:
-        raise CalibrationError("the fit does not tell its nominal robot; name it (nominal)")
+        source = fit if isinstance(fit, (str, Path)) else "the fit"
+        raise CalibrationError(f"{source}: does not tell its nominal robot; give nominal=")
     check_like(robot, cell.robot)
     arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
     base, tool, said = placed(cell, arm, robot, drawn, frame)
@@ -229,13 +231,13 @@ def check_like(nominal: Robot, robot: Robot) -> None:
     if nominal.joints != robot.joints:
         raise OptionError(
             f"{nominal.name} has {nominal.joints} joints, the calibrated {robot.name} "
-            f"{robot.joints}; give the nominal robot of this fit (nominal)"
+            f"{robot.joints}; give the nominal robot of this fit, nominal="
         )
     odd = (nominal.prismatic != robot.prismatic) | (nominal.sign != robot.sign)
     if odd.any():
         raise OptionError(
             f"joint {int(np.argmax(odd)) + 1} of {nominal.name} has another type or sign than the "
-            "calibrated one's; give the nominal robot of this fit (nominal)"
+            "calibrated one's; give the nominal robot of this fit, nominal="
         )
 
 
@@ -259,6 +261,7 @@ def path_of(
     if not data.poses:
         raise DataError(f"{data.source}: holds no targets")
     check_joints(robot, data)
+    check_plausible(data)
     data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
 

@@ -29,7 +29,7 @@ from minimax_cal.measuring.columns import (
 FARTHEST = 1e5  # no instrument measures farther [m]
 PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
     "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
-    "payload": ("payload_kg", 0.0, 1e5, 1.0),
+    "payload": ("payload_kg", 0.0, 3e3, 1.0),  # the strongest arms carry 2.3 t
     "u95": ("u95_mm", 0.0, 1.0, 1e3),
 }
 
@@ -157,6 +157,12 @@ def check_finite(data: Measurements) -> Measurements:
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
+    check_plausible(data)
+    return check_u95(data)
+
+
+def check_plausible(data: Measurements) -> None:
+    """Raise DataError for a temperature, a payload or an uncertainty that cannot be."""
     for name, (header, low, high, scale) in PLAUSIBLE.items():
         values = data.columns.get(name, np.zeros(0))
         odd = (values < low) | (values > high)
@@ -166,7 +172,6 @@ def check_finite(data: Measurements) -> Measurements:
                 f"{data.source}:{data.line[row]}: column {header}: {scale * values[row]:g} cannot "
                 f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
             )
-    return check_u95(data)
 
 
 def check_u95(data: Measurements) -> Measurements:

@@ -488,6 +488,9 @@ def test_command_says_which_targets_are_missed(saved: Path, tmp_path: Path) -> N
         (DEGREES, "a,1,2,3,four,5,6,0,v", "four"),
         (DEGREES, "a,1,2,3,,5,6,0,v", "is empty"),
         (DEGREES, "a,1,2", "3 cells"),
+        (DEGREES, "a,1,2,3,4,50,6,-50,v", "t.csv:2: column payload_kg: -50 cannot be"),
+        (DEGREES, "a,1,2,3,4,50,6,5000,v", "t.csv:2: column payload_kg: 5000 cannot be"),
+        (DEGREES.replace("speed", "temperature_C"), "a,1,2,3,4,50,6,0,-300", "-300 cannot be"),
         (DEGREES.replace("_deg", "_rad"), "a,10,20,30,40,50,60,0,v", "degrees?"),
         (DEGREES.replace("q3_deg", "q3_mm"), "a,1,2,3,4,5,6,0,v", "joint 3"),
         ("q1_rad;q2_rad", "0;0", "commas"),
@@ -513,7 +516,7 @@ def test_command_tells_wrong_files(saved: Path, tmp_path: Path) -> None:
     old.write_text(json.dumps(content))
     code, _, said = run(old, targets)
     assert code == 2
-    assert "nominal" in said
+    assert f"{old}: does not tell its nominal robot; give nominal=" in said
     assert run(old, targets, "--robot", "irb2600", "-q")[0] == 0
 
 

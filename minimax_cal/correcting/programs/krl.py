@@ -12,10 +12,12 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from minimax_cal.correcting.programs.krl_moves import LOOK, ORIGINS, WORD, motions, used
 from minimax_cal.correcting.programs.points import Number, Point, Text, blanked, checked, posed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
+__all__ = ["ORIGINS", "used"]  # of the language, beside what stands here
 ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')
 AGGREGATE = re.compile(r"\{\s*(?:(E6POS|POS|FRAME|E6AXIS|AXIS)\s*:)?([^{}]*)\}", re.IGNORECASE)
 ENTRY = re.compile(r"\s*([A-Za-z]\w{0,3})\s+([^,\s]+)\s*")
@@ -23,12 +25,17 @@ BEFORE = re.compile(
     r"(?:\b(E6POS|POS|FRAME|E6AXIS|AXIS)\s+)?\$?(\w{1,32})\s*(?:\[[^\]]{0,20}\]\s*)?=\s*\Z",
     re.IGNORECASE,
 )
-MOTION = re.compile(r"\b(?:PTP|LIN|CIRC|SPTP|SLIN|SCIRC)\b[^\r\n]*\Z", re.IGNORECASE)
-MOVED = re.compile(r"\b(?:PTP|LIN|CIRC|SPTP|SLIN|SCIRC)\s+(\w{1,32})", re.IGNORECASE)
+DECLARED = re.compile(r"\bDECL\s+(?:GLOBAL\s+)?(E6POS|POS|E6AXIS|AXIS)\s+([^=\r\n]*)", re.I)
+HEAD = re.compile(  # the line that a comment on the whole file stands behind
+    r"^(?:\xef\xbb\xbf)?[^\S\n]*(?:GLOBAL\s+)?DEF(?:DAT|FCT)?\s[^\r\n]*",
+    re.IGNORECASE | re.MULTILINE,
+)
 PLACE = ("X", "Y", "Z", "A", "B", "C")
 AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
+ENTRIES = {*PLACE, *AXES, "S", "T", *(f"E{i}" for i in range(1, 7))}
+COLON = re.compile(r"[ \t]*:")
+COMMENT = ";"
 LEVEL = 1e-7  # cosine of B below which A and C turn about one axis
-LOOK = 200  # letters before a value that say what it is
 
 
 def read(text: str, source: str) -> Text:
@@ -41,23 +48,58 @@ def points(program: Text) -> Iterator[Point]:
 
     A FRAME may be a base or a tool: it is a point where a motion of the same file goes to it.
     """
-    moved = {name.upper() for name in MOVED.findall(program.bare)}
+    for kind, name, found in values(program):
+        if kind:
+            yield point(program, kind, name, found)
+
+
+def left(program: Text) -> Iterator[int]:
+    """Lines of what stays as it is: relative motions, offsets, points that are not whole."""
+    for kind, _, found in values(program):
+        if not kind:
+            yield program.line(found.start())
+
+
+def values(program: Text) -> Iterator[tuple[str, str, re.Match[str]]]:
+    """Type, name and braces of what a motion may go to; no type where it stays as it is."""
+    going, kinds = motions(program), declared(program)
     for found in AGGREGATE.finditer(program.bare):
         line_start = program.bare.rfind("\n", 0, found.start()) + 1
-        head = program.bare[max(line_start, found.start() - LOOK) : found.start()]
-        declared, motion = BEFORE.search(head), MOTION.search(head)
-        kind = (found[1] or (declared[1] if declared else "") or "").upper()
-        name = declared[2] if declared else ""
-        keys = [entry[1].upper() for entry in ENTRY.finditer(found[2])]
+        before = BEFORE.search(program.bare[max(line_start, found.start() - LOOK) : found.start()])
+        own = before[2] if before else ""
+        name = own.upper()
+        keys = {entry[1].upper() for entry in ENTRY.finditer(found[2])}
+        whole = set(PLACE) <= keys or set(AXES) <= keys
+        kind = (found[1] or (before[1] if before else "") or kinds.get(name, "")).upper()
         if not kind:
-            kind = "E6AXIS" if set(AXES) <= set(keys) else "E6POS" if "S" in keys else "FRAME"
-        if name.startswith(("BASE", "TOOL")) or not (
-            set(PLACE) <= set(keys) or set(AXES) <= set(keys)
-        ):
+            kind = "E6AXIS" if set(AXES) <= keys else "E6POS" if "S" in keys else "FRAME"
+        coordinates = keys & {*PLACE, *AXES} and (whole or keys <= ENTRIES)
+        if not coordinates or (kind == "FRAME" and name.startswith(("BASE", "TOOL"))):
             continue
-        if kind == "FRAME" and not (motion or name.upper() in moved):
-            continue
-        yield point(program, kind, name, found)
+        motion = going.lines.get(line_start)
+        inside = bool(motion and motion.start() < found.start() and not name)
+        relative = name in going.relative or bool(inside and motion and motion[1])
+        meant = kind != "FRAME" or inside or name in going.to
+        if whole and meant and not relative and not beside_colon(program.bare, found):
+            yield kind, own, found
+        elif meant or name in going.named:
+            yield "", own, found
+
+
+def beside_colon(bare: str, found: re.Match[str]) -> bool:
+    """Whether a value is a part of a sum of frames, such as the offset of XP : {...}."""
+    before = bare[max(0, found.start() - LOOK) : found.start()].rstrip(" \t")
+    return before.endswith(":") or bool(COLON.match(bare, found.end()))
+
+
+def declared(program: Text) -> dict[str, str]:
+    """Types of points that are declared without a value, by name."""
+    return {
+        name[1].upper(): found[1].upper()
+        for found in DECLARED.finditer(program.bare)
+        for part in found[2].split(",")
+        if (name := WORD.match(part))
+    }
 
 
 def point(program: Text, kind: str, name: str, found: re.Match[str]) -> Point:
@@ -127,8 +169,3 @@ def turn_bits(q: Array) -> int:
 def frames(program: Text) -> dict[str, Array]:
     """KRL keeps bases and tools in the controller."""
     return {}
-
-
-def used(program: Text) -> Iterator[tuple[int, str, str]]:
-    """Nothing that a file says of tools is fixed."""
-    yield from ()

@@ -19,6 +19,8 @@ from minimax_cal.robots.transforms import transform
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 LONGEST = 40  # letters of a number
 FARTHEST = 1e5  # of a coordinate [mm]
+MARK = "Corrected by minimax-cal compensate; correct the program as it was before, not this one"
+MARKED = re.compile(rf"^[^\S\n]*[!;] {MARK[:35]}", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,25 @@ class Text:
             parts += [self.text[at : number.start], new]
             at = number.stop
         return "".join([*parts, self.text[at:]])
+
+
+def marked(program: Text, head: re.Pattern[str], comment: str) -> tuple[Number, str]:
+    """A comment that tells a corrected program, on a line of its own behind its head."""
+    found = head.search(program.bare)
+    at = found.end() if found else 0
+    end = "\r\n" if "\r\n" in program.text else "\n"
+    alone = program.text[at : at + 1] in ("", "\r", "\n")
+    parts = (end if at else "", f"{comment} {MARK}", "" if at and alone else end)
+    return Number(0.0, at, at), "".join(parts)
+
+
+def check_unmarked(program: Text) -> None:
+    """Raise DataError for a program that was corrected already."""
+    if found := MARKED.search(program.text):
+        raise DataError(
+            f"{program.source}:{program.line(found.start())}: these points are corrected already, "
+            "and would be twice; give the program as it was before"
+        )
 
 
 def blanked(text: str, pattern: re.Pattern[str]) -> str:

@@ -15,7 +15,13 @@ import numpy as np
 
 from minimax_cal.correcting.compensate import Compensation
 from minimax_cal.correcting.programs import krl, rapid
-from minimax_cal.correcting.programs.points import Number, Point, Text, of_quaternion, posed
+from minimax_cal.correcting.programs.moved_with import check_used, frame_of, shown, untold
+from minimax_cal.correcting.programs.points import (
+    Point,
+    Text,
+    check_unmarked,
+    marked,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import read_raw
@@ -56,8 +62,8 @@ class Program:
     data: Measurements
 
     def corrected(self, found: Compensation) -> bytes:
-        """The same bytes, with the points' numbers anew."""
-        changes: list[tuple[Number, str]] = []
+        """The same bytes, with the points' numbers anew and a comment that says so."""
+        changes = [marked(self.text, self.language.HEAD, self.language.COMMENT)]
         poses = np.linalg.inv(self.work) @ self.robot.pose(found.q) @ self.tool
         for point, pose, old, q in zip(self.points, poses, found.commanded, found.q, strict=True):
             if point.pose is None:
@@ -80,6 +86,7 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
     if b"\0" in raw:
         raise DataError(f"{path}: is no text")
     text = language.read(raw.decode("latin-1"), str(path))
+    check_unmarked(text)
     if robot.joints != 6 or robot.prismatic.any():
         raise OptionError(f"{robot.name}: points of programs are for arms with six turning joints")
     points = tuple(point for point, _ in zip(language.points(text), range(MOST + 1), strict=False))
@@ -87,10 +94,11 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
         raise DataError(f"{path}: holds no points with numbers")
     if len(points) > MOST:
         raise DataError(f"{path}: holds over {MOST} points; split it")
-    known = language.frames(text)
-    check_used(language, text, tool, work)
-    grip, table = frame_of(tool, known, "tool"), frame_of(work, known, "wobj")
-    q, notices = joints_of(points, language, robot, grip, table, str(path))
+    known, given = language.frames(text), {"tool": tool, "wobj": work}
+    check_used(language, text, points, given)
+    grip, table = (frame_of(one, known, option) for option, one in given.items())
+    q, doubts = joints_of(points, language, robot, grip, table, str(path))
+    notices = (*untold(language, text, points, given), *left_out(language, text), *doubts)
     lines = np.array([point.line for point in points])
     nowhere = np.zeros((len(q), 0, 3))
     data = Measurements(
@@ -99,41 +107,16 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
     return Program(text, language, points, grip, table, robot, data)
 
 
-def check_used(language: ModuleType, text: Text, tool: str, work: str) -> None:
-    """Raise OptionError for a move with another tool or work object than was named."""
-    for line, moved, on in language.used(text):
-        for used, given, option, none in (
-            (moved, tool, "tool", "tool0"),
-            (on, work, "wobj", "wobj0"),
-        ):
-            if "," not in given and used.lower() != (given or none).lower():
-                raise OptionError(
-                    f"{text.source}:{line}: moves with {used}, not with {given or none}; give "
-                    f"{option}='{used}', or its frame as x,y,z,q1,q2,q3,q4, and correct modules of "
-                    "several tools one by one"
-                )
-
-
-def frame_of(given: str, known: dict[str, Array], option: str) -> Array:
-    """(4, 4) of a name or numbers.  Raises OptionError."""
-    if not given:
-        return np.eye(4)
-    names = {name.lower(): pose for name, pose in known.items()}
-    if given.lower() in names:
-        return names[given.lower()]
-    try:
-        numbers = np.array([float(part) for part in given.split(",")])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) != 7 or not np.isfinite(numbers).all():
-        there = f" ({', '.join(known)})" if known else ""
-        raise OptionError(
-            f"{option}={given!r}: give x,y,z,q1,q2,q3,q4 in mm, or a name declared there{there}"
-        )
-    try:
-        return posed(numbers[:3], of_quaternion(numbers[3:], f"{option}={given!r}"))
-    except DataError as error:
-        raise OptionError(str(error)) from error
+def left_out(language: ModuleType, text: Text) -> tuple[str, ...]:
+    """A notice of points that stay as they are though they hold numbers."""
+    lines = list(language.left(text))
+    if not lines:
+        return ()
+    many = f"{len(lines)} points are" if len(lines) > 1 else "1 point is"
+    return (
+        f"{text.source}: {many} left as programmed, at line {shown(lines)}: relative motions, "
+        "offsets, and points without all of X, Y, Z, A, B, C or A1 to A6",
+    )
 
 
 def joints_of(
@@ -168,10 +151,9 @@ def joints_of(
         out.append(before)
     if not doubtful:
         return np.array(out), ()
-    shown = ", ".join(map(str, doubtful[:8])) + (" ..." if len(doubtful) > 8 else "")
     said = (
-        f"{source}: at line {shown} no way of {robot.name} stands as the configuration says; the "
-        "one nearest to the point before is taken"
+        f"{source}: at line {shown(doubtful)} no way of {robot.name} stands as the configuration "
+        "says; the one nearest to the point before is taken"
     )
     return np.array(out), (said,)
 

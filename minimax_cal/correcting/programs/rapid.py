@@ -1,4 +1,4 @@
-"""RAPID modules of ABB: robtargets and jointtargets, declared or in a move.
+"""RAPID modules of ABB: robtargets and jointtargets, declared, assigned or in a move.
 
 robtarget: [[x,y,z],[q1,q2,q3,q4],[cf1,cf4,cf6,cfx],[external axes]]; jointtarget: [[six joints in
 degrees],[external axes]].  cf is the quarter turn that a joint stands in [ABB RAPID reference].
@@ -7,7 +7,7 @@ degrees],[external axes]].  cf is the quarter turn that a joint stands in [ABB R
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -22,6 +22,7 @@ from minimax_cal.correcting.programs.points import (
     of_quaternion,
     posed,
 )
+from minimax_cal.correcting.programs.rapid_moves import moves
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
@@ -29,13 +30,19 @@ ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 DECLARED = re.compile(
     r"\b(robtarget|jointtarget)\s+(\w{1,32})\s*(?:\{[^}]{0,40}\}\s*)?:=\s*", re.IGNORECASE
 )
-MOVE = re.compile(r"\bMove(?:L|J|C|AbsJ)\w{0,8}\b([^;]{0,2000});", re.IGNORECASE)
+NAMES = re.compile(r"\b(robtarget|jointtarget)\s+(\w{1,32})", re.IGNORECASE)
+ASSIGNED = re.compile(r"(?<![\w.\\])(\w{1,32})\s*(?:\{[^}]{0,40}\}\s*)?:=\s*(?=\[)")
+HEAD = re.compile(  # the words that a comment on the whole module stands behind
+    r"^(?:\xef\xbb\xbf)?[^\S\n]*MODULE\s+\w+(?:\s*\([^)]{0,200}\))?[^\S\r\n]*",
+    re.IGNORECASE | re.MULTILINE,
+)
 BRACKETS = re.compile(r"\[[^\[\]]*\]")
 LITERAL = re.compile(r"\[(?:\s*\[[^\[\]]*\]\s*,?){2,4}\s*\]")
 FRAME = re.compile(r"\b(tooldata|wobjdata)\s+(\w{1,32})\s*:=\s*", re.IGNORECASE)
 QUARTERED = (0, 3, 5)  # joints whose quarter turns cf1, cf4, cf6 tell
 SIZES = {"robtarget": (3, 4, 4, 6), "jointtarget": (6, 6)}
-ORIGINS = ("tool0", "wobj0")
+ORIGINS = {"tool": "tool0", "wobj": "wobj0"}
+COMMENT = "!"
 
 
 def read(text: str, source: str) -> Text:
@@ -54,11 +61,26 @@ def points(program: Text) -> Iterator[Point]:
         for start, stop in literals:
             declared.add(start)
             yield point(program, kind, name, start, stop)
-    for move in MOVE.finditer(program.bare):
-        for literal in LITERAL.finditer(program.bare, move.start(1), move.end(1)):
-            kind = "jointtarget" if "absj" in move[0][:9].lower() else "robtarget"
+    kinds = {name[2].lower(): name[1].lower() for name in NAMES.finditer(program.bare)}
+    end = 0
+    for found in ASSIGNED.finditer(program.bare):
+        if found.start() < end or found[1].lower() not in kinds:
+            continue
+        end = program.bare.find(";", found.end()) % (len(program.bare) + 1)
+        for start, stop in rows(program, found.end()):
+            if start not in declared:
+                declared.add(start)
+                yield point(program, kinds[found[1].lower()], found[1], start, stop)
+    for move in moves(program):
+        for literal in LITERAL.finditer(program.bare, *move.body):
+            kind = "jointtarget" if move.to_joints else "robtarget"
             if literal.start() not in declared and sizes(literal[0]) == SIZES[kind]:
                 yield point(program, kind, "", literal.start(), literal.end())
+
+
+def left(program: Text) -> Iterator[int]:
+    """Lines of points that stay as they are though they hold numbers: none."""
+    yield from ()
 
 
 def rows(program: Text, at: int) -> Iterator[tuple[int, int]]:
@@ -128,7 +150,7 @@ def frames(program: Text) -> dict[str, Array]:
 
     Without tools that stand still and work objects that the robot holds.
     """
-    out = {name: np.eye(4) for name in ORIGINS}
+    out = {name: np.eye(4) for name in ORIGINS.values()}
     for found in FRAME.finditer(program.bare):
         kind, name = found[1].lower(), found[2]
         end = max(program.bare.find(";", found.end()), found.end())
@@ -154,13 +176,9 @@ def frame(program: Text, name: str, place: re.Match[str], turn: re.Match[str]) -
     return posed(xyz, of_quaternion(quaternion, where))
 
 
-def used(program: Text) -> Iterator[tuple[int, str, str]]:
-    """Line, tool and work object of each move."""
-    for move in MOVE.finditer(program.bare):
-        body = LITERAL.sub("", move[1])
-        last = body.rsplit(",", 1)[-1]
-        tool, *more = re.split(r"\\", last)
-        object_ = [part.partition(":=")[2] for part in more if part.lower().startswith("wobj")]
-        name = tool.strip()
-        if re.fullmatch(r"\w{1,32}", name):
-            yield program.line(move.start()), name, (object_[0].strip() if object_ else "wobj0")
+def used(program: Text, points: Sequence[Point]) -> Iterator[tuple[int, str, str]]:
+    """Line, "tool" or "wobj", and its name of each move, '' where the move does not tell."""
+    for move in moves(program):
+        if not move.to_joints:
+            yield program.line(move.start), "tool", move.tool
+            yield program.line(move.start), "wobj", move.work
