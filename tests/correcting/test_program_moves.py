@@ -214,6 +214,11 @@ def test_relative_motions_and_offsets_stay(fit: mc.Fit, place: str, tmp_path: Pa
     assert made[1] == f"; {MARK}"
 
 
+def test_a_program_of_offsets_alone_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(mc.CalibrationError, match="no points with numbers, only relative motions"):
+        opened(tmp_path / "a.src", "LIN_REL {Z 5}\nLIN XP:{X 0,Y 0,Z 5,A 0,B 0,C 0}\n")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [

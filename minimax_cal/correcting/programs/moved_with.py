@@ -66,11 +66,11 @@ def untold(
             taken = given[option] or language.ORIGINS[option]
             doubts.setdefault(lines, []).append((WORDS[option], taken))
     for lines, pairs in doubts.items():
-        words, taken = (" and ".join(part) for part in zip(*pairs, strict=True))
+        words, taken = (" and ".join(dict.fromkeys(part)) for part in zip(*pairs, strict=True))
         who = f"moves at line {shown(lines)} do" if lines else "does"
         yield (
             f"{text.source}: {who} not tell the {words} of the points, which are taken as those "
-            f"of {taken}"
+            f"of {taken}; give tool= or wobj= where they are of others"
         )
 
 

@@ -91,7 +91,9 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
         raise OptionError(f"{robot.name}: points of programs are for arms with six turning joints")
     points = tuple(point for point, _ in zip(language.points(text), range(MOST + 1), strict=False))
     if not points:
-        raise DataError(f"{path}: holds no points with numbers")
+        only = any(language.left(text))
+        more = ", only relative motions, offsets or parts of points" if only else ""
+        raise DataError(f"{path}: holds no points with numbers{more}")
     if len(points) > MOST:
         raise DataError(f"{path}: holds over {MOST} points; split it")
     known, given = language.frames(text), {"tool": tool, "wobj": work}

@@ -64,8 +64,9 @@ def moves(program: Text) -> Iterator[Move]:
     routines, passed = set(), set()
     for found in ROUTINE.finditer(program.bare):
         routines.add(found[1].lower())
-        given = program.bare[found.end() : found.end() + LONGEST].partition(")")[0]
-        passed |= {data[2].lower() for data in DATA.finditer(given if found[2] else "")}
+        stop = program.bare.find(")", found.end(), found.end() + LONGEST) if found[2] else -1
+        given = program.bare[found.end() : max(stop, found.end())]
+        passed |= {data[2].lower() for data in DATA.finditer(given)}
     named = {found.start(1): found for found in NAMED.finditer(program.bare)}
     heads = {found.start(1): found for found in CALL.finditer(program.bare)} | named
     end = 0
