@@ -20,7 +20,7 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import ordered
-from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_plausible
+from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_columns
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
@@ -261,7 +261,7 @@ def path_of(
     if not data.poses:
         raise DataError(f"{data.source}: holds no targets")
     check_joints(robot, data)
-    check_plausible(data)
+    check_columns(data)
     data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
 

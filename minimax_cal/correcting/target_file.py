@@ -22,6 +22,7 @@ from minimax_cal.measuring.columns import (
     near,
     optional_kind,
     read_rows,
+    useless,
     whole_rows,
 )
 from minimax_cal.measuring.measurements import Measurements
@@ -70,9 +71,16 @@ def read_targets(path: Path | str) -> TargetFile:
     file = whole_rows(file)
     q, sliding = file.joints()
     columns: dict[str, Array] = {}
-    notices = []
+    idle = useless(header)
+    notices = [
+        f"{path}: column {name} is kept and not used: {why}"
+        for name, why in idle.items()
+        if optional_kind(name)[0] in USED
+    ]
     for name in header:
         kind, match = optional_kind(name)
+        if name in idle:
+            continue
         if kind in USED and kind in TEXT:
             columns[name] = np.array(file.text(name))
         elif kind in USED and match:

@@ -55,7 +55,7 @@ from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import groups, split, with_groups
-from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
 from minimax_cal.measuring.stations import Frames, seen_from
@@ -214,7 +214,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     said = (*said, *unplaced(data, kept))
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
-    notices = (*data.notices, *checks.limit_notices(robot, data), *said)
+    notices = (*data.notices, *checks.limit_notices(robot, data), *time_notices(data), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
         names = ", ".join(np.array(data.target_names)[few])

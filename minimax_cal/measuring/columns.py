@@ -41,6 +41,8 @@ OPTIONAL = {
     }.items()
 }
 TEXT = {"session", "group", "pose", "split"}  # labels, compared but never computed with
+OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
+OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +155,29 @@ def header_check(path: Path | str, header: Sequence[str]) -> None:
             if axes.count(axis) != 1:
                 fault = "is missing" if axis not in axes else "is given in two units"
                 raise DataError(f"{path}:1: column smr{number}_{axis}_{unit} {fault}")
+    stems: dict[str, str] = {}
+    for name in header:
+        _, match = optional_kind(name)
+        stem = name.removesuffix(f"_{match[1]}") if match and match.re.groups else name
+        if stems.setdefault(stem, name) != name:
+            raise DataError(f"{path}:1: {stems[stem]} and {name} are one column; keep one unit")
+
+
+def useless(header: Sequence[str]) -> dict[str, str]:
+    """Optional columns that say nothing of this arm, and why."""
+    joints = max((int(m[1]) for name in header if (m := JOINT.fullmatch(name))), default=0)
+    out = {}
+    for name in header:
+        if not optional_kind(name)[0]:
+            continue
+        if m := OF_JOINT.fullmatch(name):
+            if not 1 <= int(m[1]) <= joints:
+                out[name] = f"the file has no joint {m[1]}"
+        elif m := OF_FOOT.fullmatch(name):
+            axes = [o[2] for other in header if (o := OF_FOOT.fullmatch(other)) and o[1] == m[1]]
+            if lost := [f"{m[1]}{axis}{m[3]}" for axis in "xyz" if axis not in axes]:
+                out[name] = f"{lost[0]} is missing"
+    return out
 
 
 def numbers(path: Path | str, name: str, cells: list[str], line: Array, *, empty: bool) -> Array:

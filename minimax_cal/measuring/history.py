@@ -72,6 +72,22 @@ def visits(data: Measurements) -> Array:
     return np.lexsort((data.columns["order"].astype(float), sessions(data)))
 
 
+def time_notices(data: Measurements) -> list[str]:
+    """A notice where `time_s` falls from one visit to the next of a session."""
+    rows = visits(data)
+    rows = rows[np.isfinite(data.columns.get("time", np.full(data.poses, np.nan))[rows])]
+    time, session = data.columns["time"][rows] if len(rows) else rows, sessions(data)[rows]
+    back = 1 + np.flatnonzero((np.diff(time) < 0.0) & (np.diff(session) == 0))
+    if not len(back):
+        return []
+    by = "the column order" if numbered(data) else "the rows"
+    return [
+        f"{data.source}:{data.line[rows[back[0]]]}: column time_s runs backwards against {by}, "
+        f"{len(back)} times: moves follow {by}, the clock time_s; correct one of them, or name the "
+        "sessions in a column `session`"
+    ]
+
+
 def moves(data: Measurements) -> Array:
     """(m, n) joint moves from the pose before, 0 where that is not known [rad, m].
 

@@ -23,9 +23,11 @@ from minimax_cal.measuring.columns import (
     near,
     optional_kind,
     read_rows,
+    useless,
     whole_rows,
 )
 
+APPROACH = re.compile(r"approach\d+")
 FARTHEST = 1e5  # no instrument measures farther [m]
 PLAUSIBLE = {  # column: its header, least and largest value in SI, what a header's unit is in SI
     "temperature": ("temperature_C", -273.15, 1000.0, 1.0),
@@ -157,12 +159,11 @@ def check_finite(data: Measurements) -> Measurements:
         points = data.y[data.seen[:, target], target]
         if len(points) > 2 and np.all(np.ptp(points, axis=0) == 0.0):
             raise DataError(f"{data.source}: all points of {name} are the same")
-    check_plausible(data)
-    return check_u95(data)
+    return check_u95(check_columns(data))
 
 
-def check_plausible(data: Measurements) -> None:
-    """Raise DataError for a temperature, a payload or an uncertainty that cannot be."""
+def check_columns(data: Measurements) -> Measurements:
+    """The data, if their optional columns can be.  Raises DataError."""
     for name, (header, low, high, scale) in PLAUSIBLE.items():
         values = data.columns.get(name, np.zeros(0))
         odd = (values < low) | (values > high)
@@ -172,6 +173,16 @@ def check_plausible(data: Measurements) -> None:
                 f"{data.source}:{data.line[row]}: column {header}: {scale * values[row]:g} cannot "
                 f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
             )
+    for name in filter(APPROACH.fullmatch, data.columns):
+        side = data.columns[name].astype(float)
+        odd = ~np.isin(side, (-1.0, 0.0, 1.0)) & ~np.isnan(side)
+        if odd.any():
+            row = int(np.argmax(odd))
+            raise DataError(
+                f"{data.source}:{data.line[row]}: column {name}: {side[row]:g} is no sign of a "
+                "move; expected -1 or 1, or an empty cell where it is not known"
+            )
+    return data
 
 
 def check_u95(data: Measurements) -> Measurements:
@@ -219,9 +230,12 @@ def measurements_in(file: Rows) -> Measurements:
             )
     columns: dict[str, Array] = {}
     unknown: dict[str, Array] = {}
+    idle = useless(header)
     for name in header:
         kind, match = optional_kind(name)
-        if kind in TEXT:
+        if name in idle:
+            unknown[name] = np.array(file.text(name))
+        elif kind in TEXT:
             columns[name] = np.array(file.text(name))
         elif match:
             unit = match[1] if match.re.groups else ""
@@ -229,7 +243,8 @@ def measurements_in(file: Rows) -> Measurements:
             columns[stem] = file.number(name, unit=unit, empty=True)
         elif not JOINT.fullmatch(name) and not TARGET.fullmatch(name):
             unknown[name] = np.array(file.text(name))
-    notices = [f"{path}: column {name} is not used{near(name)}" for name in unknown]
+    why = {name: f": {idle[name]}" if name in idle else near(name) for name in unknown}
+    notices = [f"{path}: column {name} is not used{why[name]}" for name in unknown]
     data = Measurements(
         q=q,
         y=y,

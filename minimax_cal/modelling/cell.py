@@ -13,7 +13,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, said
 from minimax_cal.ground.files import json_of, read_text
 from minimax_cal.measuring.checks import check_joints
-from minimax_cal.measuring.history import Clock
+from minimax_cal.measuring.history import Clock, ordered
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.measuring.stations import ALONE, Sessions, labels, moved, seen_from, shifts
 from minimax_cal.modelling.effects.scene import Scene
@@ -274,6 +274,14 @@ def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
         said.append(
             f"{data.source}: {named}: taken to be measured from where session "
             f"{next(iter(frames))} was (the fit knows {', '.join(frames)})"
+        )
+    led = [t.label for t in cell.effects.terms if EFFECTS[t.effect].of_move]
+    sides = [data.columns[c] for c in data.columns if c.startswith("approach")]
+    told = any(np.nan_to_num(side).any() for side in sides)
+    if led and not (told or ordered(data)):
+        said.append(
+            f"{data.source}: {', '.join(led)} depends on the way to a pose, which these data do "
+            "not tell: taken as 0; give the column order, or approach1 ..."
         )
     timed = [t.label for t in cell.effects.terms if t.by_clock]
     if timed and "clock" not in data.columns:

@@ -218,3 +218,12 @@ def test_a_part_read_as_a_file_of_its_own_has_the_time_of_the_fit(tmp_path: Path
     assert "extrapolated: by order these poses lie from 8.4 to 9.4" in said
     (said,) = strangers(cell, replace(ONE, columns={}))
     assert "does not run here" in said
+
+
+def test_play_on_data_without_an_order_is_told() -> None:
+    cell = mc.calibrate(ROBOT, ONE, "sum", effects=["backlash:all"]).cell
+    assert strangers(cell, ONE) == ()
+    unordered = replace(ONE, columns={})
+    (said,) = strangers(cell, unordered)
+    assert "backlash:all depends on the way to a pose, which these data do not tell" in said
+    assert strangers(cell, replace(ONE, columns={"approach2": np.ones(ONE.poses)})) == ()

@@ -136,6 +136,9 @@ def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
     assert [m.parameter for m in found.moved] == ["theta1"]
     assert found.hidden == ()
     assert mc.check(fit, mc.measurements(q, y), "rms 0.5").moved == ()
+    alone = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame")
+    assert [m.parameter for m in alone.moved] == ["theta1"]
+    assert [h.parameter for h in alone.hidden] == ["theta6"]
 
 
 FOOT = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.4, 0.1]])

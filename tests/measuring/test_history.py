@@ -3,7 +3,7 @@ from conftest import shared
 from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
-from minimax_cal.measuring.history import moves, visits, with_history
+from minimax_cal.measuring.history import moves, time_notices, visits, with_history
 from minimax_cal.measuring.measurements import Measurements, measurements
 
 
@@ -108,3 +108,14 @@ def test_irb120_keeps_the_moves_whose_start_is_in_the_file() -> None:
     assert_allclose(columns["move3"][rows], data.q[rows, 2] - data.q[rows - 1, 2], atol=0)
     assert np.all(np.abs(columns["approach3"][rows]) == 1)
     assert not columns["approach3"][~linked].any()
+
+
+def test_a_clock_against_the_order_is_told() -> None:
+    order, time = np.arange(4.0), np.array([0.0, 2.0, 1.0, np.nan])
+    q = [0.0, 1.0, 2.0, 3.0]
+    (said,) = time_notices(walk(q, order=order, time=time))
+    assert ":3: column time_s runs backwards against the column order, 1 times" in said
+    assert time_notices(walk(q, order=order[::-1], time=-order)) == []
+    days = np.array(["a", "a", "b", "b"])
+    assert time_notices(walk(q, time=np.array([5.0, 6.0, 1.0, 2.0]), session=days)) == []
+    assert time_notices(walk(q, order=order)) == []

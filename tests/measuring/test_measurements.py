@@ -149,3 +149,39 @@ def test_what_cannot_be_is_refused(column: str, value: float, says: str) -> None
     values[3] = value
     with pytest.raises(mc.DataError, match=f"4: {says}"):
         mc.measurements(q, y, **{column: values})
+
+
+SIX = ",".join(f"q{i}_rad" for i in range(1, 7)) + ",smr1_x_mm,smr1_y_mm,smr1_z_mm"
+
+
+@pytest.mark.parametrize("side", [0.5, 7.0])
+def test_an_approach_is_a_sign(side: float, tmp_path: Path) -> None:
+    rows = "\n0.1,0.2,1,2,3,-1\n0.3,0.4,4,5,6,{}\n0.3,0.5,4,5,7,\n"
+    with pytest.raises(mc.DataError, match=f"m.csv:3: column approach2: {side:g} is no sign"):
+        read(HEAD + ",approach2" + rows.format(side), tmp_path)
+    assert read(HEAD + ",approach2" + rows.format(0), tmp_path).columns["approach2"][1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("u95_mm", "u95_m"), ("qread1_rad", "qread1_deg"), ("base1_x_mm", "base1_x_m")],
+)
+def test_a_column_in_two_units_is_refused(one: str, other: str, tmp_path: Path) -> None:
+    with pytest.raises(mc.DataError, match=f"m.csv:1: {one} and {other} are one column"):
+        read(f"{HEAD},{one},{other}\n0.1,0.2,1,2,3,0.1,0.1\n0.3,0.4,4,5,6,0.1,0.1\n", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("column", "why"),
+    [
+        ("approach9", "the file has no joint 9"),
+        ("approach0", "the file has no joint 0"),
+        ("tau9_Nm", "the file has no joint 9"),
+        ("qread9_rad", "the file has no joint 9"),
+        ("base1_x_mm", "base1_y_mm is missing"),
+    ],
+)
+def test_a_column_of_no_use_is_kept_with_a_notice(column: str, why: str, tmp_path: Path) -> None:
+    data = read(f"{SIX},{column}\n0,0,0,0,0,0,1,2,3,1\n1,0,0,0,0,0,4,5,6,-1\n", tmp_path)
+    assert list(data.unknown[column]) == ["1", "-1"]
+    assert data.notices == (f"{data.source}: column {column} is not used: {why}",)

@@ -190,3 +190,16 @@ def test_without_numba_numpy_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choice.util, "find_spec", lambda name: None)
     assert choice.kernels() is plain
     choice.best.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["plain", "fast"])
+def test_targets_alone_may_be_free(
+    name: str, request: pytest.FixtureRequest, rng: np.random.Generator
+) -> None:
+    own = plain if name == "plain" else request.getfixturevalue(name)
+    model, state = cell("irb120", 1, 0, rng)
+    given = plain, arrays_of(state), model.sight
+    first, every = 5 * 6 + 6, np.arange(model.names.count)
+    whole = sums.normal(*given, every)
+    cost, gradient, gram = sums.normal(own, *given[1:], every[first:])
+    near((cost, gradient, gram), (whole[0], whole[1][..., first:], whole[2][..., first:, first:]))

@@ -25,9 +25,10 @@ from minimax_cal.measuring.columns import (
     near,
     optional_kind,
     read_rows,
+    useless,
     whole_rows,
 )
-from minimax_cal.measuring.measurements import Measurements, check_u95, file_column
+from minimax_cal.measuring.measurements import Measurements, check_columns, check_u95, file_column
 
 WIRE = re.compile(r"wire(\d+)_(mm|m)")
 PLACE = re.compile(r"flange_([xyz])_(mm|m)")
@@ -80,7 +81,7 @@ def read_relative(path: Path | str) -> RelativeData:
     at = Measurements(
         q, nothing, (), sliding, file.line, columns, {}, notices, str(path), file.digest
     )
-    data, blind = READERS[kind](file, check_u95(at))
+    data, blind = READERS[kind](file, check_u95(check_columns(at)))
     if blind.all():
         raise DataError(f"{path}: nothing was measured at any pose")
     if blind.any():
@@ -93,8 +94,11 @@ def read_relative(path: Path | str) -> RelativeData:
 def optional_columns(file: Rows, kind: str) -> tuple[dict[str, Array], tuple[str, ...]]:
     """The optional columns by name, in SI, and a notice for each column that is not used."""
     columns: dict[str, Array] = {}
-    notices = []
+    idle = useless(file.header)
+    notices = [f"{file.path}: column {name} is not used: {why}" for name, why in idle.items()]
     for name in file.header:
+        if name in idle:
+            continue
         family, match = optional_kind(name)
         match = match or DOUBT.fullmatch(name)
         own = name == "socket" or name.startswith(("wire", "flange"))

@@ -212,11 +212,11 @@ def summed(
     error: (B, k, 3 c), J: (B, k, h, 3 c), root: (k, c), s, end: as `sighted` and `sensed`.  A
     target's own coordinates are which[s:end], of all that begin with the parameter `first`.
     """
-    B, k, h, _ = J.shape
+    (B, k, h, _), c = J.shape, root.shape[1]
     cost += np.einsum("bkr,bkr->bk", error, error)
     pull, both = (J @ error[..., None])[..., 0], J @ np.swapaxes(J, -1, -2)
-    side = (J.reshape(B, k, 3 * h, -1) @ root[..., None]).reshape(B, k, h, 3)
-    own, square = (error.reshape(B, k, 3, -1) @ root[..., None])[..., 0], (root**2).sum(axis=1)
+    side = (J.reshape(B, k, 3 * h, c) @ root[..., None]).reshape(B, k, h, 3)
+    own, square = (error.reshape(B, k, 3, c) @ root[..., None])[..., 0], (root**2).sum(axis=1)
     held = [(slice(0, s), slice(0, s)), (slice(end, len(which)), slice(s, h))]  # and in `both`
     held = held[: 2 if end < len(which) else 1]
     row = np.arange(s, end)

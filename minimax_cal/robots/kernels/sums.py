@@ -105,7 +105,8 @@ class Columns:
         out = np.zeros((B, k)), np.zeros((B, k, p)), np.zeros((B, k, p, p))
         for lo, hi in blocks(len(sight[0]), B * k, own.BLOCK):
             error, J, root = self.shared(own, at, sight, lo, hi)
-            flat = error.reshape(B, k, -1), J.reshape(*J.shape[:3], -1), root
+            long = 3 * (hi - lo)  # told, as -1 is of no rows that move all targets
+            flat = error.reshape(B, k, long), J.reshape(*J.shape[:3], long), root
             own.summed(*flat, self.which, *self.ends, *out)
         return out
 
