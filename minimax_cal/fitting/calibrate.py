@@ -54,7 +54,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
-from minimax_cal.measuring.grouping import groups, split, with_groups
+from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
@@ -214,7 +214,8 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     said = (*said, *unplaced(data, kept))
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
-    notices = (*data.notices, *checks.limit_notices(robot, data), *time_notices(data), *said)
+    doubts = (*checks.limit_notices(robot, data), *time_notices(data), mislabelled(data))
+    notices = (*data.notices, *filter(None, doubts), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
         names = ", ".join(np.array(data.target_names)[few])

@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot
 
@@ -54,7 +55,8 @@ def check_count(data: Measurements, poses: int, unknowns: int, known: int) -> No
     poses: number of different ones.  unknowns: free parameters.  known: priors on them.
     """
     if poses == 1 and data.poses > 1:
-        raise DataError(f"{data.source}: all {data.poses} rows have the same joint values")
+        alike = f"{data.source}: all {data.poses} rows have the same joint values"
+        raise DataError(mislabelled(data) or alike)
     a_pose = min(3.0 * data.seen.sum() / data.poses, 6.0)  # a rigid flange has six freedoms
     needed = int(np.ceil((unknowns - known) / a_pose)) + 1
     if poses < needed:

@@ -30,6 +30,7 @@ LABELS = ("pose", "group")  # columns that tell which poses belong together
 SORTED = 2000  # poses among which pairs are found by sorting, without a tree
 MOST = 3000  # poses among which clusters are looked for
 MOVES = 0.01  # a joint with less range does not move [rad, m]
+TURN = 2.0 * np.pi
 REGIONS = 5  # clusters of joint values that are left out in their turn
 LLOYD = 10  # rounds that find them
 QUARTER = 0.25  # of the poses at each end of a joint
@@ -76,6 +77,27 @@ def groups(data: Measurements) -> Array:
             same = np.isin(group, group[labels == label])
             group[same] = group[same].min()
     return numbered_by_joints(group, data.q)
+
+
+def mislabelled(data: Measurements) -> str:
+    """Which `pose` label stands at poses that are not one, to people; '' for none.
+
+    A joint may have come back a whole turn away.
+    """
+    labels = data.columns.get("pose", np.full(data.poses, "")).astype(str)
+    for label in np.unique(labels[labels != ""]):
+        rows = np.flatnonzero(labels == label)
+        off = data.q[rows] - data.q[rows[0]]
+        off = np.abs(off - np.where(data.sliding, 0.0, TURN * np.round(off / TURN)))
+        if off.max() > MOVES:
+            row, joint = np.argwhere(off == off.max())[0]
+            size = f"{1e3 * off.max():.3g} mm" if data.sliding[joint] else f"{off.max():.3g} rad"
+            return (
+                f"{data.source}:{data.line[rows[row]]}: pose {str(label)!r} is also that of line "
+                f"{data.line[rows[0]]}, where joint {joint + 1} differs by {size}; an equal label "
+                "says that the same pose was visited again: name each pose by itself"
+            )
+    return ""
 
 
 def close_pairs(q: Array, within: float) -> Array:

@@ -260,7 +260,36 @@ def measurements_in(file: Rows) -> Measurements:
     blind = np.asarray(~data.seen.any(axis=1))
     if blind.any():
         notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
-    return replace(data.take(~blind), notices=(*data.notices, *notices))
+    again, said = pasted(file, ~blind)
+    return replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
+
+
+def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
+    """(m,) True for rows that repeat an earlier one in every cell, and a notice of them.
+
+    Nothing is measured twice to the last digit; as repeats they would tell of no noise at all.
+    kept: (m,) rows that count.
+    """
+    first: dict[tuple[str, ...], int] = {}
+    source = np.array([first.setdefault(row, i) for i, row in enumerate(file.rows)])
+    again = (source < np.arange(len(source))) & kept
+    rows = np.flatnonzero(again)
+    if not len(rows):
+        return again, []
+    runs = np.split(rows, 1 + np.flatnonzero((np.diff(rows) != 1) | (np.diff(source[rows]) != 1)))
+    told = [repeated(file, run, source[run]) for run in runs[:5]]
+    more = f", and {len(runs) - 5} more places" if len(runs) > 5 else ""
+    return again, [
+        f"{file.path}: {', '.join(told)}{more} in every cell: pasted twice? they count once"
+    ]
+
+
+def repeated(file: Rows, run: Array, source: Array) -> str:
+    """That rows which follow each other repeat others, to people."""
+    if len(run) == 1:
+        return f"line {file.line[run[0]]} repeats line {file.line[source[0]]}"
+    (a, b), (c, d) = file.line[run[[0, -1]]], file.line[source[[0, -1]]]
+    return f"lines {a}-{b} repeat lines {c}-{d}"
 
 
 def write_measurements(path: Path | str, data: Measurements) -> None:

@@ -476,3 +476,9 @@ def test_a_real_arm_agrees_with_the_accuracy_of_its_calibration(target: int) -> 
             assert size.mean() == pytest.approx(told.mean_mm, rel=1e-9)
             assert size.max() == pytest.approx(told.max_mm, rel=1e-9)
             assert np.sqrt(np.mean(size**2)) == pytest.approx(told.rms_mm, rel=1e-9)
+
+
+def test_one_label_at_two_poses_is_no_repeatability(cell: mc.Cell) -> None:
+    data = seen_at(cell, level_poses(cell.robot, 6), pose=np.repeat(["a", "b", "c"], 2))
+    with pytest.raises(DataError, match="pose 'a' is also that of line 1"):
+        of(cell, data)

@@ -116,6 +116,11 @@ def test_one_pose_repeated(robot: mc.Robot, noisy: Simulation) -> None:
     assert "all 30 rows have the same joint values" in refused(robot, data)
 
 
+def test_one_label_for_all_poses(robot: mc.Robot, noisy: Simulation) -> None:
+    data = replace(noisy.data, columns={"pose": np.full(noisy.data.poses, "p")})
+    assert "pose 'p' is also that of line 2, where joint" in refused(robot, data)
+
+
 def test_two_poses(robot: mc.Robot, noisy: Simulation) -> None:
     message = refused(robot, noisy.data.take(np.array([0, 1])))
     assert "2 different poses" in message

@@ -12,6 +12,7 @@ from minimax_cal.measuring.grouping import (
     clusters,
     grouped,
     groups,
+    mislabelled,
     nearest_means,
     numbered_by_joints,
     parts,
@@ -215,3 +216,14 @@ def test_groups_are_numbered_alike_in_any_order_of_the_rows(rng: np.random.Gener
     group, order = rng.integers(0, 6, 40), rng.permutation(40)
     found = numbered_by_joints(group[order], q[order])
     assert_array_equal(found, numbered_by_joints(group, q)[order])
+
+
+def test_one_label_at_two_poses_is_told(rng: np.random.Generator) -> None:
+    q = np.repeat(rng.uniform(-2.0, 2.0, (4, 6)), 2, axis=0)
+    q[1, 5] += 2.0 * np.pi + 1e-3  # the same pose, the wrist a turn on
+    label = np.array(["a", "a", "b", "b", "", "", "d", "d"])
+    assert mislabelled(made(q, pose=label)) == ""
+    assert mislabelled(made(q)) == ""
+    q[3, 1] += 0.5
+    said = mislabelled(made(q, pose=label))
+    assert ":4: pose 'b' is also that of line 3, where joint 2 differs by 0.5 rad" in said

@@ -185,3 +185,13 @@ def test_a_column_of_no_use_is_kept_with_a_notice(column: str, why: str, tmp_pat
     data = read(f"{SIX},{column}\n0,0,0,0,0,0,1,2,3,1\n1,0,0,0,0,0,4,5,6,-1\n", tmp_path)
     assert list(data.unknown[column]) == ["1", "-1"]
     assert data.notices == (f"{data.source}: column {column} is not used: {why}",)
+
+
+def test_rows_pasted_twice_count_once(tmp_path: Path) -> None:
+    head, one, two, three = HEAD, "0.1,0.2,1,2,3", "0.3,0.4,4,5,6", "0.3,0.5,4,5,6.5"
+    data = read("\n".join([head, one, two, three, one, two, three, two]) + "\n", tmp_path)
+    assert_array_equal(data.line, [2, 3, 4])
+    (said,) = data.notices
+    assert "lines 5-7 repeat lines 2-4, line 8 repeats line 3 in every cell" in said
+    visits = [f"{row},{i}" for i, row in enumerate([one, two, one])]
+    assert read("\n".join([head + ",order", *visits]) + "\n", tmp_path).poses == 3

@@ -26,6 +26,7 @@ from minimax_cal.judging.iso9283.visits import (
     values_of,
     view_of,
 )
+from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.history import ordered, with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -316,6 +317,8 @@ def iso9283(
     and "after" (calibrated).  held: (m,) True where no fit has seen the pose.  tcp: centroid (of
     the targets), a target, or a point of the last frame (3,) [m].  Raises CalibrationError.
     """
+    if fault := mislabelled(data):
+        raise DataError(fault)
     # in the order of the file where nothing tells another: a row measured again is no new visit
     data = with_history(data if ordered(data) else data.in_visit_order())
     chosen, told = tcp_of(data, tcp)
