@@ -30,6 +30,6 @@ def relative_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
     with to.stages() as progress:
         fit = relative(robot, data, progress, **chosen)
     to.notice(*fit.notices)
-    if to.deliver(fit.json):
+    if to.deliver(fit.json, fit.status):
         options.show(*fit.tables(), headline=fit.headline())
     return options.exit_code(fit.status)

@@ -190,8 +190,9 @@ def test_numbers_that_do_not_work_out_are_exit_code_1(
     mixed = [",".join(row[:6] + cells[k][6:]) for row, k in zip(cells, order, strict=True)]
     path = tmp_path / "mixed.csv"
     path.write_text("\n".join([header, *mixed]))
-    assert run("relative", "irb2600", path) == 1
+    assert run("relative", "irb2600", path, "-o", tmp_path / "fit.json") == 1
     out, err = capsys.readouterr()
     assert "held out, calibrated" in " ".join(out.split())
     assert "the nominal robot misses by" in err
-    assert err.splitlines()[-1].startswith("error: iteration_limit: ")
+    assert err.splitlines()[-1].startswith("error: failed: ")
+    assert not (tmp_path / "fit.json").exists()

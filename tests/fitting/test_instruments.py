@@ -42,6 +42,7 @@ from minimax_cal.fitting.instruments.split import free_numbers, misclosures
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.sampling import random_poses
+from minimax_cal.solvers.status import Status
 
 NOISE = 15e-6
 
@@ -373,6 +374,59 @@ def test_another_robot_is_doubted() -> None:
     fit = relative("irb120", seen.data)
     assert any("the nominal robot misses by" in notice for notice in fit.notices)
     assert any("implausibly large changes" in notice for notice in fit.notices)
+
+
+# ---- slips -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "name"), [(1e-3, "wire1_m"), (1e3, "wire1_mm")])
+def test_lengths_in_another_unit_are_refused(factor: float, name: str) -> None:
+    arm, seen = measured("irb2600", "wires_3", noise=NOISE)
+    wrong = replace(seen.data, length=factor * seen.data.length)
+    with pytest.raises(mc.DataError, match=f"given as .*: name the columns {name}, "):
+        relative(arm.robot, wrong)
+
+
+@pytest.mark.parametrize("kind", ["wires_3", "closures"])
+def test_a_reversed_joint_is_named(kind: str) -> None:
+    arm, seen = measured("irb2600", kind, noise=NOISE)
+    q = seen.data.at.q * [1, 1, -1, 1, 1, 1]
+    wrong = replace(seen.data, at=replace(seen.data.at, q=q))
+    with pytest.raises(mc.DataError, match="the sign of joint 3 looks reversed"):
+        relative(arm.robot, wrong)
+
+
+def test_a_large_offset_that_is_not_fitted_fails() -> None:
+    arm, seen = measured("irb2600", "wires_3", noise=NOISE)
+    shifted = replace(seen.data, length=seen.data.length + np.array([0.1, 0.05, -0.03]))
+    fit = relative(arm.robot, shifted)
+    assert fit.status is Status.FAILED
+    assert any("the wires' zeros look off; fit them with offset=" in n for n in fit.notices)
+    assert relative(arm.robot, shifted, offset=True).status is Status.CONVERGED
+
+
+def test_labels_of_sockets_at_random_are_no_closures(robot: mc.Robot) -> None:
+    """All could close if the arm shrank to a point."""
+    q = random_poses(robot, 60, np.random.default_rng(0))
+    fit = relative(robot, closures(q, [f"S{i % 6}" for i in range(60)]))
+    assert fit.status is Status.FAILED
+    assert any("it is no calibration of this arm" in notice for notice in fit.notices)
+
+
+def test_a_known_distance_that_cannot_be_is_refused() -> None:
+    arm, seen = measured("irb2600", "closures", noise=NOISE)
+    a, b = seen.data.sockets[:2]
+    fit = relative(arm.robot, seen.data)
+    spots = fit.instrument["sockets_mm"]
+    far = 1e-3 * float(np.linalg.norm(np.subtract(spots[a], spots[b])))
+    for known, words in (
+        ([(a, b, 1e-3 * far)], "mm apart; metres?"),
+        ([(a, b, far + 0.2)], "mm apart; check the labels"),
+        ([(a, b, far), (b, a, far + 0.1)], "given twice"),
+    ):
+        with pytest.raises(mc.OptionError, match=words):
+            relative(arm.robot, seen.data, known_distances=known)
+    assert relative(arm.robot, seen.data, known_distances=[(a, b, far)]).status is Status.CONVERGED
 
 
 # ---- options ---------------------------------------------------------------------------------

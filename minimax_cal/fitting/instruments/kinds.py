@@ -9,7 +9,7 @@ from pathlib import Path
 
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.identify import RESOLUTION
-from minimax_cal.fitting.instruments import fit, poses, remarks
+from minimax_cal.fitting.instruments import fit, plausible, poses, remarks
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.file import read_relative
 from minimax_cal.fitting.instruments.identify import position_sigma
@@ -26,6 +26,7 @@ from minimax_cal.fitting.options import listed
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
+from minimax_cal.solvers.status import Status
 
 
 def relative(
@@ -79,6 +80,7 @@ def from_instrument(
 ) -> RelativeCalibration:
     """Calibrate from lengths or closures."""
     began = time.perf_counter()
+    plausible.check_plausible(robot, data, options)
     held, notices = held_out(data, options)
     train = data.take(~held)
     fitted = fit.fit_instrument(robot, train, options, progress)
@@ -104,8 +106,14 @@ def from_instrument(
         provenance=Provenance.of(robot, data.at, options.settings()),
     )
     said = (*remarks.of_scale(fitted), *remarks.of_offsets(fitted, result.parameters, options))
-    said += (*remarks.weak(result), *remarks.unlikely(result))
-    return replace(result, notices=(*result.notices, *said, *remarks.general(result, data, held)))
+    offset = plausible.offset_told(robot, train, options, fitted)
+    wrong = plausible.contradiction(robot, data, fitted, result, offset)
+    said += (*remarks.weak(result), *remarks.unlikely(result), *filter(None, (offset, wrong)))
+    return replace(
+        result,
+        status=Status.FAILED if wrong else result.status,
+        notices=(*result.notices, *said, *remarks.general(result, data, held)),
+    )
 
 
 def from_poses(

@@ -37,6 +37,12 @@ def known_of(text: str) -> Known:
     raise OptionError(f"known_distances={text!r}: write two sockets and a length, as A,B,500.02")
 
 
+def known_text(known: Known) -> str:
+    """A known distance as it was asked for."""
+    first, second, distance = known
+    return f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
+
+
 @dataclass(frozen=True)
 class RelativeOptions:
     """How to calibrate.
@@ -96,8 +102,13 @@ def check_options(data: RelativeData, options: RelativeOptions) -> None:
             raise OptionError(
                 f"{name}= is for {kind}; {data.at.source} holds {data.kind}: leave it out"
             )
-    for first, second, distance in options.known_distances:
-        said = f"known_distances={f'{first},{second},{1e3 * distance:g}'!r}"
+    asked: set[frozenset[str]] = set()
+    for known in options.known_distances:
+        first, second, distance = known
+        said = known_text(known)
+        if {first, second} in asked:
+            raise OptionError(f"{said}: this distance is given twice; give it once")
+        asked.add(frozenset((first, second)))
         for label in (first, second):
             if label not in data.sockets:
                 raise OptionError(f"{said}: {data.at.source} has no socket {label!r}")

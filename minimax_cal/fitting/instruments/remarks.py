@@ -12,6 +12,7 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
 from minimax_cal.fitting.instruments.identify import has_scale
 from minimax_cal.fitting.instruments.options import RelativeOptions
+from minimax_cal.fitting.instruments.plausible import spread_mm
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import TARGET
 from minimax_cal.fitting.same_arm import WILD_ANGLE
@@ -45,8 +46,7 @@ def of_offsets(
     """How weakly the offsets of wires are determined."""
     if not options.offset:
         return ()
-    dof = max(fit.numbers - int(fit.identification.active.sum()), 1)
-    noise_mm = 1e3 * float(np.sqrt(fit.found.cost[0] / dof))
+    noise_mm = spread_mm(fit)
     told = [p for p in parameters if p.name.startswith("offset")]
     each = ", ".join(
         f"{p.name} {1e3 * p.value:+.3f} +- {1e3 * p.sigma:.3f} mm"

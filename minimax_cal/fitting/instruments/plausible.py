@@ -1,0 +1,188 @@
+"""Slips of lengths and closures that no fit should be asked to explain: units, signs, offsets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.fitting.checks import FEW, POOR_FIT
+from minimax_cal.fitting.claims import GROSS, LEAST_FLOOR
+from minimax_cal.fitting.identify import plenty_of_poses
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.fit import (
+    InstrumentFit,
+    allowed_of,
+    fit_instrument,
+    instrument_of,
+    start_of,
+)
+from minimax_cal.fitting.instruments.options import RelativeOptions, known_text, silent
+from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.instruments.rows import Closures, Instrument, places
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.measuring.checks import suspicions
+from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot
+
+MENDED = 0.04  # of the mean square: what explains the misses that well is their cause
+BETTER = 0.25  # of the mean square: what explains so much is worth a look
+RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
+
+
+def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) -> None:
+    """Raise CalibrationError for slips that show where the arm as drawn is fitted.
+
+    All rows are looked at, those held out too: they judge the fit.
+    """
+    data = data.take(some(data))
+    instrument, state = started(robot, data, options)
+    given, limit = mean_square(instrument, state), POOR_FIT * robot.reach()
+    if np.sqrt(given) <= limit:
+        check_known(data, options, instrument, state, 4.0 * limit)
+        return
+    whole = size(instrument, state)
+    trials = []
+    for text, mended in slips(robot, data):
+        at = started(robot, mended, options)
+        trials.append((mean_square(*at) / size(*at), mean_square(*at), text))
+    least = min(share for share, _, _ in trials)
+    share, square, text = next(trial for trial in trials if trial[0] <= 2.0 * least)
+    if np.sqrt(square) <= 4.0 * limit and share < MENDED * given / whole:
+        raise DataError(
+            f"{data.at.source}: {text} (the nominal robot then misses by "
+            f"{1e3 * np.sqrt(square):.3g} mm, not {1e3 * np.sqrt(given):.3g} mm)"
+        )
+
+
+def some(data: RelativeData) -> Array:
+    """(m,) True for rows that are enough to find a slip: of closures all, of each wire `FEW`."""
+    if data.kind != "distances":
+        return np.ones(data.poses, dtype=bool)
+    chosen = np.zeros(data.poses, dtype=bool)
+    for length in data.length.T:
+        seen = np.flatnonzero(np.isfinite(length))
+        chosen[seen[np.linspace(0, len(seen) - 1, min(len(seen), FEW)).astype(int)]] = True
+    return chosen
+
+
+def started(robot: Robot, data: RelativeData, options: RelativeOptions) -> tuple[Instrument, State]:
+    """The measurements, and what fits the arm as drawn best."""
+    instrument = instrument_of(robot, data, options)
+    allowed, _ = allowed_of(robot, instrument, options)
+    return instrument, start_of(robot, instrument, data.at.q, allowed)
+
+
+def mean_square(instrument: Instrument, state: State) -> float:
+    """Of the misses of lengths, or of visits about their socket [m^2]."""
+    if isinstance(instrument, Closures):
+        off = instrument.centred(places(instrument.model, state))
+        return float((off**2).sum(axis=0).mean())
+    return float(np.nanmean(instrument.errors(state) ** 2))
+
+
+def size(instrument: Instrument, state: State) -> float:
+    """What a mean square of closures is to be seen by: an arm that hardly moves closes anything."""
+    if not isinstance(instrument, Closures):
+        return 1.0
+    place = places(instrument.model, state)
+    return max(float(place.var(axis=-1).sum()), 1e-12)
+
+
+def slips(robot: Robot, data: RelativeData) -> Iterator[tuple[str, RelativeData]]:
+    """Slips worth testing: what to say, and the data with the slip mended."""
+    if data.kind == "distances":
+        yield (
+            "the lengths look like millimetres given as metres: name the columns wire1_mm, ...",
+            replace(data, length=1e-3 * data.length),
+        )
+        yield (
+            "the lengths look like metres given as millimetres: name the columns wire1_m, ...",
+            replace(data, length=1e3 * data.length),
+        )
+    for text, mended in suspicions(robot, data.at):
+        if mended.q is not data.at.q:  # else of points, which are not measured here
+            yield text, replace(data, at=mended)
+
+
+def check_known(
+    data: RelativeData,
+    options: RelativeOptions,
+    instrument: Instrument,
+    state: State,
+    limit: float,
+) -> None:
+    """Raise OptionError for a known distance that the arm as drawn misses by more than a limit."""
+    if not isinstance(instrument, Closures):
+        return
+    centre = instrument.barycentres(places(instrument.model, state)).T
+    for known, (a, b) in zip(options.known_distances, instrument.pairs, strict=True):
+        drawn, told = float(np.linalg.norm(centre[a] - centre[b])), known[2]
+        if abs(drawn - told) <= limit:
+            continue
+        metres = "; metres? give millimetres" if abs(drawn - 1e3 * told) <= limit else ""
+        raise OptionError(
+            f"{known_text(known)}: by the arm as drawn these sockets of {data.at.source} are "
+            f"{1e3 * drawn:.4g} mm apart{metres or '; check the labels and the length'}"
+        )
+
+
+def contradiction(
+    robot: Robot, data: RelativeData, fit: InstrumentFit, result: RelativeCalibration, offset: str
+) -> str:
+    """Why the fit is no calibration of this arm; '' where it is one.
+
+    offset: what the lengths say of offsets that were not fitted, see `offset_told`.
+    """
+    closing, limit_mm = data.kind == "closures", 1e3 * GROSS * robot.reach()
+    which = "the labels of the sockets" if closing else "which length is which wire's"
+    for key, what in (("train", "training"), ("holdout", "held-out")):
+        miss_mm = result.accuracy[key].rms_mm
+        if miss_mm > limit_mm:
+            return (
+                f"the fit misses the {what} rows by {miss_mm:.3g} mm, more than {100 * GROSS:g} % "
+                "of the arm's reach: it is no calibration of this arm; check the robot file, joint "
+                f"signs, units and {which}"
+            )
+    before, after = (swept(robot, fit.instrument, x) for x in (fit.nominal, fit.state))
+    if abs(after - before) > RESIZED * before:
+        return (
+            f"the fit makes an arm that sweeps {before:.3g} m one that sweeps {after:.3g} m: it is "
+            f"no calibration of this arm; check the robot file, joint signs, units and {which}"
+        )
+    nominal, calibrated, _ = result.before_and_after()
+    if offset and calibrated.rms_mm > nominal.rms_mm:
+        return "the fit is worse than the arm as drawn: fit the wires' zeros with offset="
+    return ""
+
+
+def swept(robot: Robot, instrument: Instrument, state: State) -> float:
+    """Spread of the target over the joints' range [m]."""
+    place = places(plenty_of_poses(robot, instrument.model), state)
+    return float(np.sqrt(place.var(axis=-1).sum()))
+
+
+def offset_told(
+    robot: Robot, train: RelativeData, options: RelativeOptions, fit: InstrumentFit
+) -> str:
+    """A notice where an offset of each wire explains what the fit leaves; '' where not."""
+    if train.kind != "distances" or options.offset or spread_mm(fit) < LEAST_FLOOR:
+        return ""
+    try:
+        more = fit_instrument(robot, train, replace(options, offset=True), silent)
+    except DataError:  # too few lengths for so many unknowns
+        return ""
+    if spread_mm(more) ** 2 > BETTER * spread_mm(fit) ** 2:
+        return ""
+    return (
+        f"with an offset of each wire the lengths fit to {spread_mm(more):.3g} mm, without to "
+        f"{spread_mm(fit):.3g} mm: the wires' zeros look off; fit them with offset="
+    )
+
+
+def spread_mm(fit: InstrumentFit) -> float:
+    """What a fit leaves of a length, by its spare numbers."""
+    dof = max(fit.numbers - int(fit.identification.active.sum()), 1)
+    return 1e3 * float(np.sqrt(fit.found.cost[0] / dof))
