@@ -18,6 +18,7 @@ from minimax_cal.robots.robot import Robot
 
 FEW = 30  # poses that are enough to test a slip of units or signs
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
+EXPLAINED = 0.04  # of the mean square: a slip that leaves no more is the cause
 ROUNDS = 5
 APART = 8.0  # times the typical miss, and this share of the reach: no error of the arm
 LEAST = 0.02
@@ -41,25 +42,38 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
 
     All rows are looked at, those held out too: they judge the fit.
     """
+    if not (robot.mdh[:, :2].any() or robot.prismatic.any()):
+        raise DataError(
+            f"{data.source}: {robot.name} has no lengths: every a and d of its joints is 0; "
+            "check the robot file"
+        )
     given = fitted(robot, data)
     check_names(robot, data, given)
     limit = POOR_FIT * robot.reach()
     if np.sqrt(given.mean_square) <= limit:
         return given
-    trials = [("the measurement frame looks left-handed; reverse one of its axes", given.mirrored)]
+    mirrored = "the measurement frame looks left-handed; reverse one of its axes"
+    trials = [(mirrored, given.mirrored)]
     few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
     with work(brief=False):
         for text, mended in suspicions(robot, data.take(few)):
-            trials.append((text, fitted(robot, mended).mean_square))
+            left = fitted(robot, mended).mean_square
+            if left < EXPLAINED * spread(mended):  # points drawn together are near any arm
+                trials.append((text, left))
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
-    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < 0.04 * given.mean_square:
+    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < EXPLAINED * given.mean_square:
         raise DataError(
             f"{data.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(given.mean_square):.3g} mm)"
         )
     return given
+
+
+def spread(data: Measurements) -> float:
+    """Mean square of the points about their middle, the most of all targets [m^2]."""
+    return float(np.nanvar(data.y, axis=0).sum(axis=-1).max())
 
 
 def check_names(robot: Robot, data: Measurements, given: BaseFit) -> None:

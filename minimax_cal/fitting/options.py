@@ -41,6 +41,9 @@ def silent(message: str) -> None:
     """Say nothing."""
 
 
+LEAST_SIGMA, MOST_SIGMA = 1e-12, 1e6  # of a prior that says something [m, rad]
+
+
 def sigmas_of(priors: Mapping[str, float | str]) -> dict[str, float]:
     """Sigmas of priors in SI, from numbers or texts with a unit.  Raises OptionError."""
     read = [prior_of(f"{k}={v}") if isinstance(v, str) else (k, v) for k, v in priors.items()]
@@ -252,6 +255,9 @@ def check_options(options: Options) -> None:
     for pattern, sigma in options.priors.items():
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
+        if not LEAST_SIGMA <= sigma <= MOST_SIGMA:
+            mend = "fix it instead" if sigma < LEAST_SIGMA else "leave it out"
+            raise OptionError(f"prior {pattern}: sigma {sigma:g} says nothing of an arm; {mend}")
 
 
 def qp_name(qp: str | Solver) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -17,6 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
+SHORT = 40  # letters of a name that stand in that of its temporary neighbour
 MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
 
 
@@ -44,17 +46,21 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
 def beside(path: Path) -> tuple[int, str]:
     """A new file in the folder of a path, open, and its name.  Raises CalibrationError."""
     try:
-        return tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        return tempfile.mkstemp(prefix=f".{path.name[:SHORT]}.", dir=path.parent)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def resolved(path: Path | str) -> Path:
-    """Where a path leads.  Raises CalibrationError for links that lead in a circle."""
+    """Where a path leads.  Raises CalibrationError for links in a circle and names too long."""
     try:
-        return Path(path).resolve()
+        there = Path(path).resolve()
+        there.exists()
     except (OSError, RuntimeError) as error:
-        raise CalibrationError(f"{path}: cannot be written (its links lead nowhere)") from error
+        long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+        why = "its name is too long" if long else "its links lead nowhere"
+        raise CalibrationError(f"{path}: cannot be written ({why})") from error
+    return there
 
 
 def mode_of(path: Path) -> int:
@@ -83,9 +89,9 @@ def check_writable(path: Path | str, suffixes: tuple[str, ...] = ()) -> None:
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
         raise CalibrationError(f"{path}: the file's ending must be one of {', '.join(suffixes)}")
-    if path.is_dir():
-        raise CalibrationError(f"{path}: is a folder; name a file")
     there = resolved(path)
+    if there.is_dir():
+        raise CalibrationError(f"{path}: is a folder; name a file")
     if not there.parent.is_dir():
         raise CalibrationError(f"{path}: cannot be written (there is no such folder)")
     if there.is_file() or not there.exists():  # no pipe and no device
@@ -168,11 +174,22 @@ def read_raw(
 
 def read_text(path: Path | str, *, kind: type[CalibrationError] = CalibrationError) -> str:
     """The text of a UTF-8 file, without a leading byte order mark; errors are of the kind given."""
+    return text_of(read_raw(path, kind=kind), path, kind=kind)
+
+
+def text_of(raw: bytes, path: Path | str, *, kind: type[CalibrationError]) -> str:
+    """The text of the bytes of a file; as `read_text`."""
     try:
-        text = read_raw(path, kind=kind).decode("utf-8-sig")
+        text = raw.decode("utf-8-sig")
         return text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         raise kind(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+
+
+def check_table(raw: bytes, path: Path | str, *, kind: type[CalibrationError]) -> None:
+    """Raise an error of a kind for a file that should be a table in text and is a spreadsheet."""
+    if raw.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
+        raise kind(f"{path}: is a spreadsheet, not text; save it as CSV")
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import unicodedata
 from contextlib import suppress
 
@@ -31,6 +32,11 @@ def one_line(text: str) -> str:
     """A message in one line that hides nothing and floods no terminal."""
     line = visible(" ".join(text.split()))
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
+
+
+def blanked(text: str, pattern: re.Pattern[str]) -> str:
+    """Text with what matches turned into spaces; line ends stay."""
+    return pattern.sub(lambda found: re.sub(r"[^\r\n]", " ", found[0]), text)
 
 
 def without_formulas(text: str) -> tuple[str, int]:

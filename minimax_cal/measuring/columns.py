@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import read_text
+from minimax_cal.ground.files import check_table, read_raw, text_of
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
@@ -87,7 +87,9 @@ class Rows:
 
 def read_rows(path: Path | str) -> Rows:
     """Read a CSV file.  Raises DataError where it is none."""
-    return rows_in(read_text(path, kind=DataError), path)
+    raw = read_raw(path, kind=DataError)
+    check_table(raw, path, kind=DataError)
+    return rows_in(text_of(raw, path, kind=DataError), path)
 
 
 def rows_in(text: str, path: Path | str) -> Rows:

@@ -178,7 +178,13 @@ class PlanOptions:
 
 def limits_of(texts: Sequence[str], robot: Robot) -> dict[int, tuple[float, float]]:
     """Limits by joint index, from texts as J2=-30:60.  Raises OptionError."""
-    return dict(joint(text, robot) for text in texts)
+    found: dict[int, tuple[float, float]] = {}
+    for text in texts:
+        index, limits = joint(text, robot)
+        if index in found:
+            raise OptionError(f"joints={text!r}: joint {index + 1} is given twice; give it once")
+        found[index] = limits
+    return found
 
 
 def joint(text: str, robot: Robot) -> tuple[int, tuple[float, float]]:

@@ -266,6 +266,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
             f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
         )
     up = np.array(schema.up)
+    up = up / max(1.0, float(np.abs(up).max()))  # the squares of huge numbers are none
     if np.linalg.norm(up) < 1e-9:
         raise RobotError(f"{source}: up: is a zero vector; give the vertical, e.g. [0, 0, 1]")
     return Robot(

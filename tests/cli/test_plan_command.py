@@ -199,6 +199,7 @@ def test_separate(poses: Path) -> None:
         (("--poses", 3), "3 poses do not tell the 33 parameters apart; plan at least"),
         (("--poses", 10, "--joint", "J2=40:-20"), "the limits are reversed"),
         (("--poses", 10, "--joint", "J9=0:1"), "has joints 1 to 6"),
+        (("--poses", 10, "--joint", "J2=10:20", "--joint", "J2=40:50"), "joint 2 is given twice"),
         (("--poses", 10, "--joint", "two=0:1"), "write J2=-30:60"),
         (("--poses", 10, "--joint", "J3=100:120"), "joint 3: no range is left"),
         (("--poses", 10, "--range", "9"), "--range 9: give low:high"),

@@ -484,3 +484,10 @@ def test_a_fit_from_before_nominal_robots(fit: tuple[Path, Simulation], tmp_path
     job = read_job(tmp_path / "old.json")
     assert job.nominal is job.robot
     assert job.effects == ("joint_coupling:J3",)
+
+
+def test_ur_yaml_of_another_make_is_told() -> None:
+    ur10 = export(job_of(bent(mc.load_robot("ur10"))), "ur-yaml").notices
+    assert not any("has not the axes" in notice for notice in ur10)
+    abb = mc.load_robot("irb2600")
+    assert "has not the axes of a Universal Robots arm" in export(job_of(abb), "ur-yaml").notices[0]

@@ -316,3 +316,11 @@ def test_only_offsets_leave_the_rest_as_drawn(noisy: Simulation, robot: mc.Robot
     assert (same.robot.mdh == fit.robot.mdh).all()
     with pytest.raises(mc.OptionError, match="the only choice is offsets"):
         mc.calibrate(robot, noisy.data, only="lengths")
+
+
+@pytest.mark.parametrize("sigma", ["1e-300mm", "1e300mm"])
+def test_a_prior_that_says_nothing_is_refused(
+    robot: mc.Robot, noisy: Simulation, sigma: str
+) -> None:
+    with pytest.raises(mc.OptionError, match=r"prior a2: sigma .* says nothing of an arm"):
+        mc.calibrate(robot, noisy.data, priors={"a2": sigma})

@@ -38,3 +38,13 @@ def test_lines_end_alike(tmp_path: Path) -> None:
     path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n")
     assert read_text(path) == "a\nb\nc\n"
     assert os.listdir(tmp_path) == ["text"]
+
+
+def test_a_name_may_be_long_and_not_longer(tmp_path: Path) -> None:
+    write_whole(tmp_path / ("n" * 255), "text")
+    assert os.listdir(tmp_path) == ["n" * 255]
+    check_writable(tmp_path / ("n" * 254))
+    for write in (check_writable, lambda path: write_whole(path, "text")):
+        with pytest.raises(CalibrationError, match="its name is too long"):
+            write(tmp_path / ("n" * 300))
+    assert os.listdir(tmp_path) == ["n" * 255]

@@ -153,3 +153,10 @@ def test_joints_outside_their_limits_are_a_notice(robot: mc.Robot, noisy: Simula
     narrow = replace(robot, upper=np.where(np.arange(6) == 1, 0.5, robot.upper))
     fit = mc.calibrate(narrow, noisy.data)
     assert any("joint 2 is outside the limits" in note for note in fit.notices)
+
+
+def test_an_arm_without_lengths(robot: mc.Robot, noisy: Simulation) -> None:
+    flat = robot.with_mdh(robot.mdh * [0, 0, 1, 1, 1])
+    assert "has no lengths: every a and d of its joints is 0" in refused(flat, noisy.data)
+    short = robot.with_mdh(robot.mdh * [1e-6, 1e-6, 1, 1, 1])
+    assert any("implausibly large" in notice for notice in mc.calibrate(short, noisy.data).notices)

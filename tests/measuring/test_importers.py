@@ -566,3 +566,88 @@ def test_every_importer_says_whether_it_fits() -> None:
         assert callable(module.fits)
         assert callable(module.read)
         assert module.TITLE
+
+
+# --- what means something else than it seems -----------------------------------------------
+
+
+def clocked(truth: mc.Measurements, write: Write, stamps: Sequence[str]) -> Path:
+    rows = [[*q, *y, s] for q, y, s in zip(truth.q, truth.y[:, 0], stamps, strict=False)]
+    header = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,smr1_x_m,smr1_y_m,smr1_z_m,time"
+    return write("t.csv", table(rows, header))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "seconds"),
+    [
+        (["23:59:58", "23:59:59", "00:00:01", "00:00:02"], [0, 1, 3, 4]),
+        (["11:59:59 PM", "12:00:01 AM", "12:00:02 AM"], [0, 2, 3]),
+        (["23:59:58", "00:00:02", "23:59:59", "00:00:03"], [0, 4, 1, 5]),  # by target
+        (["20:00:00", "04:00:00", "12:00:00"], [0, 8 * 3600, 16 * 3600]),
+        (["06:00:00", "12:00:00", "20:00:00", "06:00:01", "12:00:01", "20:00:01"],
+         [0, 21600, 50400, 1, 21601, 50401]),
+        (["10:00:02", "10:00:01", "10:00:00"], [2, 1, 0]),
+        (["00:00:01", "23:59:59"], [0, 86398]),
+    ],
+)  # fmt: skip
+def test_a_clock_runs_on_over_midnight(
+    truth: mc.Measurements, write: Write, stamps: list[str], seconds: list[float]
+) -> None:
+    found = import_files([clocked(truth, write, stamps)])
+    assert_allclose(found.data.columns["time"], seconds)
+
+
+def test_a_clock_of_twelve_hours_is_asked_about(truth: mc.Measurements, write: Write) -> None:
+    path = clocked(truth, write, ["12:59:59", "01:00:00", "01:00:01"])
+    refused(f"{path}:3: column time: 01:00:00 follows 12:59:59: a clock of twelve hours?", path)
+
+
+def test_joint_names_are_put_along_the_arm(truth: mc.Measurements, write: Write) -> None:
+    ways = [2, 1, 0, 3, 4, 5]
+    for front in ("", "left_"):
+        names = [f"{front}{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow",
+                 "wrist_1", "wrist_2", "wrist_3")]  # fmt: skip
+        joints = write("ros.csv", table(truth.q[:, ways], ",".join(names[i] for i in ways)))
+        points = write("points.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
+        same(import_files([points], joints, units="q=rad"), truth, targets=1)
+
+
+def test_rapid_comments_are_no_poses(truth: mc.Measurements, write: Write) -> None:
+    text = rapid_text(truth).replace("  CONST jointtarget p6:", "! CONST jointtarget p6:")
+    points = write("points.csv", table(np.delete(truth.y[:, 0], 5, axis=0) * 1e3, "x,y,z"))
+    found = import_files([points], write("poses.mod", text))
+    assert_allclose(found.data.q, np.delete(truth.q, 5, axis=0), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("header", "word"), [("Delete", "deleted"), ("Delete", "WAHR"), ("Deleted", "TRUE")]
+)
+def test_words_for_deleted_points(
+    truth: mc.Measurements, write: Write, header: str, word: str
+) -> None:
+    rows = leica_rows(truth)
+    bad = [*rows[0]]
+    bad[-1] = word
+    points = write("leica.csv", table([bad, *rows], LEICA.replace("Delete", header)))
+    joints = write("joints.csv", joint_rows(truth))
+    same(import_files([points], joints), truth)
+    bad[-1] = "perhaps"
+    points = write("leica.csv", table([bad, *rows], LEICA.replace("Delete", header)))
+    refused("leica.csv:2: column " + header + ": 'perhaps' does not say", points, joints=joints)
+
+
+def test_what_is_told_twice_is_refused(truth: mc.Measurements, write: Write) -> None:
+    for units, words in (
+        ("zz=mm,q=deg", "units='zz=mm': write q=deg, smr=mm or time=dmy"),
+        ("q=deg,q=rad", "units='q=rad': q is in deg already"),
+    ):
+        with pytest.raises(mc.OptionError, match=words):
+            import_files(["none.csv"], units=units)
+    points = write("p1.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
+    copy = write("p2.csv", table(truth.y[:, 0] * 1e3, "x,y,z"))
+    joints = write("joints.csv", joint_rows(truth))
+    refused(f"{points}: is given twice", points, points, joints=joints)
+    refused(f"{copy}: holds the same points as {points}", points, copy, joints=joints)
+    whole = write("m.csv", table(truth.q, ",".join(f"q{i}_rad" for i in range(1, 7))))
+    refused("7-9", whole, columns="1-6=q_rad,7-9=smr1_mm")
+    refused("column 4 is placed twice", whole, columns="1-3=q_rad,4-6=smr1_mm,4-6=smr2_mm")

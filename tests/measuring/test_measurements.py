@@ -42,6 +42,11 @@ def test_unknown_columns_are_kept_with_a_notice(tmp_path: Path) -> None:
     assert any("did you mean temperature_C" in note for note in data.notices)
 
 
+def test_a_spreadsheet_is_named(tmp_path: Path) -> None:
+    with pytest.raises(mc.DataError, match=r"m\.csv: is a spreadsheet, not text; save it as CSV"):
+        read(b"PK\x03\x04\x00\xff", tmp_path)
+
+
 def test_byte_order_mark_crlf_and_trailing_commas_are_fine(tmp_path: Path) -> None:
     text = ("\ufeff" + GOOD.replace("\n", ",\r\n")).encode()
     assert read(text, tmp_path).poses == 2

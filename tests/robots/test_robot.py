@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import minimax_cal as mc
+from minimax_cal.robots.robot import robot_from_dict
 
 ROBOT = {
     "name": "two bars",
@@ -133,6 +134,28 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     path.write_text("!!python/object/apply:os.system ['echo hacked']")
     with pytest.raises(mc.RobotError, match="cannot be parsed"):
         mc.load_robot(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name: r\njoints: [{a: 1, d: 2,\n  a: 3}]", "line 3: 'a' stands twice"),
+        ("name: r\nname: s", "line 2: 'name' stands twice"),
+        ("joints: [{d: 0445}]", "line 1: 0445 is no decimal number"),
+        ("joints: [{d: 1:30}]", "line 1: 1:30 is no decimal number"),
+        ("joints: [{d: 1:30.5}]", "line 1: 1:30.5 is no decimal number"),
+    ],
+)
+def test_yaml_means_what_it_reads_as(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    with pytest.raises(mc.RobotError, match=says):
+        mc.load_robot(path)
+
+
+def test_a_huge_vertical_keeps_its_direction() -> None:
+    robot = robot_from_dict(ROBOT | {"up": [0.0, 3e300, 4e300]})
+    np.testing.assert_allclose(robot.up, [0.0, 0.6, 0.8])
 
 
 def test_yaml_that_grows_is_refused(tmp_path: Path) -> None:

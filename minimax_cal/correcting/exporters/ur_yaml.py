@@ -12,6 +12,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.transforms import to_rpy, turn
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+ALIKE = 0.1  # sine of the angle by which an axis may be off
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 HEADER = (
     "# Written by minimax-cal.  Joint origins in metres and radians, from the controller's base\n"
@@ -40,8 +41,21 @@ def write(job: Job) -> Export:
     text = yaml.safe_dump({"kinematics": table | {"hash": hash_of(table)}}, sort_keys=False)
     return Export.of(
         HEADER + text,
+        *stranger(job),
         "the hash is of these numbers and is not the controller's checksum: the driver will warn "
         "that the two differ",
+    )
+
+
+def stranger(job: Job) -> tuple[str, ...]:
+    """A notice where the axes are not those of a Universal Robots arm: 2, 3 and 4 are parallel."""
+    alpha = job.robot.mdh[:, 3]
+    parallel, square = np.sin(alpha[[1, 2]]), np.cos(alpha[[0, 3, 4]])
+    if max(np.abs(parallel).max(), np.abs(square).max()) < ALIKE:
+        return ()
+    return (
+        f"{job.robot.name} has not the axes of a Universal Robots arm, and only their driver and "
+        "ur_description read this file; for others use urdf or ros-yaml",
     )
 
 

@@ -13,9 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minimax_cal.correcting.programs.krl_moves import LOOK, ORIGINS, WORD, motions, used
-from minimax_cal.correcting.programs.points import Number, Point, Text, blanked, checked, posed
+from minimax_cal.correcting.programs.points import Number, Point, Text, checked, posed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import blanked
 
 __all__ = ["ORIGINS", "used"]  # of the language, beside what stands here
 ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')

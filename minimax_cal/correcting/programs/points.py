@@ -114,11 +114,6 @@ def check_unmarked(program: Text) -> None:
         )
 
 
-def blanked(text: str, pattern: re.Pattern[str]) -> str:
-    """Text with what matches turned into spaces; line ends stay."""
-    return pattern.sub(lambda found: re.sub(r"[^\r\n]", " ", found[0]), text)
-
-
 def checked(numbers: Sequence[Number], where: str) -> None:
     """Raise DataError for coordinates that no arm reaches."""
     for number in numbers:

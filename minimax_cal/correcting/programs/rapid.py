@@ -17,7 +17,6 @@ from minimax_cal.correcting.programs.points import (
     Number,
     Point,
     Text,
-    blanked,
     checked,
     of_quaternion,
     posed,
@@ -25,8 +24,9 @@ from minimax_cal.correcting.programs.points import (
 from minimax_cal.correcting.programs.rapid_moves import moves
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import blanked
+from minimax_cal.measuring.importers.rapid import ASIDE
 
-ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 DECLARED = re.compile(
     r"\b(robtarget|jointtarget)\s+(\w{1,32})\s*(?:\{[^}]{0,40}\}\s*)?:=\s*", re.IGNORECASE
 )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.checks import FEW, POOR_FIT
+from minimax_cal.fitting.checks import EXPLAINED, FEW, POOR_FIT
 from minimax_cal.fitting.claims import GROSS, LEAST_FLOOR
 from minimax_cal.fitting.identify import plenty_of_poses
 from minimax_cal.fitting.instruments.data import RelativeData
@@ -27,7 +27,6 @@ from minimax_cal.measuring.checks import suspicions
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
-MENDED = 0.04  # of the mean square: what explains the misses that well is their cause
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
 RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
 
@@ -50,7 +49,7 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
         trials.append((mean_square(*at) / size(*at), mean_square(*at), text))
     least = min(share for share, _, _ in trials)
     share, square, text = next(trial for trial in trials if trial[0] <= 2.0 * least)
-    if np.sqrt(square) <= 4.0 * limit and share < MENDED * given / whole:
+    if np.sqrt(square) <= 4.0 * limit and share < EXPLAINED * given / whole:
         raise DataError(
             f"{data.at.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(square):.3g} mm, not {1e3 * np.sqrt(given):.3g} mm)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -39,6 +40,7 @@ IMPORTERS = {
     "smr_files": "rows",
     "columns": "rows",
 }
+MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
 LAYOUTS = ("", "pose", "target")
 DATES = ("dmy", "mdy", "ymd")
 
@@ -101,10 +103,12 @@ def units_of(texts: Sequence[str]) -> dict[str, str]:
         kinds: Sequence[str] = (*ANGLES, *LENGTHS) if name.startswith("q") else tuple(LENGTHS)
         kinds = TEMPERATURES if name == "temperature" else kinds
         kinds = (*TIMES, *DATES) if name == "time" else kinds
-        if not name or unit not in kinds:
-            ways = [f"{name}={kind}" for kind in kinds] if name else ["q=deg", "smr=mm", "time=dmy"]
+        known = bool(MEASURED.fullmatch(name))
+        if not known or unit not in kinds:
+            ways = [f"{name}={k}" for k in kinds] if known else ["q=deg", "smr=mm", "time=dmy"]
             raise OptionError(f"units={part!r}: write {', '.join(ways[:-1])} or {ways[-1]}")
-        found[name] = unit
+        if found.setdefault(name, unit) != unit:
+            raise OptionError(f"units={part!r}: {name} is in {found[name]} already; give one unit")
     return found
 
 
@@ -164,6 +168,7 @@ def import_files(
         raise OptionError("name a file to import")
     told = told_by(columns, units, layout, decimal)
     readings = [read_any(path, told) for path in files]
+    check_twice(readings)
     points = [reading for reading in readings if reading.smrs]
     turns = [reading for reading in readings if reading.joints]
     if joints is not None:
@@ -192,6 +197,16 @@ def import_files(
         f"{other.sheet.path}: holds points without joints, but {held.sheet.path} holds both; "
         "import it alone"
     )
+
+
+def check_twice(readings: Sequence[Reading]) -> None:
+    """Raise DataError where two files of points are one: they would be two targets in one place."""
+    texts: dict[str, Path] = {}
+    for path, text in ((r.sheet.path, r.sheet.text) for r in readings if r.smrs):
+        first = texts.setdefault(text, path)
+        if first is not path:
+            what = "is given twice" if first == path else f"holds the same points as {first}"
+            raise DataError(f"{path}: {what}; give each target's file once")
 
 
 def told_by(

@@ -98,5 +98,7 @@ def by_place(sheet: Sheet, tokens: list[str]) -> dict[int, tuple[str, str]]:
                 f"columns=: {token}: {what} takes {len(whole)} columns, {place} are "
                 f"{last - first + 1}"
             )
+        if twice := found.keys() & set(range(first, last + 1)):
+            raise OptionError(f"columns=: {token}: column {min(twice) + 1} is placed twice")
         found |= dict(zip(range(first, last + 1), whole, strict=True))
     return found

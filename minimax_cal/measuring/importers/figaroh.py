@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import re
 
-from minimax_cal.measuring.importers.reading import Reading, Told, named_reading, plain, stems
+from minimax_cal.measuring.importers.reading import (
+    Reading,
+    Told,
+    along_arm,
+    named_reading,
+    plain,
+    stems,
+)
 from minimax_cal.measuring.importers.sheet import Sheet
 
 TITLE = "FIGAROH CSV"
@@ -20,12 +27,16 @@ def fits(sheet: Sheet, joints: bool) -> bool:
 
 
 def read(sheet: Sheet, told: Told) -> Reading:
-    """One row a pose; every column that is neither marker nor known is a joint, in file order."""
-    names = [
-        name
-        for name in stems(sheet)
-        if not (MARKER.fullmatch(name) or TURNED.fullmatch(name) or plain(name))
-    ]
+    """One row a pose; every column that is neither marker nor known is a joint, in file order, or
+    along the arm where the names tell.
+    """
+    names = along_arm(
+        [
+            name
+            for name in stems(sheet)
+            if not (MARKER.fullmatch(name) or TURNED.fullmatch(name) or plain(name))
+        ]
+    )
 
     def meaning(stem: str) -> str:
         if found := MARKER.fullmatch(stem):

@@ -8,6 +8,7 @@ from minimax_cal.measuring.importers.reading import (
     Reading,
     Told,
     checked,
+    joint_names,
     named_reading,
     plain,
     stems,
@@ -32,7 +33,7 @@ def fits(sheet: Sheet, joints: bool) -> bool:
 def read(sheet: Sheet, told: Told) -> Reading:
     """One row a pose.  A first column of words is the key."""
     if sheet.header:
-        named = [name for name in stems(sheet) if name.endswith("_joint")]
+        named = joint_names(sheet)
 
         def meaning(stem: str) -> str:
             if stem in named:

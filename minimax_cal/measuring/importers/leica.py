@@ -6,12 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.measuring.importers.reading import Reading, Told, named_reading, plain, stems
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.importers.reading import (
+    Column,
+    Reading,
+    Told,
+    named_reading,
+    plain,
+    stems,
+)
 from minimax_cal.measuring.importers.sheet import Sheet
 
 TITLE = "Leica tracker CSV"
-SIGNS = {"u(95)", "time stamp", "image rms", "otg applied", "target"}
-YES = {"true", "yes", "1", "x"}
+MARKS = ("delete", "deleted", "gel\N{LATIN SMALL LETTER O WITH DIAERESIS}scht")
+SIGNS = {"u(95)", "time stamp", "image rms", "otg applied", "target", *MARKS}
+YES = {"true", "yes", "1", "x", "y", "wahr", "ja", "j", "vrai", "oui", *MARKS}
+NO = {"", "false", "no", "0", "-", "n", "falsch", "nein", "faux", "non"}
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:
@@ -25,8 +36,10 @@ def read(sheet: Sheet, told: Told) -> Reading:
     reading = named_reading(
         TITLE, sheet, lambda stem: f"smr1_{stem}" if stem in ("x", "y", "z") else plain(stem)
     )
-    mark = next((c for c in reading.columns if c.name.lower() == "delete"), None)
-    deleted = np.array([mark is not None and mark.cells[i].lower() in YES for i in rows(sheet)])
+    deleted = np.zeros(len(reading.line), dtype=bool)
+    for mark in reading.columns:
+        if mark.name.lower() in MARKS:
+            deleted |= marked(reading, mark)
     if not deleted.any():
         return reading
     kept = np.flatnonzero(~deleted)
@@ -37,6 +50,13 @@ def read(sheet: Sheet, told: Told) -> Reading:
     return replace(reading, columns=columns, line=reading.line[kept], notices=(notice,))
 
 
-def rows(sheet: Sheet) -> range:
-    """Row numbers."""
-    return range(len(sheet.cells))
+def marked(reading: Reading, mark: Column) -> Array:
+    """(m,) True for points that a column says are deleted.  Raises DataError."""
+    cells = [cell.lower() for cell in mark.cells]
+    for line, cell in zip(reading.line, cells, strict=True):
+        if cell not in YES | NO:
+            raise DataError(
+                f"{reading.sheet.path}:{line}: column {mark.name}: {cell!r} does not say whether "
+                "the point is deleted; write true or false"
+            )
+    return np.array([cell in YES for cell in cells])

@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import blanked
 from minimax_cal.measuring.importers.reading import Column, Reading, Told
 from minimax_cal.measuring.importers.sheet import POINT, Sheet
 
 TITLE = "RAPID jointtargets"
+ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 DECLARED = re.compile(r"\bjointtarget\s+(\w+)", re.IGNORECASE)
 VALUES = re.compile(r"[\[{]\s*([^\[\]{}]+?)\s*[\]}]")
 ROBOT_AXES = 6
@@ -20,18 +22,19 @@ UNUSED = 9e9  # how RAPID writes an external axis that is not there
 
 def fits(sheet: Sheet, joints: bool) -> bool:
     """Whether the text declares jointtargets."""
-    return bool(DECLARED.search(sheet.text))
+    return bool(DECLARED.search(blanked(sheet.text, ASIDE)))
 
 
 def read(sheet: Sheet, told: Told) -> Reading:
     """One row a jointtarget, its name the key.  Raises DataError."""
-    found = list(DECLARED.finditer(sheet.text))
+    bare = blanked(sheet.text, ASIDE)
+    found = list(DECLARED.finditer(bare))
     names: list[str] = []
     lines: list[int] = []
     rows: list[list[str]] = []
     for here, after in zip(found, [*found[1:], None], strict=True):
-        line = sheet.text.count("\n", 0, here.start()) + 1
-        body = sheet.text[here.end() : after.start() if after else len(sheet.text)]
+        line = bare.count("\n", 0, here.start()) + 1
+        body = bare[here.end() : after.start() if after else len(bare)]
         values = VALUES.search(body.split(";")[0])
         cells = [c.strip() for c in values[1].strip(" ,").split(",")] if values else []
         where = f"{sheet.path}:{line}: jointtarget {here[1]}"

@@ -19,6 +19,8 @@ TEMPERATURES = ("C", "K", "F")
 OTHERS = ("kg", "Nm")
 ALIASES = {"°": "deg", "º": "deg", "µm": "um", "μm": "um", "inch": "in", "°C": "C", "°F": "F"}
 ALIASES |= {"degC": "C", "degF": "F", "degree": "deg", "degrees": "deg", "radians": "rad"}
+# joints along the arm, where the names tell: a ROS log may sort them by alphabet
+UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 KNOWN = {*ANGLES, *LENGTHS, *TIMES, *TEMPERATURES, *OTHERS}
 JOINT = re.compile(r"(?:q|j|a|ax|axis|joint|theta)[ _]?(\d+)", re.IGNORECASE)
 POINT_NAME = re.compile(r"smr(\d+)_([xyz])")
@@ -149,6 +151,19 @@ def split_unit(name: str) -> tuple[str, str]:
 def stems(sheet: Sheet) -> tuple[str, ...]:
     """The header's names in small letters, without units."""
     return tuple(split_unit(name)[0].lower() for name in sheet.header)
+
+
+def joint_names(sheet: Sheet) -> list[str]:
+    """The header's names that end in `_joint`, along the arm."""
+    return along_arm([name for name in stems(sheet) if name.endswith("_joint")])
+
+
+def along_arm(names: list[str]) -> list[str]:
+    """Names of joints along the arm, where they tell; else as they are."""
+    told = [[name for name in names if name.endswith(f"{joint}_joint")] for joint in UR]
+    if len(names) == len(UR) and all(len(found) == 1 for found in told):
+        return [name for (name,) in told]
+    return names
 
 
 def plain(stem: str) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.ground.files import read_raw
+from minimax_cal.ground.files import check_table, read_raw
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
@@ -94,8 +94,7 @@ def cut(sheet: Sheet, decimal: str = "") -> Sheet:
 def decoded(path: Path) -> tuple[str, str]:
     """The text and the name of its encoding."""
     raw = read_raw(path, kind=DataError)
-    if raw.startswith(b"PK\x03\x04") or raw.startswith(b"\xd0\xcf\x11\xe0"):
-        raise DataError(f"{path}: is a spreadsheet, not text; save it as CSV")
+    check_table(raw, path, kind=DataError)
     for mark, name in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if raw.startswith(mark):
             return raw.decode(name, errors="replace"), name

@@ -18,6 +18,7 @@ DAYS = {
     "ymd": ("%Y-%m-%d ", "%Y-%m-%dT", "%Y/%m/%d ", "%Y.%m.%d "),
     "": ("",),
 }
+DAY, HOUR = 86400.0, 3600.0
 START = datetime(1900, 1, 1)  # where a clock without a date starts
 COMPACT = "%Y%m%d%H%M%S"
 CELSIUS = {"C": (1.0, 0.0), "K": (1.0, -273.15), "F": (5.0 / 9.0, -160.0 / 9.0)}
@@ -50,6 +51,8 @@ def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
                 found.setdefault(tuple(since), (stamps, form.strip()))
     if len(found) == 1:
         stamps, form = next(iter(found.values()))
+        if np.nanmax(stamps) < DAY:  # a clock without a date
+            stamps = over_midnight(reading, column, stamps)
         return stamps, f"{STAMPED} {form}"
     if found:
         raise DataError(
@@ -61,6 +64,36 @@ def seconds(reading: Reading, column: Column, told: str) -> tuple[Array, str]:
             f"{reading.sheet.path}: column {column.name}: {filled[0]!r} is not a time as {told}"
         )
     return np.empty(0), "no time stamps that are understood; if seconds, add units='time=s'"
+
+
+def over_midnight(reading: Reading, column: Column, clock: Array) -> Array:
+    """Seconds of a clock without a date, on over midnight.  Raises DataError for half a clock.
+
+    Rows may be in any order.  Where half a day holds no time, and rows fall across it, the early
+    times are of the next day; else those after a single fall, if they end before the first began.
+    """
+    rows = np.flatnonzero(np.isfinite(clock))
+    time = clock[rows]
+    fall = 1 + np.flatnonzero(np.diff(time) < -0.5 * DAY)
+    halves = (time[:-1] // HOUR == 12.0) & (time[1:] // HOUR == 1.0)
+    if (hour := time // HOUR).min() >= 1.0 and hour.max() <= 12.0 and halves.any():
+        at = 1 + int(np.argmax(halves))
+        raise DataError(
+            f"{reading.sheet.path}:{reading.line[rows[at]]}: column {column.name}: "
+            f"{column.cells[rows[at]]} follows {column.cells[rows[at - 1]]}: a clock of twelve "
+            "hours? write AM or PM, or the date"
+        )
+    if not len(fall):
+        return clock
+    steps = np.sort(time)
+    widest = int(np.argmax(np.diff(steps)))
+    if steps[widest + 1] - steps[widest] > 0.5 * DAY:
+        return np.where(clock <= steps[widest], clock + DAY, clock)
+    if len(fall) == 1 and time[fall[0] :].max() <= time[: fall[0]].min():
+        out = clock.copy()
+        out[rows[fall[0] :]] += DAY
+        return out
+    return clock  # rows in another order than that of time: targets one after the other
 
 
 def parsed(cells: list[str], form: str) -> Array | None:

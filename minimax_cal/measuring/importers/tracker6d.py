@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from minimax_cal.measuring.importers.reading import Reading, Told, named_reading, plain, stems
+from minimax_cal.measuring.importers.reading import (
+    Reading,
+    Told,
+    joint_names,
+    named_reading,
+    plain,
+    stems,
+)
 from minimax_cal.measuring.importers.sheet import Sheet
 
 TITLE = "6D tracker log"
-# joints along the arm, where the names tell: a ROS log may sort them by alphabet
-UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:
@@ -19,9 +24,7 @@ def fits(sheet: Sheet, joints: bool) -> bool:
 
 def read(sheet: Sheet, told: Told) -> Reading:
     """One row a pose; the point is the origin of the measured pose."""
-    names = [name for name in stems(sheet) if name.endswith("_joint")]
-    if {name.removesuffix("_joint") for name in names} == set(UR):
-        names = [f"{name}_joint" for name in UR]
+    names = joint_names(sheet)
 
     def meaning(stem: str) -> str:
         if stem in names:
