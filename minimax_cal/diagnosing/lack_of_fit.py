@@ -82,7 +82,6 @@ def probes(scene: Scene) -> Iterator[Probe]:
     if course:
         eye = np.broadcast_to(np.eye(3)[:, None, :, None], (3, *scene.points.shape))
         twist = [eye, cross(eye, np.broadcast_to(scene.points, eye.shape))]
-        yield Probe("the base at a steady pace", np.concatenate(twist), np.array(course[:1]))
         yield Probe("the base with time", np.concatenate(twist), np.array(course))
         yield Probe("the scale with time", scene.points[None], np.array(course))
         yield Probe("the joints with time", scene.jacobian, np.array(course))
