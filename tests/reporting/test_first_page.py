@@ -32,9 +32,14 @@ def rendered(wording: Wording, *paths: Path) -> Seen:
 
 
 def rows(seen: Seen) -> dict[str, list[str]]:
-    """The table of the result by its first cells."""
-    return {row[0]: row[1:] for title, found in seen.tables.items() if title.startswith("Model: ")
-            for row in found}  # fmt: skip
+    """The table of the result by what its first cells name, their poses before the rest."""
+    every = [row for title, found in seen.tables.items() if title.startswith("Model: ")
+             for row in found]  # fmt: skip
+    names = [row[0].partition(" (") for row in every]
+    return {
+        name: [poses.removesuffix(")"), *row[1:]]
+        for (name, _, poses), row in zip(names, every, strict=True)
+    }
 
 
 def test_requirement_result_and_verdict(

@@ -184,12 +184,13 @@ def result_table(sources: Sources, found: Signed) -> Table:
             bound = claim.bound(kind)
             one = named.get((bound, kind))
             asked = one.limit.size_mm if one else math.nan
-            rows.append((f"{KINDS[kind]}, {title}", claim.sets[i], claim.before[i], bound.value,
-                         bound.high, asked, one.verdict if one else ""))  # fmt: skip
+            which = f" ({claim.sets[i]})" if claim.sets[i] else ""
+            rows.append((f"{KINDS[kind]}, {title}{which}", claim.before[i], bound.value, bound.high,
+                         asked, one.verdict if one else ""))  # fmt: skip
     rows += iso_rows(sources.fit) if sources.fit else ()
-    header = ("error of position", "poses", "before mm", "result mm", "95 % limit mm",
+    header = ("error of position (on poses)", "before mm", "result mm", "95 % limit mm",
               "required mm", "verdict")  # fmt: skip
-    return Table(f"Model: {found.model}", header, tuple(rows), ("", "", *[".3f"] * 3, ".3g", ""))
+    return Table(f"Model: {found.model}", header, tuple(rows), ("", *[".3f"] * 3, ".3g", ""))
 
 
 def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
@@ -204,7 +205,7 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
     if not all(np.isfinite(size).any() for size in sizes):
         return []
     return [
-        (f"AP of ISO 9283, {name}", f"{np.isfinite(sizes[1]).sum()} held out",
+        (f"AP of ISO 9283, {name} ({np.isfinite(sizes[1]).sum()} held out)",
          *(float(take(size)) for size in sizes), math.nan, math.nan, "")
         for name, take in (("mean", np.nanmean), ("largest", np.nanmax))
     ]  # fmt: skip
