@@ -47,6 +47,8 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
     for text, mended in slips(robot, data):
         at = started(robot, mended, options)
         trials.append((mean_square(*at) / size(*at), mean_square(*at), text))
+        if mended.length is not data.length and np.sqrt(trials[-1][1]) <= limit:
+            break  # a unit that fits leaves nothing to ask of joints
     least = min(share for share, _, _ in trials)
     share, square, text = next(trial for trial in trials if trial[0] <= 2.0 * least)
     if np.sqrt(square) <= 4.0 * limit and share < EXPLAINED * given / whole:
