@@ -62,6 +62,8 @@ VISIBLE = 50.0 * (1.0 - 1e-6)  # lambda from which an effect must be seen
 SEPARABLE = 25.0  # lambda (1 - rho^2) from which it must be told from its nearest rival
 CLOSE = 1.06  # held-out RMS over the oracle's that is good enough
 MOST_MISSES, MISSES_EACH = 40, 8
+MAP = "joint_error_map"  # that a joint errs by its angle, which is true of these laws:
+OF_ANGLE = ("gear_error", "gear_ripple", "encoder_gain")
 NO_ANSWER = ("none", "unknown", "not_repeatable", "error")
 
 
@@ -383,6 +385,12 @@ def right(row: Row) -> bool:
     return row["match"] in ("exact", "broad")
 
 
+def false_for_sure(row: Row) -> bool:
+    """Named for sure, and not merely that the true cause's joint errs by its angle."""
+    own = [[MAP, place] for effect, place in row["truth"] if effect in OF_ANGLE]
+    return bool(row["sure"]) and any(name not in own for name in row["names"])
+
+
 def close(row: Row) -> bool:
     """Held-out RMS about that of the oracle."""
     return bool(row["final_mm"] <= CLOSE * row["oracle_mm"])
@@ -428,6 +436,8 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         Criterion("  all of lambda >= 50: unknown", "", outside, unknown),
         Criterion("true effect deleted: named for sure", "sure without the truth", of("deleted"),
                   lambda r: r["sure"], 0.15, False),
+        Criterion("  named for sure, and falsely", "", of("deleted"), false_for_sure, 0.15,
+                  False),
         Criterion("  of these, lambda (1 - rho^2) >= 25 of the best other: named for sure", "",
                   [r for r in of("deleted") if r["telling"] >= SEPARABLE], lambda r: r["sure"]),
         Criterion("  unknown", "", of("deleted"), unknown),

@@ -52,6 +52,7 @@ from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import FEW
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.options import Progress, silent
+from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
@@ -195,6 +196,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     told = (*asked.data.notices, *notices, *clean.remarks)
     if late:
         told = (*told, f"points that stand out beside all that was found: {listed(late)}")
+    every = ladder.last.cell.placed(clean.given)
+    told = (*told, *contradictions(every, ladder.last.cell.error(every)))
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,

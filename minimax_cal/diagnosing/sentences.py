@@ -115,7 +115,7 @@ def shrunk(found: Diagnosis) -> str:
     )
     if len(found.ladder) < 3:
         return f"{text}."
-    text += f", whole model {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm)"
+    text += f", whole model {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm{without_far(found)})"
     if not math.isfinite(found.closed):
         return f"{text}."
     low, high = (100.0 * end for end in found.closed_ci)
@@ -124,6 +124,14 @@ def shrunk(found: Diagnosis) -> str:
     if not (found.floor.certain or share == "100 %"):  # told as if noise alone left nothing
         share = f"at least {share}"
     return f"{text}; {share} of the gap to the noise is closed{ends}."
+
+
+def without_far(found: Diagnosis) -> str:
+    """What the whole model does where no held-out point stands out; empty where none does."""
+    every, sound = found.ladder[-1].holdout, found.ladder[-1].trusted
+    count = sum(every.counts) - sum(sound.counts)
+    points = "the point that stands" if count == 1 else f"{count} points that stand"
+    return f"; {sound.rms_mm:.3f} mm without {points} out" if count and sum(sound.counts) else ""
 
 
 def remaining(found: Diagnosis) -> str:

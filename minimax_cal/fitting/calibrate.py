@@ -47,6 +47,7 @@ from minimax_cal.fitting.options import (
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.same_arm import wild
+from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps, stationed, unplaced
@@ -266,6 +267,7 @@ def judged(
         *solved.notices,
         *remarks(options, poses),
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
+        *contradictions(data, after),
         *(fault.text for fault in faults.session_jumps(data, after)),
         *alarming,
         *bad_rows(suspects, data.source),

@@ -151,6 +151,15 @@ def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
     assert not any(text.startswith("Of what remains") for text in told.reasons)
 
 
+def test_what_stands_out_is_left_out_beside(found: Diagnosis) -> None:
+    *before, last = found.ladder
+    assert "without" not in found.headline()
+    for count, words in ((19, "the point that stands out"), (17, "3 points that stand out")):
+        sound = replace(scores(0.11), counts=(count,))
+        told = replace(found, ladder=(*before, replace(last, trusted=sound)))
+        assert f"(largest 0.460 mm; 0.110 mm without {words})" in told.headline()
+
+
 def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
     rivals = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
               Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "

@@ -363,6 +363,9 @@ def test_criteria_and_tables_of_made_up_rows() -> None:
         row("single", answer("one_of", GAIN, also=(J2,)), J2, oracle_mm=0.01, known_mm=0.04),
         row("single", answer("unknown"), GAIN, telling=3.0, rho2=0.97),
         row("deleted", answer("named", GAIN), J2),
+        row("deleted", answer("named", ("joint_error_map", "J2")), J2),  # which is true
+        row("deleted", answer("named", ("joint_error_map", "J3")), J2),
+        row("deleted", answer("unknown"), J2),
         row("outside", answer("unknown"), ("outside_sum", "J2")),
         row("pair", answer("named", J2, GAIN), GAIN, J2),
     ]
@@ -373,7 +376,8 @@ def test_criteria_and_tables_of_made_up_rows() -> None:
     assert found["no effect: something named"][6] == "MISSED"
     assert_allclose(found["one effect, lambda >= 50: truth in the set of the first"][2], 200 / 3)
     assert found["first name right where lambda (1 - rho^2) >= 25"][1:3] == (2, 50.0)
-    assert found["true effect deleted: named for sure"][2] == 100.0
+    assert found["true effect deleted: named for sure"][2] == 75.0
+    assert found["named for sure, and falsely"][2] == 50.0
     assert found["outside the library, lambda (1 - rho^2) >= 50: unknown"][6] == "met"
     assert found["two effects exactly right, each lambda (1 - rho^2) >= 25"][2] == 100.0
     assert found["one effect, lambda >= 50: mean size of the set"][2] == 1.5
