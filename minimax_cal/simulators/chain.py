@@ -26,6 +26,7 @@ ROBOT = "minimax_cal_robot"  # the text under which a file of ours holds its rob
 DRIVES_TENDON = 3  # mjTRN_TENDON
 SAME_ROBOT = 1e-6  # a file's own robot may differ from its bodies by no more [m, rad]
 Bodies = Sequence[int]
+SHORTEST = 1e-5  # timestep with which an arm comes to rest in seconds [s]
 LOG = logging.getLogger("minimax_cal")
 
 
@@ -78,6 +79,12 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
 
     tip: its last body.  unknown: whether its masses are assumed.  Raises RobotError.
     """
+    step = float(model.opt.timestep)
+    if step < SHORTEST:
+        raise RobotError(
+            f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
+            f'<option timestep="..."> of {SHORTEST:g} s or more'
+        )
     joints = joints_of(model, count, source, tip)
     seen = as_urdf(model, joints, source)
     down = np.array(model.opt.gravity)

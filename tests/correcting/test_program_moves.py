@@ -105,6 +105,18 @@ def test_other_tools_and_work_objects_are_refused(
         opened(tmp_path / "a.mod", weld(target, *moves))
 
 
+@pytest.mark.parametrize(
+    "displaced", ["PDispSet frame1;", "  PDispOn\\Rot, p1, tool0;", "pdispon p1,tool0;"]
+)
+def test_displaced_points_are_refused(displaced: str, target: str, tmp_path: Path) -> None:
+    """Unless the words are in a comment, or end a displacement."""
+    move = "MoveL p1,v1,fine,tool0;"
+    name = displaced.strip().partition(",")[0].split()[0].split("\\")[0]
+    with pytest.raises(mc.CalibrationError, match=rf"a\.mod:6: {name} displaces the points"):
+        opened(tmp_path / "a.mod", weld(target, move, displaced, move))
+    assert opened(tmp_path / "a.mod", weld(target, "! " + displaced, "PDispOff;", move)).points
+
+
 def test_numbers_are_no_two_tools(target: str, tmp_path: Path) -> None:
     text = weld(target, "MoveL p1,v1,z1,tA;", "MoveAbsJ home,v1,z1,tool0;", "SpotL p1,v1,g,s,tB;")
     with pytest.raises(mc.CalibrationError, match=r"a\.mod:7: moves with tB, at line 5 with tA"):

@@ -97,6 +97,18 @@ def test_the_robot_of_a_model_moves_as_the_model_does(given: tuple[Path, Chain])
     assert_allclose(chain.robot.up, [0.0, 0.0, 1.0], atol=1e-12)
 
 
+@pytest.mark.parametrize("step", ["1e-6", "1e-9"])
+def test_a_timestep_that_takes_forever_is_refused(
+    given: tuple[Path, Chain], tmp_path: Path, step: str
+) -> None:
+    tree = ET.parse(given[0])
+    for option in [*tree.getroot().iter("option")] or [ET.SubElement(tree.getroot(), "option")]:
+        option.set("timestep", step)
+    tree.write(tmp_path / "slow.xml")
+    with pytest.raises(mc.RobotError, match=rf"slow\.xml: its timestep of {float(step):g} s"):
+        chain_of(read_model(tmp_path / "slow.xml").compiled(), 6, str(tmp_path / "slow.xml"))
+
+
 def test_everything_stays_but_what_was_corrected(given: tuple[Path, Chain], tmp_path: Path) -> None:
     path, chain = given
     cell = bent_cell(chain.robot, {"joint_compliance:all": [2e-6] * 5, "encoder_gain:J4": [1e-3]})

@@ -61,6 +61,11 @@ def left(program: Text) -> Iterator[int]:
             yield program.line(found.start())
 
 
+def displacements(program: Text) -> Iterator[tuple[int, str]]:
+    """Lines and names of what displaces every point after it: a base does, which is heeded."""
+    yield from ()
+
+
 def values(program: Text) -> Iterator[tuple[str, str, re.Match[str]]]:
     """Type, name and braces of what a motion may go to; no type where it stays as it is."""
     going, kinds = motions(program), declared(program)

@@ -96,6 +96,11 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
         raise DataError(f"{path}: holds no points with numbers{more}")
     if len(points) > MOST:
         raise DataError(f"{path}: holds over {MOST} points; split it")
+    for line, name in language.displacements(text):
+        raise DataError(
+            f"{path}:{line}: {name} displaces the points after it, so that nobody knows where they "
+            "are; correct programs whose points are not displaced"
+        )
     known, given = language.frames(text), {"tool": tool, "wobj": work}
     check_used(language, text, points, given)
     grip, table = (frame_of(one, known, option) for option, one in given.items())

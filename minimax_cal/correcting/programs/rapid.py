@@ -21,7 +21,7 @@ from minimax_cal.correcting.programs.points import (
     of_quaternion,
     posed,
 )
-from minimax_cal.correcting.programs.rapid_moves import moves
+from minimax_cal.correcting.programs.rapid_moves import displaced, moves
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.words import blanked
@@ -81,6 +81,11 @@ def points(program: Text) -> Iterator[Point]:
 def left(program: Text) -> Iterator[int]:
     """Lines of points that stay as they are though they hold numbers: none."""
     yield from ()
+
+
+def displacements(program: Text) -> Iterator[tuple[int, str]]:
+    """Lines and names of what displaces every point after it."""
+    return displaced(program)
 
 
 def rows(program: Text, at: int) -> Iterator[tuple[int, int]]:

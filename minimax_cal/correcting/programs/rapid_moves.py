@@ -25,6 +25,7 @@ CALL = re.compile(
     r"UNDO|VAR|WHILE)\b)([A-Za-z]\w{0,31})(?=[\s\\])(?!\s*(?:\(|:=))",
     re.IGNORECASE | re.MULTILINE,
 )
+DISPLACED = re.compile(r"^[^\S\r\n]*(PDisp(?:On|Set))(?=[\s\\])", re.IGNORECASE | re.MULTILINE)
 SIGN = re.compile(r"[\[\](){},\\]")
 PLACE = re.compile(r"(?:(?:Offs|RelTool)\s*\(\s*(\w+)|(\w+)\s*(?:\{[^}]*\}\s*)?\Z)", re.IGNORECASE)
 BRACKETS = re.compile(r"\[[^\[\]]*\]")
@@ -85,6 +86,12 @@ def moves(program: Text) -> Iterator[Move]:
             for word in (tool, work)
         )
         yield Move(found[1], start, (found.end(), stop), tool, work)
+
+
+def displaced(program: Text) -> Iterator[tuple[int, str]]:
+    """Lines and names of instructions that displace every point after them."""
+    for found in DISPLACED.finditer(program.bare):
+        yield program.line(found.start(1)), found[1]
 
 
 def parts(body: str) -> Iterator[tuple[str, str]]:
