@@ -23,6 +23,7 @@ from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import METHODS, Limits
 
 ENOUGH = 60  # poses that tell one start from another
+SCREENED = Limits(step=1e-6)  # tells one start from another; the best is refined
 LINEAR_RANK = 1e-6  # relative singular value below which the linear start says nothing
 SPREAD = (0.05, 0.2)  # where else the target may be, from the last frame, per metre of reach
 
@@ -51,7 +52,9 @@ def wire_start(robot: Robot, q: Array, wires: Wires, active: Array) -> State:
         own,
     )
     few = thinned(robot, q, wires)
-    screened = least_squares.solve(Squares(few, free), starts, count, float(few.points))
+    screened = least_squares.solve(
+        Squares(few, free), starts, count, float(few.points), limits=SCREENED, trace=False
+    )
     cost = np.where(np.isfinite(screened.cost), screened.cost, np.inf)
     return refined(wires, free, screened.x.take(np.array(int(cost.argmin()))))
 
