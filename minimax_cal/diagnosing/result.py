@@ -42,6 +42,7 @@ FAULTS = {
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
 }
+OF_TARGETS = ("outliers", "swapped_rows", "target_reseat")  # their whole are all targets
 PEOPLES = {  # how people read a unit of the file
     "rad": (1e3, "mrad"),
     "rad/(N m)": (1e3, "mrad/(N m)"),
@@ -67,6 +68,11 @@ class Alternative:
     power: float
     loss: float
     separate_with: str = ""
+
+    @property
+    def at(self) -> str:
+        """Where, in words."""
+        return in_words(self.place, self.effect)
 
     @property
     def helps(self) -> bool:
@@ -142,7 +148,7 @@ class Finding:
     @property
     def at(self) -> str:
         """Where, in words."""
-        return in_words(self.term.place)
+        return in_words(self.term.place, self.term.effect)
 
     @property
     def lines(self) -> str:
@@ -481,10 +487,10 @@ class Diagnosis:
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
 
 
-def in_words(place: str) -> str:
-    """A place, as at joint 2."""
+def in_words(place: str, effect: str = "") -> str:
+    """A place, as at joint 2.  effect: what is there, which may be no part of the arm."""
     if place == "all":
-        return "of the whole arm"
+        return "of the targets" if effect in OF_TARGETS else "of the whole arm"
     kind = {"J": "joint", "L": "link"}.get(place[:1]) if place[1:].isdigit() else None
     return f"at {kind} {place[1:]}" if kind else f"at {place}"
 

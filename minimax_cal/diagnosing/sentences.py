@@ -81,7 +81,7 @@ def listed(title: str, findings: Sequence[Finding], *, rivals: bool = False) -> 
         why = f" ({same[0].cause})" if rivals else ""
         parts.append(f"{effect} {together([f.at for f in same])}{why}{lines_of(same[0])}")
         for finding in same if rivals else ():
-            others = {f"{a.effect} {in_words(a.place)}" for a in finding.alternatives}
+            others = {f"{a.effect} {a.at}" for a in finding.alternatives}
             where = f" {finding.at}" if len(same) > 1 else ""
             if others:
                 parts[-1] += f",{where} or else {' or '.join(sorted(others))}"
@@ -186,5 +186,5 @@ def next_measurement(causes: Sequence[Finding]) -> str:
 
     text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
     named = " and ".join(dict.fromkeys(f"{f.term.effect} {f.at}" for f, _ in pairs))
-    others = " and ".join(dict.fromkeys(f"{a.effect} {in_words(a.place)}" for _, a in pairs))
+    others = " and ".join(dict.fromkeys(f"{a.effect} {a.at}" for _, a in pairs))
     return f"Next measurement: {text}, to tell {named} from {others}."

@@ -143,6 +143,12 @@ def test_places_in_words(place: str, words: str) -> None:
     assert in_words(place) == words
 
 
+def test_all_targets_are_not_the_whole_arm() -> None:
+    assert in_words("all", "outliers") == in_words("all", "target_reseat") == "of the targets"
+    assert in_words("all", "joint_compliance") == "of the whole arm"
+    assert in_words("smr1", "outliers") == "at smr1"
+
+
 def test_results_are_themselves_and_stay_so(made: Diagnosis) -> None:
     """Their arrays would not compare."""
     other = Alternative("gear_error", "J2", 0.9, 12.0, 3.0)
