@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,21 @@ def test_effects_on_targets_are_drawn_along_their_motion(
         assert_allclose(np.median(law[curve.x > 0.62]), late, rtol=0.1)
     diagnosis.save_diagnosis(diagnosed(case), tmp_path / "gap.png")
     assert (tmp_path / "gap.png").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize("rungs", [2, 12, 30])
+def test_no_rung_touches_another(rungs: int) -> None:
+    """In a quarter of the picture that `save_diagnosis` draws, four ninths of its height."""
+    found = diagnosed("backlash")
+    more = [replace(found.ladder[-1], name=f"+ gear_ripple J{i}") for i in range(rungs)]
+    figure = new_figure(6.25, 10.0 * 4.0 / 9.0)
+    axes = figure.subplots()
+    diagnosis.draw_ladder(axes, replace(found, ladder=(*found.ladder[:2], *more)))
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in axes.get_yticklabels()]
+    assert len(boxes) == rungs + 2
+    assert all(upper.y0 > lower.y1 for upper, lower in pairwise(boxes))
+    assert boxes[0].height > 5.0  # and can be read
 
 
 def test_errors_are_those_of_the_ladder() -> None:

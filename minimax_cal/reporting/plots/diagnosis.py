@@ -23,6 +23,7 @@ from minimax_cal.reporting.plots.figures import (
     scale_bar,
 )
 
+LETTERS, LADDER = 10.0, 200.0  # size of letters, and of all rungs' together: none touches another
 COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
 
 
@@ -51,10 +52,11 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
         plain_ticks(axes.xaxis, numbers)
     else:
         axes.set_xlim(left=0.0)
-    axes.set_yticks(at, [textwrap.fill(step.name, 24) for step in steps])
+    letters = min(LETTERS, LADDER / len(steps))
+    axes.set_yticks(at, [textwrap.fill(step.name, 24) for step in steps], fontsize=letters)
     axes.set_ylim(len(steps) - 0.5, -0.5)
     right = axes.secondary_yaxis("right")
-    right.set_yticks(at, [f"{value:.3f}" for value in held])
+    right.set_yticks(at, [f"{value:.3f}" for value in held], fontsize=letters)
     right.tick_params(length=0)
     axes.set_xlabel("error (mm); on the right: held-out RMS")
     axes.grid(visible=True, axis="x", alpha=0.3)
