@@ -42,7 +42,7 @@ FAULTS = {
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
 }
-OF_TARGETS = ("outliers", "swapped_rows", "target_reseat")  # their whole are all targets
+FAULTS_OF_TARGETS = ("outliers", "swapped_rows")  # all of their place are the targets
 PEOPLES = {  # how people read a unit of the file
     "rad": (1e3, "mrad"),
     "rad/(N m)": (1e3, "mrad/(N m)"),
@@ -490,7 +490,8 @@ class Diagnosis:
 def in_words(place: str, effect: str = "") -> str:
     """A place, as at joint 2.  effect: what is there, which may be no part of the arm."""
     if place == "all":
-        return "of the targets" if effect in OF_TARGETS else "of the whole arm"
+        seated = effect in EFFECTS and EFFECTS[effect].moves == "target"
+        return "of the targets" if seated or effect in FAULTS_OF_TARGETS else "of the whole arm"
     kind = {"J": "joint", "L": "link"}.get(place[:1]) if place[1:].isdigit() else None
     return f"at {kind} {place[1:]}" if kind else f"at {place}"
 
