@@ -92,9 +92,22 @@ class Joint:
         group = clusters(self.study.data)
         return uncertainty_of(self.estimator, self.state, group, units)
 
+    @cached_property
+    def needs(self) -> dict[bytes, bool]:
+        """Of folds that were asked for, whether the fit needs them."""
+        return {}
+
+    @cached_property
+    def lefts(self) -> dict[bytes, Array]:
+        """Of folds that were asked for, what `left_at` told."""
+        return {}
+
     def spared(self, folds: Sequence[Array]) -> list[Array]:
         """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
-        return [fold for fold in folds if not needed(self.poses, fold)]
+        for fold in folds:
+            if fold.tobytes() not in self.needs:
+                self.needs[fold.tobytes()] = needed(self.poses, fold)
+        return [fold for fold in folds if not self.needs[fold.tobytes()]]
 
     def cross_validated(self, folds: Sequence[Array]) -> float:
         """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
@@ -123,9 +136,12 @@ class Joint:
 
     def left_at(self, fold: Array) -> Array:
         """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
-        step = step_without(self.poses, fold)
-        told = np.einsum("mrp,p->mr", self.poses.jacobian[fold], step)
-        return np.asarray(self.poses.error[fold] - told)
+        mark = fold.tobytes()
+        if mark not in self.lefts:
+            step = step_without(self.poses, fold)
+            told = np.einsum("mrp,p->mr", self.poses.jacobian[fold], step)
+            self.lefts[mark] = np.asarray(self.poses.error[fold] - told)
+        return self.lefts[mark]
 
 
 def joint(study: Study, terms: Sequence[Term]) -> Joint:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 
 from minimax_cal.diagnosing.gap import folds
@@ -284,7 +284,8 @@ class Beside:
         size = np.linalg.norm(columns.reshape(-1, columns.shape[-1]), axis=0)
         size = np.where(size > 0.0, size, 1.0)  # of what no pose shows 0 is left
         bare = Beside(parts, y, columns / size, RIDGE + prior / size**2, y)
-        return replace(bare, error=bare.cleared(y[..., None])[0][..., 0])
+        column = y[..., None]
+        return replace(bare, error=bare.cleared(column, bare.told(column)[0])[..., 0])
 
     @property
     def variance(self) -> float:
@@ -310,32 +311,38 @@ class Beside:
         return float((self.error**2).sum())
 
     @cached_property
-    def grams(self) -> Array:
-        """(f, p, p) products of the columns at all poses but those of each part, and the ridge."""
-        return np.asarray(self.without(self.columns, self.columns) + np.diag(self.ridge))
+    def factors(self) -> list[tuple[Array, bool]]:
+        """(f,) of products of the columns at all poses but a part's, and the ridge."""
+        grams = self.without(self.columns, self.columns) + np.diag(self.ridge)
+        return [cho_factor(gram, check_finite=False) for gram in grams]
 
     def without(self, one: Array, other: Array) -> Array:
         """(f, c, d) products of columns (m, r, c) and (m, r, d) at all poses but a part's."""
         own = np.array([product_of(one[part], other[part]) for part in self.parts])
         return np.asarray(product_of(one, other) - own)
 
-    def cleared(self, columns: Array) -> tuple[Array, Array]:
-        """What this fit does not predict of columns (m, r, c), each pose without its part.
+    def told(self, columns: Array) -> tuple[Array, Array]:
+        """Values (f, p, c) of this fit's columns for others (m, r, c), without each part.
 
         And the products (f, p, c) of its own with them.
         """
         cross = self.without(self.columns, columns)
+        pairs = zip(self.factors, cross, strict=True)
+        return np.array([cho_solve(one, pull, check_finite=False) for one, pull in pairs]), cross
+
+    def cleared(self, columns: Array, values: Array) -> Array:
+        """What values of this fit, as `told`, leave of columns (m, r, c), each by its part's."""
         out = np.zeros_like(columns)
-        for part, value in zip(self.parts, np.linalg.solve(self.grams, cross), strict=True):
+        for part, value in zip(self.parts, values, strict=True):
             out[part] = columns[part] - self.columns[part] @ value
-        return out, cross
+        return out
 
     def with_block(self, block: Block) -> Beside:
         """The fit with a block besides, by that prior of it which meets the parts best."""
         both = np.concatenate([block.columns, self.y[..., None]], axis=-1)
-        clear, cross = self.cleared(both)
-        fall = np.swapaxes(cross, 1, 2) @ np.linalg.solve(self.grams, cross)
-        left = (self.without(both, both) - fall)[:, None]
+        values, cross = self.told(both)
+        clear = self.cleared(both, values)
+        left = (self.without(both, both) - np.swapaxes(cross, 1, 2) @ values)[:, None]
         ridge = self.variance / block.priors**2
         eye = np.eye(ridge.shape[1])
         value = np.linalg.solve(left[..., :-1, :-1] + ridge[:, :, None] * eye, left[..., :-1, -1:])

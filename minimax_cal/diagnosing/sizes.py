@@ -56,9 +56,16 @@ def weights_of(poses: Poses, values: Array, parts: Sequence[slice]) -> Array:
     variance = least / max(3 * int(np.count_nonzero(poses.seen)) - len(gram), 1)
     for part in parts:
         weight[part] = variance / square  # as if each might explain all that is left
+    free = np.isin(np.arange(len(weight)), np.concatenate([np.r_[part] for part in parts]))
+    left += RIDGE * np.eye(len(left))
+    # the others, alone or with priors of their own, are projected out once
+    across = solve_normal(left[np.ix_(~free, ~free)], left[np.ix_(~free, free)])
+    told = told[free] - across.T @ told[~free]
+    left = left[np.ix_(free, free)] - left[np.ix_(free, ~free)] @ across
     for _ in range(ROUNDS):
-        covariance = np.linalg.inv(left + np.diag(weight) + RIDGE * np.eye(len(left)))
-        second = (covariance @ told) ** 2 + variance * np.diag(covariance)
+        covariance = np.linalg.inv(left + np.diag(weight[free]))
+        second = np.zeros(len(weight))
+        second[free] = (covariance @ told) ** 2 + variance * np.diag(covariance)
         for part in parts:
             weight[part] = variance / np.mean(second[part])
     return np.asarray(weight * size**2)
