@@ -15,6 +15,7 @@ CONSTANTS = (0.15, 0.5, np.inf)  # of the session; infinite is a straight line
 FINER = np.array([0.5, 0.65, 0.8, 0.9, 1.1, 1.25, 1.5, 2.0])
 TWO = {"fast": 0.15, "slow": np.inf}  # two constants: one settles fast, the other slowly
 ROOM = 20.0  # temperature at which lengths are what they are called [C]
+NEARBY = 24  # moments before one that was chosen, and after it
 STEPS = 12  # moments at which a nest may have moved
 
 
@@ -52,8 +53,10 @@ def finer(scene: Scene, choice: Choice) -> Sequence[Choice]:
         clock = np.sort(scene.column("clock"))
         at = int(np.searchsorted(clock, choice["since"]))
         step = max(1, len(clock) // STEPS)
-        near = clock[max(at - step, 3) : max(min(at + step, len(clock) - 3), 0)]
-        return tuple({**choice, "since": float(t)} for t in near)
+        away = np.unique(np.geomspace(1, step, NEARBY).astype(int))  # fine nearby, coarse afar
+        near = at + np.concatenate([-away[::-1], [0], away])
+        near = near[(near >= 3) & (near < len(clock) - 3)]
+        return tuple({**choice, "since": float(t)} for t in clock[near])
     if "fast" in choice:
         return tuple({**choice, "fast": float(fast)} for fast in choice["fast"] * FINER)
     if "constant" not in choice:
