@@ -190,7 +190,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         verdict = "not_repeatable"
     beyond = NOT_ASKED
     if not options.quick:
-        beyond = beyond_of(study, causes, judges, progress)
+        beyond = beyond_of(study, causes, judges, options.holdout_by, progress)
     wrong = against(robot, floor, steps[-1])
     alarming = (*doubts(robot, study.fit, study.nominal.error(study.data)), *filter(None, [wrong]))
     told = (*asked.data.notices, *notices, *clean.remarks)

@@ -13,6 +13,7 @@ from minimax_cal.evidence.limits import MOST
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.beyond import Beyond, Errors, without
 from minimax_cal.fitting.options import Progress
+from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
@@ -33,16 +34,21 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     return climbed(small, causes.maps.beside(named), wary=causes.wary)
 
 
-def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:
-    """Every part of the poses judges a model that was sought without it."""
+def beyond_of(
+    study: Study, causes: Causes, judges: Judges, by: str | None, progress: Progress
+) -> Beyond:
+    """Every part of the poses judges a model that was sought without it.
+
+    by: whose groups are the parts, as in `grouping.parts`.
+    """
     data = judges.everyone
-    found = parts(data)
+    found = parts(data, by)
     masks = [np.isin(study.data.line, data.line[part.rows]) for part in found]
     estimator = Estimator(
         study.model.only(study.fit.identification.active), np.ones(len(study.model.y))
     )
     errors = Errors()
-    states = without(estimator, study.fit.state, masks)
+    states = without(estimator, study.fit.state, masks, steps_of(study.data.frames))
     for number, (part, mask, state) in enumerate(zip(found, masks, states, strict=True)):
         if state is None:
             errors.miss(part.name)

@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
+from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import mended, standing_out
@@ -363,7 +364,10 @@ def spared(ladder: Ladder, judges: Judges, floor: Floor) -> float:
     part = folds(judges.train, SPARED)
     masks = [part == number for number in range(SPARED)]
     shares = []
-    fits = [without(fit.estimator, fit.state, masks) for fit in (ladder.fits[0], ladder.last)]
+    frames = steps_of(judges.train.frames)
+    fits = [
+        without(fit.estimator, fit.state, masks, frames) for fit in (ladder.fits[0], ladder.last)
+    ]
     for states in zip(*fits, strict=True):
         if states[0] is None or states[1] is None:
             continue

@@ -265,7 +265,7 @@ def step_without(poses: Poses, part: Array) -> Array:
 
 
 def without(
-    estimator: Estimator, state: State, parts: Sequence[Array], frames: int = 0
+    estimator: Estimator, state: State, parts: Sequence[Array], frames: int
 ) -> list[State | None]:
     """The fit without each of some parts, None where there is none.
 

@@ -10,17 +10,22 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from problems_fit import study_of
+from scipy.spatial.transform import Rotation
 
+import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import folds
 from minimax_cal.diagnosing.causes import Causes, causes_of
 from minimax_cal.diagnosing.folds import beyond_of, fold_of
 from minimax_cal.diagnosing.gap import Judges
-from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import parts
+from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.parameters import State
 
 
@@ -49,7 +54,7 @@ def test_every_part_is_left_out_and_judges(
         return SimpleNamespace(fits=[SimpleNamespace(cell=cell) for cell in reversed(cells)])
 
     monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, None, judges, told.append)  # type: ignore[arg-type]
+    found = beyond_of(play, None, judges, None, told.append)  # type: ignore[arg-type]
     every = judges.everyone
     left_out = parts(every)
     assert [one.where for one in found.folds] == [part.name for part in left_out]
@@ -77,13 +82,51 @@ def test_a_part_that_the_fit_needs_judges_nothing(
 
     monkeypatch.setattr(folds, "fold_of", fold)
     monkeypatch.setattr(folds, "without", some)
-    found = beyond_of(play, None, judges, silent)  # type: ignore[arg-type]
+    found = beyond_of(play, None, judges, None, silent)  # type: ignore[arg-type]
     assert [one.where for one in found.folds] == [p.name for p in parts(judges.everyone)][1:]
-    monkeypatch.setattr(folds, "parts", lambda data: ())
+    monkeypatch.setattr(folds, "parts", lambda data, by: ())
     monkeypatch.setattr(folds, "without", plain)
-    nothing = beyond_of(play, None, judges, silent)  # type: ignore[arg-type]
+    nothing = beyond_of(play, None, judges, None, silent)  # type: ignore[arg-type]
     assert nothing.folds == ()
     assert nothing.reason == "the poses are too few or too much alike"
+
+
+def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own points may not place the frame in which they judge; as `calibrate` has it."""
+    robot, made = mc.load_robot("irb2600"), mc.simulate("irb2600", 90, 2, seed=3)
+    session, y = np.repeat(["a", "b", "c"], 30), made.data.y.copy()
+    turns = Rotation.random(2, rng=np.random.default_rng(0)).as_matrix()
+    for name, turn in zip("bc", turns, strict=True):
+        y[session == name] = y[session == name] @ turn.T + 0.7
+    data = replace(made.data.with_y(y), columns={**made.data.columns, "session": session})
+    data = stationed(robot, with_history(data), np.ones(90, dtype=bool))
+    study = studied(robot, data, fit_cell(robot, data, SUM, silent))
+    judges = Judges(data, data.take(np.zeros(0, dtype=int)), np.zeros((2, 0), dtype=bool))
+
+    def fold(*given: Any) -> Any:
+        return SimpleNamespace(fits=[SimpleNamespace(cell=study.geometric)])
+
+    monkeypatch.setattr(folds, "fold_of", fold)
+    every = tuple(f"session {name}" for name in "abc")
+    found = beyond_of(study, None, judges, None, silent)  # type: ignore[arg-type]
+    assert found.missed == every
+    assert found.folds
+    grouped = beyond_of(study, None, judges, "session", silent)  # type: ignore[arg-type]
+    assert len(grouped.missed) == 3
+    assert not grouped.folds
+
+
+def test_groups_that_are_named_are_the_parts(
+    play: Study, judges: Judges, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fold(*given: Any) -> Any:
+        return SimpleNamespace(fits=[SimpleNamespace(cell=play.geometric)])
+
+    monkeypatch.setattr(folds, "fold_of", fold)
+    found = beyond_of(play, None, judges, "region", silent)  # type: ignore[arg-type]
+    known = [part.name for part in parts(judges.everyone, "region")]
+    assert [one.where for one in found.folds] == known
+    assert all(name.startswith("the region of line") for name in known)
 
 
 def test_a_fold_is_sought_and_fitted_on_its_rows_alone(play: Study) -> None:

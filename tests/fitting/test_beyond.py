@@ -123,7 +123,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
         if untold(poses, part, effects_of).any() or arrived(poses, near, part):
             continue
         far += 1
-        (found,) = without(estimator, state, [part])
+        (found,) = without(estimator, state, [part], 0)
         assert found is not None
         there = Poses.of(estimator, found)
         step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
