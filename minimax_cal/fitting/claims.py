@@ -26,9 +26,9 @@ from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
-FLOORS = 50.0  # times the floor, likewise
-LEAST_FLOOR = 5e-3  # no arm does better [mm]
 GROSS = 0.01  # of the reach: a fit that misses by more contradicts its own data
+FLOORS = 50.0  # times the floor, likewise
+YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
 LISTED = 5  # lines that a notice names
 LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 
@@ -103,9 +103,12 @@ def too_far(
     all points and without those that are suspect.
     """
     limit, what = 1e3 * GROSS * robot.reach(), f"{100 * GROSS:g} % of the arm's reach"
-    if floor and FLOORS * max(floor[0], LEAST_FLOOR) < limit:
-        limit = FLOORS * max(floor[0], LEAST_FLOOR)
+    if floor and FLOORS * floor[0] < limit:
+        limit = FLOORS * floor[0]
         what = f"{FLOORS:g} times the noise floor ({floor[1]})"
+        if limit < 1e3 * YIELDS * robot.reach():
+            limit = 1e3 * YIELDS * robot.reach()
+            what += f" and {100 * YIELDS:g} % of the arm's reach"
     for name, (whole, left) in scores.items():
         few = sum(left.counts) < LEFT * sum(whole.counts)
         miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit

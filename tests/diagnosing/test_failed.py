@@ -45,7 +45,25 @@ def test_points_that_are_suspect_contradict_nothing(robot: mc.Robot) -> None:
     assert against(robot, open_end, few_bad) == ""
     most_bad = Step("geometric", fits, scores(90.0, 20), scores(0.1, 8))
     assert "misses the held-out poses by 90 mm" in against(robot, open_end, most_bad)
-    known = Floor(0.001, 0.001, 0.001, REPEATS)
-    off = Step("geometric", scores(0.4, 80), fits, fits)
+    known = Floor(0.1, 0.1, 0.1, REPEATS)
+    off = Step("geometric", scores(5.5, 80), fits, fits)
     assert "50 times the noise floor" in against(robot, known, off)
     assert against(robot, open_end, off) == ""
+
+
+def test_an_arm_that_comes_back_well_may_bend(robot: mc.Robot) -> None:
+    """Readings at standstill tell what the instrument does, not how large an effect may be."""
+    made = mc.simulate(robot, 100, 3, seed=1, truth=mc.Truth(noise=0.0, noise_per_metre=0.0))
+    rng = np.random.default_rng(1)
+    twice = made.data.take(np.repeat(np.arange(100), 2))
+    twice = twice.with_y(twice.y + 2e-6 * rng.normal(size=twice.y.shape))
+    assert mc.calibrate(robot, twice, objective="sum").status == "converged"
+    exact = Floor(0.002, 0.002, 0.002, REPEATS)
+
+    def step(share: float) -> Step:
+        rms = 1e3 * share * robot.reach()
+        one = Accuracy(rms, rms, rms, 80, (80 * rms**2,), (80,))
+        return Step("geometric", one, one, one)
+
+    assert against(robot, exact, step(0.9e-3)) == ""
+    assert "and 0.1 % of the arm's reach" in against(robot, exact, step(1.1e-3))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.checks import EXPLAINED, FEW, POOR_FIT
-from minimax_cal.fitting.claims import GROSS, LEAST_FLOOR
+from minimax_cal.fitting.claims import GROSS
 from minimax_cal.fitting.identify import plenty_of_poses
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import (
@@ -28,6 +28,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
+LEAST = 5e-3  # a fit that misses by less leaves nothing to explain [mm]
 RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
 
 
@@ -169,7 +170,7 @@ def offset_told(
     robot: Robot, train: RelativeData, options: RelativeOptions, fit: InstrumentFit
 ) -> str:
     """A notice where an offset of each wire explains what the fit leaves; '' where not."""
-    if train.kind != "distances" or options.offset or spread_mm(fit) < LEAST_FLOOR:
+    if train.kind != "distances" or options.offset or spread_mm(fit) < LEAST:
         return ""
     try:
         more = fit_instrument(robot, train, replace(options, offset=True), silent)
