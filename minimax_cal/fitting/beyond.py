@@ -22,7 +22,7 @@ from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region
-from minimax_cal.modelling.near import nearby
+from minimax_cal.modelling.near import is_kept, nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.status import Status
@@ -272,8 +272,8 @@ def without(
     That is where the rest loses geometry: base, links, targets and the frames of further sessions.
     Parameters of effects that the rest does not tell it gives up, as a calibration of the rest
     would.  One step of Gauss and Newton from the whole fit is taken for the answer where a second
-    would hardly move the part that is left out; else the search goes on to its end.  The weights of
-    targets and points stay as they were.
+    would hardly move the part that is left out, and where effects keep their bounds; else the
+    search goes on to its end.  The weights of targets and points stay as they were.
 
     parts: masks (m,) of the fit's poses.  frames: how many of the effects' parameters, the first,
     are those of the frames.
@@ -313,7 +313,7 @@ def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
     estimator, state = poses.estimator, poses.state
     if not gone.any():
         near = moved(estimator, state, step_without(poses, part))
-        if arrived(poses, near, part):
+        if is_kept(near, estimator.model.room) and arrived(poses, near, part):
             return near
     rest = estimator.at(np.flatnonzero(~part)).whole
     active, free = rest.active.copy(), np.flatnonzero(rest.active)

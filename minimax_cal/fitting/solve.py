@@ -143,6 +143,11 @@ class Task:
     order: Array
     sigma: Array
 
+    @property
+    def judged(self) -> Array:
+        """(k,) True for targets that the geometry answers to, False for those that follow."""
+        return self.share > ASIDE
+
     def identified(self, model: Model, state: State) -> Identification:
         """The parameters that the poses of a model tell; those of effects are given up first."""
         more, count = len(model.fields), self.base.names.count
@@ -161,7 +166,7 @@ class Task:
         sigma, own = self.sigma, model.prior.weight[len(self.sigma) :]
         if not np.isfinite(sigma).any():
             return model, nearby(model, begin, self.options.method)
-        points = float(model.counts.sum())
+        points, following = float(model.counts[self.judged].sum()), 3.0 * (~self.judged).sum()
         mean_square = self.frame.mean_square / 3.0
         for _ in range(PRIOR_ROUNDS):
             weight = np.concatenate([mean_square / sigma**2, own])
@@ -172,7 +177,7 @@ class Task:
             known = np.diag(weight[model.active])
             paid = np.trace(solve_normal(gram, gram - known))  # parameters the data pay for
             previous = mean_square
-            dof = max(3.0 * points - paid, 1.0)
+            dof = max(3.0 * points - (paid - following), 1.0)
             mean_square = max(float(model.cost(state).sum()) / dof, LEAST_NOISE**2)
             if abs(mean_square - previous) <= 0.01 * previous:
                 break
@@ -181,8 +186,8 @@ class Task:
     def robust(self, model: Model, found: LeastSquares[State]) -> Robust:
         """The fit with the loss and the trimming that were asked for."""
         line, options = self.data.line, self.options
-        judged = self.share > ASIDE
-        return robust_fit(self.squares, model, found, line, options.loss, options.trim, judged)
+        squares, judged = self.squares, self.judged
+        return robust_fit(squares, model, found, line, options.loss, options.trim, judged)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,10 +31,7 @@ def nearby(model: Model, begin: State, method: str = AUTO) -> LeastSquares[State
     down; or one of `least_squares.METHODS`, from the first step.
     """
     found = unbounded(model, begin, method)
-    effects = found.x.effects[0]
-    if not len(model.room) or np.all((effects >= model.room[:, 0]) & (effects <= model.room[:, 1])):
-        return found
-    return between(model, found)
+    return found if is_kept(found.x.take(np.array(0)), model.room) else between(model, found)
 
 
 def unbounded(model: Model, begin: State, method: str) -> LeastSquares[State]:
@@ -86,6 +83,13 @@ def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
     state = replace(state, effects=settled(state.effects, room))
     count, trace = free.iterations + len(costs) - 1, np.array(costs)
     return LeastSquares(state.batch(), trace[-1:], count, (status,), trace[:, None])
+
+
+def is_kept(state: State, room: Array) -> bool:
+    """Whether a state's effects are between their bounds (e, 2); where there are none, they are."""
+    return not len(room) or bool(
+        ((state.effects >= room[:, 0]) & (state.effects <= room[:, 1])).all()
+    )
 
 
 def kept(state: State, room: Array) -> State:

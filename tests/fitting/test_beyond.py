@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
     RANK,
     arrived,
@@ -173,3 +174,25 @@ def test_what_no_pose_tells_costs_no_part(apart: list[float], lost: bool, weight
     rows: Any = np.stack([np.ones(4), 1.0 + np.array(apart) * [1e-2, -1e-2, 1e-2, -1e-2]], axis=1)
     poses = Rows(rows, weight)
     assert needed(cast(Poses, poses), np.arange(4) == 0) is lost
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_no_part_left_out_makes_a_joint_yield_upwards(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compliances near 0: one step from the whole fit would go below in some parts."""
+    found, steps, plain = [], [], beyond.fit_of_rest
+
+    def looked(poses: Poses, part: Array, gone: Array) -> Any:
+        found.append(plain(poses, part, gone))
+        steps.append(moved(poses.estimator, poses.state, step_without(poses, part)))
+        return found[-1]
+
+    monkeypatch.setattr(beyond, "fit_of_rest", looked)
+    sim = simulate("irb120", 40, 3, seed=seed, truth=Truth(compliance=1e-6))
+    mc.calibrate("irb120", sim.data, "sum", effects=["joint_compliance:all"])
+    compliances = [
+        (one.effects, each.effects) for one, each in zip(found, steps, strict=True) if one
+    ]
+    assert any((step < 0.0).any() for _, step in compliances)
+    assert all((one >= 0.0).all() for one, _ in compliances)

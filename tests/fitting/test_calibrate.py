@@ -171,6 +171,16 @@ def test_priors_help_when_poses_are_few(robot: mc.Robot) -> None:
     assert mc.calibrate(robot, too_few, "sum", holdout=0.0, priors=priors).status == "converged"
 
 
+def test_targets_that_follow_weigh_no_prior(robot: mc.Robot, noisy: Simulation) -> None:
+    """smr:K is the calibration of that target alone, with priors too."""
+    priors = {"a*": 1e-4, "d*": 1e-4, "theta*": 1e-4, "alpha*": 1e-4, "beta*": 1e-4}
+    one = mc.calibrate(robot, noisy.data, "smr:1", priors=priors)
+    alone = mc.calibrate(robot, noisy.data.only(0), "sum", priors=priors)
+    told, known = (fit.estimator.model.prior.weight for fit in (one, alone))
+    assert_allclose(told[told > 0.0], known[known > 0.0], rtol=0.01)  # where the rounds end
+    assert_allclose(one.robot.mdh, alone.robot.mdh, rtol=0, atol=1e-6)
+
+
 def test_a_tight_prior_pins_and_a_wide_one_does_nothing(robot: mc.Robot, noisy: Simulation) -> None:
     plain = mc.calibrate(robot, noisy.data, "sum", holdout=0.0)
     wide = mc.calibrate(robot, noisy.data, "sum", holdout=0.0, priors={"a2": 1e3})
