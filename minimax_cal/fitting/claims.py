@@ -166,11 +166,11 @@ def beyond_of(
 ) -> Beyond:
     """How the fit does on parts of the poses that it has not seen.
 
-    held: (m,) not of the fit; points that stand out among them judge it, and are set aside beside.
+    held: (m,) not of the fit.  Points that stand out judge it, those of the fit too where they are
+    left out; beside they are set aside.
     """
     points = np.moveaxis(data.y, 1, 0)
-    wrong = [one for one in suspects if one.held]
-    doubted = np.isnan(aside(points, data, wrong)).any(axis=-1) & data.seen.T
+    doubted = np.isnan(aside(points, data, suspects)).any(axis=-1) & data.seen.T
     every, free = solved.effects.terms, of_sessions(data.frames)
     geometric = None
     if len(every) > len(free):

@@ -76,3 +76,16 @@ def test_suspects_of_a_file_come_back(robot: mc.Robot, noisy: Simulation, tmp_pa
     assert keys[0] == keys[1]
     assert again.beyond.to_dict() == fit.beyond.to_dict()
     assert again.trusted == fit.trusted
+
+
+def test_a_wrong_point_of_the_fit_is_set_aside_where_its_part_judges(robot: mc.Robot) -> None:
+    """As beyond as measured without it: the loss gives it no weight, its part would tell it."""
+    data = mc.simulate(robot, 100, 3, seed=4).data
+    clean = mc.calibrate(robot, data, "sum", loss="tukey")
+    y = data.y.copy()
+    y[np.flatnonzero(~clean.held)[3], 1] += [5e-3, 0.0, 0.0]
+    fit = mc.calibrate(robot, data.with_y(y), "sum", loss="tukey")
+    assert [one.held for one in fit.suspects] == [False]
+    assert fit.beyond.trusted is not None
+    assert fit.beyond.worst_mm > 1.5 * clean.beyond.worst_mm
+    assert fit.beyond.trusted.worst_mm == pytest.approx(clean.beyond.worst_mm, rel=0.02)
