@@ -44,7 +44,6 @@ from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.evidence.library import library
-from minimax_cal.evidence.noise import Noise, Rows
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
@@ -67,7 +66,7 @@ from minimax_cal.measuring.faults import (
     standing_out,
 )
 from minimax_cal.measuring.faults.fault import listed
-from minimax_cal.measuring.floor import Floor, floor_of, instrument_noise
+from minimax_cal.measuring.floor import Floor, floor_of, instrument_noise, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -178,7 +177,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
         progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
-    floor = floor_beneath(robot, clean.data, ladder.last, noise_mm(study.rows, noise))
+    floor = floor_beneath(robot, clean.data, ladder.last)
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
@@ -265,9 +264,9 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
     return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
 
 
-def floor_beneath(robot: Robot, data: Measurements, last: Joint, noise: float) -> Floor:
-    """What noise alone would leave beneath the last rung.  noise: as the fit tells it [mm]."""
-    most = min(noise, last.train.rms_mm)
+def floor_beneath(robot: Robot, data: Measurements, last: Joint) -> Floor:
+    """What noise alone would leave beneath the last rung."""
+    most = noise_at_most(last.train.rms_mm, sum(last.train.counts), last.poses.left_free)
     return floor_of(data, last.cell.error(data), robot.repeatability, most)
 
 
@@ -307,12 +306,6 @@ def against(robot: Robot, floor: Floor, last: Step) -> str:
     known = (floor.value, floor.source) if floor.certain else None
     scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
     return too_far(robot, known, scores)
-
-
-def noise_mm(rows: Rows, noise: Noise) -> float:
-    """RMS distance that a fit takes for noise [mm]."""
-    spread = noise.variance * (1.0 + noise.ratio * rows.variance_ratio).sum() / max(rows.count, 1)
-    return 1e3 * float(np.sqrt(3.0 * spread))
 
 
 def located(study: Study) -> Where:

@@ -19,7 +19,7 @@ from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import visits
 from minimax_cal.modelling.effects.scene import Scene, joint_of, turning
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
@@ -98,7 +98,7 @@ def at_targets(scene: Scene, course: Array) -> Iterator[Probe]:
     axes = scene.links.axes
     g = (axes * -scene.robot.up[:, None]).sum(axis=1)
     attitude = [*g, g[0] * g[1], g[1] * g[2], g[2] * g[0], g[0] ** 2 - g[1] ** 2]
-    seen = scene.points - scene.instrument[:, None]
+    seen = scene.points - scene.instruments
     away = np.linalg.norm(seen, axis=1, keepdims=True)
     ray = seen / away
     for i, name in enumerate(scene.data.target_names):
@@ -407,7 +407,7 @@ def repeats(scene: Scene, rest: Rest) -> tuple[float, float]:
     used = np.count_nonzero(rest.root.reshape(block.shape), axis=1)
     size = (block**2).sum(axis=1)
     sound = stats.chi2.sf(size, np.maximum(used, 1)) * scene.poses >= STRUCTURE
-    group = np.where(sound, groups(scene.data), -1)
+    group = np.where(sound, visits(scene.data), -1)
     names, count = np.unique(group[sound], return_counts=True)
     pure, pure_dof = 0.0, 0
     for name in names[count > 1]:

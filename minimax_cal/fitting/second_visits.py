@@ -14,7 +14,7 @@ from minimax_cal.fitting.suspects import Scores, spread_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FAINT
 from minimax_cal.measuring.floor import FEWEST
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
 GUILTY = 3.0  # times the error of the other visit: the one that is wrong
@@ -32,11 +32,12 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     were read back in the errors.  Fewer than five poses that were visited again tell nothing.
     error: (k, m, 3), NaN unknown [m].
     """
-    visits = [nearest(part, groups(data)) for part in (error, np.moveaxis(data.y, 1, 0))]
-    known = np.isfinite(visits[0][0])
-    if len(np.unique(groups(data)[known.any(axis=0)])) < FEWEST:
+    group = visits(data)
+    near = [nearest(part, group) for part in (error, np.moveaxis(data.y, 1, 0))]
+    known = np.isfinite(near[0][0])
+    if len(np.unique(group[known.any(axis=0)])) < FEWEST:
         return
-    apart, other = min(visits, key=lambda visit: float(np.median(visit[0][known])))
+    apart, other = min(near, key=lambda visit: float(np.median(visit[0][known])))
     scores = Scores(np.where(known, apart, 0.0) ** 2, 3 * known)
     far = spread_of(scores, 3.0 * known.sum()).far(scores)
     usual = float(np.quantile(apart[known & ~far], HIGH)) if (known & ~far).any() else 0.0

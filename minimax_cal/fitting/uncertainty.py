@@ -197,13 +197,16 @@ class Poses:
         """(p,) J'A e of all poses."""
         return self.sums[1]
 
+    @cached_property
+    def left_free(self) -> float:
+        """Degrees of freedom of the errors: coordinates less parameters that the data pay for."""
+        paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
+        return max(3.0 * np.count_nonzero(self.seen) - paid, 1.0)
+
     @property
     def mean_square(self) -> float:
         """Of a coordinate's error, as a prior was weighed against it in the fit [m^2]."""
-        paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
-        count = 3.0 * np.count_nonzero(self.seen)
-        square = float(self.estimator.model.cost(self.state).sum())
-        return square / max(count - paid, 1.0)
+        return float(self.estimator.model.cost(self.state).sum()) / self.left_free
 
     @cached_property
     def plain(self) -> Normal:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
@@ -28,7 +28,7 @@ RMS_OF_REPEATABILITY = float(
 class Floor:
     """RMS distance that noise alone would leave [mm], between two ends, and how it is known.
 
-    value: the best estimate; where nothing but the fit tells, what it leaves at most.
+    value: the best estimate; where nothing but the fit tells, what noise is at most by its errors.
     """
 
     value: float
@@ -66,7 +66,7 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     """The floor, by revisits, else by what is declared, else by what a fit leaves at most.
 
     error: (k, m, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
-    most: RMS distance that the fit takes for noise [mm].
+    most: RMS distance that noise leaves at most, as the fit tells it [mm].
     """
     again = least_scatter(data, error)
     if again:
@@ -80,6 +80,14 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
         return Floor(most, min(float(np.nan_to_num(instrument)), most), most, AT_MOST)
     low = float(np.hypot(instrument, 0.5 * arm))  # a data sheet promises no more than this
     return Floor(both, low, both, DECLARED)
+
+
+def noise_at_most(rms: float, points: int, dof: float) -> float:
+    """RMS distance of the noise, 97.5 times in 100 less than this, by what a fit leaves [mm].
+
+    What the fit lacks only adds to it.  rms: of its points [mm].  dof: coordinates less parameters.
+    """
+    return rms * math.sqrt(3.0 * points / float(chdtri(dof, 0.975)))
 
 
 def declared(data: Measurements, repeatability: float) -> tuple[float, float] | None:
@@ -116,7 +124,7 @@ def least_scatter(data: Measurements, error: Array) -> tuple[Array, Array] | Non
 
 def visited(data: Measurements, error: Array) -> tuple[Array, Array] | None:
     """As `deviations`, None where too few poses were visited again.  error: or points [m]."""
-    group = groups(data)
+    group = visits(data)
     if np.count_nonzero(np.bincount(group) > 1) < FEWEST:
         return None
     square, group = deviations(error, group)

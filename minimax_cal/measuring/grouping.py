@@ -79,6 +79,14 @@ def groups(data: Measurements) -> Array:
     return numbered_by_joints(group, data.q)
 
 
+def visits(data: Measurements) -> Array:
+    """(m,) a number for each pose and load: rows that share it are visits that should agree."""
+    group = groups(data)
+    load = np.nan_to_num(data.columns.get("payload", np.zeros(data.poses)).astype(float))
+    both = np.stack([group.astype(float), load])
+    return np.asarray(np.unique(both, axis=1, return_inverse=True)[1]).reshape(-1)
+
+
 def mislabelled(data: Measurements) -> str:
     """Which `pose` label stands at poses that are not one, to people; '' for none.
 

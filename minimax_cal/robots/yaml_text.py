@@ -28,8 +28,10 @@ class WrittenOut(yaml.SafeLoader):
         """A mapping.  Raises YAMLError for a key that stands twice."""
         seen: set[str] = set()
         for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.YAMLError(f"line {line}: a key that is no word; write one")
             if key.value in seen:
-                line = key.start_mark.line + 1
                 raise yaml.YAMLError(f"line {line}: {key.value!r} stands twice; keep one")
             seen.add(key.value)
         return super().construct_mapping(node, deep=deep)

@@ -21,7 +21,13 @@ from minimax_cal.diagnosing.where.mean_squares import (
     shape_energy,
     shape_scatter,
 )
-from minimax_cal.diagnosing.where.residual import joint_rows, residual_of
+from minimax_cal.diagnosing.where.residual import (
+    TOGETHER,
+    evened,
+    joint_rows,
+    residual_of,
+    times_before,
+)
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
 from minimax_cal.evidence.noise import orthonormal
@@ -531,3 +537,17 @@ def test_a_real_arm() -> None:
     assert found.structure < 1e-12
     assert found.noise < 30e-6
     json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_many_visits_to_one_pose_are_evened_some_at_a_time(rng: np.random.Generator) -> None:
+    """Blocks of few visits leave the rest as it was; times of a number are counted in order."""
+    group = np.array([3, 1, 3, 3, 1, 2])
+    assert times_before(group).tolist() == [0, 0, 1, 2, 1, 0]
+    m, wide, p = 200, 3, 4
+    basis = np.linalg.qr(rng.normal(size=(m * wide, p)))[0]
+    rows = rng.normal(size=m * wide)
+    rows = (rows - basis @ (basis.T @ rows)).reshape(m, wide)
+    spread = np.broadcast_to(np.eye(wide), (m, wide, wide))
+    apart, one = (evened(rows, basis.reshape(m, wide, p), spread, g)
+                  for g in (np.arange(m) // TOGETHER, np.zeros(m, dtype=int)))  # fmt: skip
+    assert_allclose(one, apart, atol=1e-12)

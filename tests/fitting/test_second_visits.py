@@ -94,3 +94,12 @@ def test_calibrate_and_diagnose_tell(robot: mc.Robot) -> None:
     ):
         (text,) = [one for one in notices if "contradict each other" in one]
         assert "line 5 smr1" in text or "from line 5" in text
+
+
+def test_the_same_pose_under_another_load_contradicts_nothing(robot: mc.Robot) -> None:
+    data, error = visited(robot)
+    for row in (40, 41, 42):
+        data, error = moved(data, error, row, 25.0 * NOISE)
+    assert list(contradictions(data, error))
+    load = np.where(np.isin(np.arange(data.poses), (40, 41, 42)), 20.0, 0.0)
+    assert not list(contradictions(replace(data, columns={"payload": load}), error))

@@ -17,6 +17,7 @@ from minimax_cal.measuring.grouping import (
     numbered_by_joints,
     parts,
     split,
+    visits,
     with_groups,
 )
 from minimax_cal.measuring.measurements import Measurements
@@ -227,3 +228,13 @@ def test_one_label_at_two_poses_is_told(rng: np.random.Generator) -> None:
     q[3, 1] += 0.5
     said = mislabelled(made(q, pose=label))
     assert ":4: pose 'b' is also that of line 3, where joint 2 differs by 0.5 rad" in said
+
+
+def test_visits_are_of_one_load(rng: np.random.Generator) -> None:
+    q = np.repeat(rng.uniform(-2.0, 2.0, (4, 6)), 3, axis=0)
+    load = np.tile([0.0, np.nan, 5.0], 4)
+    assert_array_equal(visits(made(q)), groups(made(q)))
+    group = visits(made(q, payload=load))
+    assert len(np.unique(group)) == 8
+    assert_array_equal(group[0::3], group[1::3])
+    assert not np.isin(group[2::3], group[0::3]).any()

@@ -140,6 +140,8 @@ def test_yaml_cannot_run_code(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("name: r\njoints: [{a: 1, d: 2,\n  a: 3}]", "line 3: 'a' stands twice"),
+        ("name: r\n? [a]\n: 1", "line 2: a key that is no word"),
+        ("? {a: 1}\n: 1", "line 1: a key that is no word"),
         ("name: r\nname: s", "line 2: 'name' stands twice"),
         ("joints: [{d: 0445}]", "line 1: 0445 is no decimal number"),
         ("joints: [{d: 1:30}]", "line 1: 1:30 is no decimal number"),

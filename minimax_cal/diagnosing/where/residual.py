@@ -11,6 +11,7 @@ from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 
 NO_FIT: Array = np.zeros((0, 0, 0, 0))
+TOGETHER = 30  # visits to one pose in a block, whose cost grows with their cube
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +73,12 @@ def evened(rows: Array, basis: Array, spread: Array, group: Array) -> Array:
 
     Rows of covariance V_g = `spread` (m, 3k, 3k), up to a factor, leave residuals of covariance
     V_g - H_gg V_g - V_g H_gg + sum_h H_gh V_h H_hg with H = QQ', Q = `basis` (m, 3k, p).  All
-    visits to a pose are one block g: the fit ties them together.
+    visits to a pose are one block g: the fit ties them together; of very many so many at a time.
     """
     middle = (np.swapaxes(basis, 1, 2) @ spread @ basis).sum(axis=0)
-    _, place, count = np.unique(group, return_inverse=True, return_counts=True)
-    out = np.empty_like(rows)
+    several = np.stack([group, times_before(group) // TOGETHER])
+    _, place, count = np.unique(several, axis=1, return_inverse=True, return_counts=True)
+    place, out = place.reshape(-1), np.empty_like(rows)
     for visits in np.unique(count):
         alike = np.flatnonzero(count[place] == visits)
         chosen = alike[np.argsort(place[alike], kind="stable")].reshape(-1, visits)
@@ -91,6 +93,16 @@ def evened(rows: Array, basis: Array, spread: Array, group: Array) -> Array:
             middle,
         )
         out[chosen] = even.reshape(rows[chosen].shape)
+    return out
+
+
+def times_before(group: Array) -> Array:
+    """(m,) how often each row's number stands before it."""
+    order = np.argsort(group, kind="stable")
+    known, first = group[order], np.arange(len(group))
+    start = np.maximum.accumulate(np.where(np.append(True, known[1:] != known[:-1]), first, 0))
+    out = np.empty_like(first)
+    out[order] = first - start
     return out
 
 
