@@ -50,6 +50,7 @@ def gap_command(model: Path, data: Path, to: Output, **chosen: Any) -> int:
     """
     with to.stages() as progress:
         found = simulator_gap(model, data, progress=progress, **chosen)
+    to.wrote(chosen["write"])
     to.notice(*found.notices)
     if to.deliver(found.json):
         options.show(found.table(), headline=found.headline())
