@@ -94,6 +94,18 @@ def driver(downloads: Path) -> Iterator[Any]:
         yield found
 
 
+@pytest.fixture(scope="session")
+def browser() -> None:
+    """Skips where no browser can print a page."""
+    from minimax_cal.ground.errors import CalibrationError
+    from minimax_cal.reporting.html import find_browser
+
+    try:
+        find_browser()
+    except CalibrationError as error:
+        pytest.skip(str(error))
+
+
 def shared(name: str) -> tuple[str, str]:
     """Robot and measurement files of a real arm; skips where they are not there."""
     folder = SHARED / name

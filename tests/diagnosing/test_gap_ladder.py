@@ -464,8 +464,8 @@ def test_parts_that_a_fit_needs_are_passed_over(
     def kept(count: int, first: bool) -> float:
         """With so many parts that both fits can do without, others that one of them cannot."""
 
-        def some(estimator: object, state: object, masks: list[Array]) -> list[object]:
-            out: list[object] = list(plain(estimator, state, masks))  # type: ignore[arg-type]
+        def some(estimator: object, state: object, masks: list[Array], frames: int) -> list[object]:
+            out: list[object] = list(plain(estimator, state, masks, frames))  # type: ignore[arg-type]
             mine = (state is fits[0].state) == first
             return [one if i < count or not mine else None for i, one in enumerate(out)]
 
@@ -473,7 +473,7 @@ def test_parts_that_a_fit_needs_are_passed_over(
         return spared(Ladder(fits, (0,), ()), judges, floor)
 
     masks = [folds(judges.train, SPARED) == number for number in range(SPARED)]
-    states = [plain(fit.estimator, fit.state, masks) for fit in fits]
+    states = [plain(fit.estimator, fit.state, masks, 0) for fit in fits]
     shares = [share(pair) for pair in zip(*states, strict=True)]  # type: ignore[arg-type]
     for count in (3, 6):
         expected = (count - 1) * np.var(shares[:count])

@@ -177,17 +177,6 @@ def test_facts_are_of_the_file_or_to_be_filled_in(
         assert words in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def browser() -> None:
-    from minimax_cal.ground.errors import CalibrationError
-    from minimax_cal.reporting.html import find_browser
-
-    try:
-        find_browser()
-    except CalibrationError as error:
-        pytest.skip(str(error))
-
-
 @pytest.mark.usefixtures("browser")
 def test_paper_and_picture_by_the_ending(
     results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -305,6 +305,7 @@ def test_without_scripts_the_tables_and_the_still_view_stand(driver: Any, folder
         driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
 
 
+@pytest.mark.usefixtures("browser")
 def test_pdf_holds_the_whole_report(results: Path, tmp_path: Path) -> None:
     out, printed = tmp_path / "a.html", tmp_path / "a.pdf"
     assert run("report", results / "fit.json", "-o", out, "--pdf", printed) == 0
