@@ -154,7 +154,31 @@ def test_leica_deleted_points_are_left_out(truth: mc.Measurements, write: Write)
     points = write("leica.csv", table([bad, *rows], LEICA))
     found = import_files([points], write("joints.csv", joint_rows(truth)))
     same(found, truth)
-    assert "1 points are marked deleted" in found.data.notices[0]
+    assert found.data.notices == (
+        f"{points}: points that are marked deleted are left out: line 2",)  # fmt: skip
+
+
+def test_leica_points_deleted_and_not_measured_again_keep_their_place(
+    truth: mc.Measurements, write: Write
+) -> None:
+    """By the targets' names, and where there is one: what follows stays with its joints."""
+    joints = write("joints.csv", joint_rows(truth))
+    for targets in (3, 1):
+        rows = [row for row in leica_rows(truth) if row[10] in ("A #1", "B #2", "C #3")[:targets]]
+        for pose, target in ((3, 0), (7, targets - 1)):
+            rows[targets * pose + target][-1] = "TRUE"
+            rows[targets * pose + target][0] = 9e3
+        points = write("leica.csv", table(rows, LEICA))
+        found = import_files([points], joints).data
+        y = truth.y[:, :targets].copy()
+        y[[3, 7], [0, targets - 1]] = np.nan
+        assert_allclose(found.y, y, rtol=0, atol=2e-9)
+        lines = ", ".join(str(2 + targets * p + t) for p, t in ((3, 0), (7, targets - 1)))
+        assert found.notices == (f"{points}: points that are marked deleted are poses without a "
+                                 f"measurement: lines {lines}",)  # fmt: skip
+    gone = write("leica.csv", table(rows[:-1], LEICA))
+    words = "(left out as marked deleted: lines 5, 9)"
+    assert refused(f"{joints}:59: joint row 58 has no point", gone, joints=joints).endswith(words)
 
 
 def test_leica_broken(truth: mc.Measurements, write: Write) -> None:

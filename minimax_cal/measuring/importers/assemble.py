@@ -11,7 +11,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.importers import contract
-from minimax_cal.measuring.importers.join import Places, in_file_order, place
+from minimax_cal.measuring.importers.join import Places, in_file_order, place, settled
 from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Reading, Told
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
@@ -96,13 +96,15 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
 
     Raises DataError.
     """
-    points = in_file_order(list(points))
+    alone = joints not in points
+    points = [settled(reading, joints, told.layout) for reading in in_file_order(list(points))]
+    joints = joints if alone else points[0]
     places = [place(reading, joints, told.layout) for reading in points]
     poses = len(joints.line)
     raw = raw_of(points, places, joints, told)
     called = callings(points, places)
     parts = [Part(r, at.pose, c) for r, at, c in zip(points, places, called, strict=True)]
-    if joints not in points:
+    if alone:
         parts.append(Part(without_points(joints), np.arange(poses), {}))
     columns, unknown, meanings = gathered(parts, told, raw.scales, poses)
     targets = target_names(points, places)

@@ -38,6 +38,29 @@ def place(points: Reading, joints: Reading, layout: str) -> Places:
     return by_count(points, joints, layout)
 
 
+def settled(points: Reading, joints: Reading, layout: str) -> Reading:
+    """A file of points without those that are marked deleted.
+
+    A point that was measured anew has a row of its own: then the rest is as many as the joints.
+    Where it was not, its row keeps the place of its pose.  Raises DataError where neither holds.
+    """
+    if not points.deleted:
+        return points
+    rest = points.left_out()
+    if points is joints:
+        return rest
+    try:
+        place(rest, joints, layout)
+    except DataError as error:
+        whole = points.emptied()
+        try:
+            place(whole, joints, layout)
+        except DataError:
+            raise DataError(f"{error} (left out as marked deleted: {points.where})") from None
+        return whole
+    return rest
+
+
 def labels_of(points: Reading) -> tuple[tuple[str, ...], Array]:
     """Names of the targets in order of appearance, and (m,) the index of each row's."""
     column = points.find("target")

@@ -32,7 +32,7 @@ def fits(sheet: Sheet, joints: bool) -> bool:
 
 
 def read(sheet: Sheet, told: Told) -> Reading:
-    """One row a point; points marked deleted are left out."""
+    """One row a point, those that are marked deleted among them."""
     reading = named_reading(
         TITLE, sheet, lambda stem: f"smr1_{stem}" if stem in ("x", "y", "z") else plain(stem)
     )
@@ -40,14 +40,7 @@ def read(sheet: Sheet, told: Told) -> Reading:
     for mark in reading.columns:
         if mark.name.lower() in MARKS:
             deleted |= marked(reading, mark)
-    if not deleted.any():
-        return reading
-    kept = np.flatnonzero(~deleted)
-    columns = tuple(
-        replace(column, cells=tuple(column.cells[i] for i in kept)) for column in reading.columns
-    )
-    notice = f"{sheet.path}: {deleted.sum()} points are marked deleted and left out"
-    return replace(reading, columns=columns, line=reading.line[kept], notices=(notice,))
+    return replace(reading, deleted=tuple(np.flatnonzero(deleted).tolist()))
 
 
 def marked(reading: Reading, mark: Column) -> Array:

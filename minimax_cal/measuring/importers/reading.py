@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,6 +35,7 @@ WORDS = {  # plain names that mean the same in any file
     "group": ("group",),
     "split": ("split",),
 }
+SOME = 8  # lines that a notice names
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
 
 
@@ -76,13 +77,17 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A file understood: columns of m cells each, and the line of each row."""
+    """A file understood: columns of m cells each, and the line of each row.
+
+    deleted: rows whose point the file itself says is not to be used.
+    """
 
     format: str
     sheet: Sheet
     columns: tuple[Column, ...]
     line: Array
     notices: tuple[str, ...] = ()
+    deleted: tuple[int, ...] = ()
 
     def find(self, meaning: str) -> Column | None:
         """The column with a meaning."""
@@ -103,6 +108,36 @@ class Reading:
         """Numbers of the targets that have columns."""
         found = (POINT_NAME.fullmatch(c.meaning) for c in self.columns)
         return tuple(sorted({int(m[1]) for m in found if m}))
+
+    def left_out(self) -> Reading:
+        """Without the rows that are marked deleted."""
+        kept = [i for i in range(len(self.line)) if i not in set(self.deleted)]
+        columns = tuple(replace(c, cells=tuple(c.cells[i] for i in kept)) for c in self.columns)
+        told = replace(self, columns=columns, line=self.line[kept], deleted=())
+        return told.noticing(f"left out: {self.where}")
+
+    def emptied(self) -> Reading:
+        """With rows that are marked deleted as poses at which nothing was measured."""
+        columns = tuple(
+            replace(c, cells=tuple("" if i in self.deleted else cell
+                                   for i, cell in enumerate(c.cells)))
+            if c.family in ("smr", "u95") else c
+            for c in self.columns
+        )  # fmt: skip
+        told = replace(self, columns=columns, deleted=())
+        return told.noticing(f"poses without a measurement: {self.where}")
+
+    @property
+    def where(self) -> str:
+        """The lines that are marked deleted."""
+        lines = [str(self.line[i]) for i in self.deleted]
+        some = ", ".join(lines[:SOME]) + (" ..." if len(lines) > SOME else "")
+        return f"line{'s' * (len(lines) > 1)} {some}"
+
+    def noticing(self, what: str) -> Reading:
+        """With a notice about points that are marked deleted."""
+        notice = f"{self.sheet.path}: points that are marked deleted are {what}"
+        return replace(self, notices=(*self.notices, notice))
 
     def numbers(self, column: Column, *, empty: bool = True) -> Array:
         """A column as floats, NaN where empty.  Raises DataError."""
