@@ -28,11 +28,15 @@ from minimax_cal.judging.saved import AFTER, Saved, open_saved
 from minimax_cal.reporting.plots.map import save_map
 
 
-def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, tuple[str, ...]]:
-    """What the covariance of a saved fit predicts, and a notice where it holds none."""
-    if saved.uncertainty is None:
-        return unknown, (f"{source}: holds no covariance, so nothing is predicted",)
-    return predictor(saved.cells[AFTER], saved.uncertainty, frame), ()
+def predicted(saved: Saved, frame: str, source: str) -> tuple[Predict, Predict, tuple[str, ...]]:
+    """What the covariance of a saved fit predicts of the centroid, and of a measurement of it.
+
+    With a notice where it holds none.
+    """
+    known, cell = saved.uncertainty, saved.cells[AFTER]
+    if known is None:
+        return unknown, unknown, (f"{source}: holds no covariance, so nothing is predicted",)
+    return predictor(cell, known, frame), predictor(cell, known, measured=True), ()
 
 
 @click.command(name="map", cls=InGroups)
@@ -65,8 +69,8 @@ def map_command(
     those of the fit].
     """
     saved = open_saved(fit, data or "", rung=rung)
-    predict, said = predicted(saved, frame, str(fit))
-    found = workspace_map(saved, predict, Grid(**chosen))
+    predict, measured, said = predicted(saved, frame, str(fit))
+    found = workspace_map(saved, predict, Grid(**chosen), measured)
     to.notice(*saved.notices, *said, *found.notices)
     if to.deliver(lambda: json_text(found.to_dict())):
         show(found.table())

@@ -41,18 +41,22 @@ def unknown(q: Array) -> Array:
     return np.full(len(q), np.nan)
 
 
-def predictor(cell: Cell, known: Uncertainty, frame: str = "measurement") -> Predict:
+def predictor(
+    cell: Cell, known: Uncertainty, frame: str = "measurement", *, measured: bool = False
+) -> Predict:
     """What a fit's covariance predicts for the targets' centroid.  frame: see `uncertainty`.
 
-    Without the joints' own scatter (repeatability), and true only as far as the model is: what the
-    model leaves out is not in it.  Raises OptionError for a frame that does not exist.
+    Without the joints' own scatter (repeatability) and without the instrument's, which a centroid
+    that is measured has as well; and true only as far as the model is: what the model leaves out
+    is not in it.  Raises OptionError for a frame that does not exist.
     """
     if frame not in FRAMES:
         raise OptionError(f"no frame {frame!r}; choose {' or '.join(FRAMES)}")
 
     def radius(q: Array) -> Array:
-        factor = position_factor(cell, known, q, frame).mean(axis=1)
-        return holding_radius(factor @ np.swapaxes(factor, -1, -2), LEVEL)
+        factor = position_factor(cell, known, q, frame, jitter=measured).mean(axis=1)
+        noise = known.noise.variance / len(cell.target_positions) if measured else 0.0
+        return holding_radius(factor @ np.swapaxes(factor, -1, -2) + noise * np.eye(3), LEVEL)
 
     return radius
 
@@ -158,7 +162,8 @@ class Sampled:
 class WorkspaceMap:
     """Sections through the workspace, and what was observed.  height, slab: see `Grid`.
 
-    inside: how many held-out poses lie within the radius predicted for them, and of how many.
+    inside: how many held-out poses lie within the radius predicted for a measurement there, and of
+    how many.
     """
 
     robot: str
@@ -302,10 +307,13 @@ def section(
     return Section(name, axes, edges[0], edges[1], count, median, worst, reached)
 
 
-def workspace_map(saved: Saved, predict: Predict = unknown, grid: Grid = Grid()) -> WorkspaceMap:
+def workspace_map(
+    saved: Saved, predict: Predict = unknown, grid: Grid = Grid(), measured: Predict = unknown
+) -> WorkspaceMap:
     """Sections through the workspace of a saved calibration.
 
     predict: radius that holds 95 % of the position of the targets' centroid, at given joints.
+    measured: the same of the centroid as it is measured, which held-out poses are asked about.
     Raises OptionError.
     """
     check_grid(grid)
@@ -314,7 +322,7 @@ def workspace_map(saved: Saved, predict: Predict = unknown, grid: Grid = Grid())
     some = sample(cell, predict, train if len(train) else data.q, grid)
     sections, height, slab = sections_of(some, grid, cell.robot.reach())
     seen = seen_of(saved)
-    radius, error = predict(data.q[held]), seen.error[AFTER][held]
+    radius, error = measured(data.q[held]), seen.error[AFTER][held]
     known = np.isfinite(radius) & np.isfinite(error)
     inside = int((error[known] <= radius[known]).sum()), int(known.sum())
     notices = tuple(remarks(cell.robot, train, inside))
@@ -375,8 +383,9 @@ def remarks(robot: Robot, train: Array, inside: tuple[int, int]) -> list[str]:
     count, of = inside
     if binom.cdf(count, of, LEVEL) < DOUBT:
         out.append(
-            f"the predicted radius holds {count} of {of} held-out poses, not {100 * LEVEL:.0f} %: "
-            "what the model leaves out is not in the prediction"
+            f"the predicted radius, made wider for the noise of a measurement, holds {count} of "
+            f"{of} held-out poses, not {100 * LEVEL:.0f} %: what the model leaves out is not in "
+            "the prediction"
         )
     free = ~(np.isfinite(robot.lower) & np.isfinite(robot.upper))
     names = ", ".join(f"J{i + 1}" for i in np.flatnonzero(free))

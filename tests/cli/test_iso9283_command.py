@@ -272,7 +272,7 @@ def test_map_predicts_by_the_covariance_in_the_file(
     for frame in ("measurement", "base"):
         code, out, notes = run(map_command, file, *FAST, "--json", "--frame", frame)
         assert code == 0
-        assert "the predicted radius holds" in notes  # joints give way: not in the covariance
+        assert "the predicted radius, made wider" in notes  # joints give way: not in the covariance
         maps.append(json.loads(out))
     medians = [np.array(m["sections"][0]["radius95_median_mm"], dtype=float) for m in maps]
     some = np.isfinite(medians[0])

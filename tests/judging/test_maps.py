@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.evidence.noise import Noise
-from minimax_cal.fitting.uncertainty import Uncertainty
+from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.maps import (
@@ -27,7 +27,7 @@ from minimax_cal.judging.maps import (
 )
 from minimax_cal.judging.saved import Saved
 from minimax_cal.modelling.parameters import Names, State
-from minimax_cal.modelling.simulate import Simulation
+from minimax_cal.modelling.simulate import Simulation, simulate
 from minimax_cal.reporting.plots.map import REACHED, outline, save_map
 from minimax_cal.robots.kinematics import forward
 from minimax_cal.robots.sampling import random_poses
@@ -91,6 +91,24 @@ def test_the_radius_holds_95_percent_of_the_arms_that_the_covariance_allows(
     held = (off <= radius).mean(axis=0)
     # binomial scatter of the draws, and 0.5 % for the gamma variable that stands for the distance
     assert np.abs(held - 0.95).max() < 4.0 * np.sqrt(0.95 * 0.05 / draws) + 0.005
+
+
+def test_the_radius_of_a_measurement_holds_95_percent_of_those_not_fitted(
+    robot: mc.Robot,
+) -> None:
+    """Twelve arms of 40 poses each; without the noise of a measurement it holds far fewer."""
+    held, bare = [], []
+    for seed in range(12):
+        data = simulate(robot, poses=80, seed=seed).data
+        fit = mc.calibrate(robot, data.take(np.arange(80) < 40), "sum", holdout=0.0)
+        rest = data.take(np.arange(80) >= 40)
+        known = uncertainty_from_dict(fit.to_dict(), fit.cell, "fit")
+        off = rest.y.mean(axis=1) - fit.predict(rest.q).mean(axis=1)
+        error = np.linalg.norm(off, axis=-1)
+        held += (error <= predictor(fit.cell, known, measured=True)(rest.q)).tolist()
+        bare += (error <= predictor(fit.cell, known)(rest.q)).tolist()
+    assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / len(held)) + 0.005
+    assert np.mean(bare) < 0.9
 
 
 def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
@@ -200,7 +218,7 @@ def test_a_prediction_that_held_out_poses_belie_is_doubted(saved: Saved) -> None
     error = workspace_map(saved, unknown, SMALL).seen.error["after"][saved.held]
     few, more = np.sort(error)[[7, 8]]  # of 12 by chance: 8 in 0.2 %, 9 in 2 % of all cases
     for radius, count, doubted in ((few, 8, True), (more, 9, False), (1.0, 12, False)):
-        found = workspace_map(saved, lambda q, r=radius: np.full(len(q), r), SMALL)
+        found = workspace_map(saved, unknown, SMALL, lambda q, r=radius: np.full(len(q), r))
         assert found.inside == (count, 12)
         assert found.to_dict()["held_out_inside"] == {"count": count, "of": 12}
         assert any("not 95 %" in notice for notice in found.notices) == doubted
