@@ -20,6 +20,6 @@ def robots_command(as_json: bool) -> int:
         click.echo(json_text({"schema": 1, "robots": content}), nl=False)
         return 0
     rows = tuple((name, robot.name, robot.joints, robot.reach()) for name, robot in names.items())
-    header = ("name", "robot", "joints", "reach m")
+    header = ("name", "robot", "joints", "links in all m")
     options.show(Table("built-in robots", header, rows, ("", "", "d", ".2f")))
     return 0

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.modelling.effects.table import Fitted, Term, terms
+from minimax_cal.reporting.html import read_sources
 from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.sampling import random_poses
 from minimax_cal.simulators.result import Rung, SimulatorGap, load_simulator_gap
@@ -81,6 +82,18 @@ def test_the_file_of_a_gap_reads_back(gap: SimulatorGap, tmp_path: Path) -> None
     assert load_simulator_gap(tmp_path / "gap.json").json() == gap.json()
     with pytest.raises(mc.CalibrationError, match="kind"):
         SimulatorGap.from_dict({**content, "kind": "diagnosis"})
+
+
+def test_a_report_tells_that_the_simulator_met_another_arm(arm: Path, gap: SimulatorGap) -> None:
+    pytest.importorskip("plotly")
+    fit = mc.load_fit(arm / "fit.json")
+    assert read_sources([fit, gap]).notices == ()
+    here = replace(gap.provenance, data_sha256="0" * 64)
+    new = replace(gap, robot=fit.robot.name, provenance=here)
+    (told,) = read_sources([fit, new]).notices
+    assert told.endswith("other measurements than the rest.")
+    (told,) = read_sources([fit, replace(new, robot="another")]).notices
+    assert f"of another, not of {fit.robot.name}: is it the same arm?" in told
 
 
 def test_the_command_and_the_report(

@@ -160,11 +160,20 @@ def read_sources(results: Sequence[Result]) -> Sources:
     files.sort(key=lambda file: file.kind)
     fit, gap = fits[0] if fits else None, gaps[0] if gaps else None
     arm = arms[0] if arms else None
-    notices = [*together(fit, gap, files)]
-    known = {part.provenance.data_sha256 for part in (fit, gap) if part}
-    if arm and arm.provenance.data_sha256 not in known:
-        notices.append("The gap in the simulator is of other measurements than the rest.")
+    notices = [*together(fit, gap, files), *simulated(arm, fit, gap)]
     return Sources(fit, gap, tuple(files), tuple(notices), arm)
+
+
+def simulated(arm: SimulatorGap | None, fit: Fit | None, gap: Diagnosis | None) -> tuple[str, ...]:
+    """What to know of a gap in a simulator beside results: its arm goes by the model's name."""
+    known = {part.provenance.data_sha256 for part in (fit, gap) if part}
+    if arm is None or arm.provenance.data_sha256 in known:
+        return ()
+    robots = {name for name in (fit and fit.robot.name, gap and gap.robot) if name}
+    other = "" if arm.robot in robots else (
+        f", and of {arm.robot}, not of {' and '.join(sorted(robots))}: is it the same arm?"
+    )  # fmt: skip
+    return (f"The gap in the simulator is of other measurements than the rest{other or '.'}",)
 
 
 def content_of(result: Result) -> tuple[dict[str, Any], str, str]:
