@@ -89,12 +89,17 @@ class Compensation:
 
     def headline(self) -> str:
         """The result in a sentence."""
-        return (
-            f"{len(self.q) - int(self.failed.sum())} of {len(self.q)} targets: largest error "
-            f"{1e3 * self.distance_before.max():.3f} mm, {1e3 * self.angle_before.max():.3f} mrad "
-            f"-> {1e3 * self.distance.max():.3f} mm, {1e3 * self.angle.max():.3f} mrad, as the "
-            "calibrated model sees it."
-        )
+        missed, count = self.failed, len(self.q)
+        sets = [(f"{count - int(missed.sum())} of {count} targets", ~missed),
+                (f"{int(missed.sum())} missed", missed)]  # fmt: skip
+        each = [
+            f"{who}: largest error {1e3 * self.distance_before[which].max():.3f} mm, "
+            f"{1e3 * self.angle_before[which].max():.3f} mrad -> "
+            f"{1e3 * self.distance[which].max():.3f} mm, {1e3 * self.angle[which].max():.3f} mrad"
+            for who, which in sets
+            if which.any()
+        ]
+        return f"{'; '.join(each)}, as the calibrated model sees it."
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

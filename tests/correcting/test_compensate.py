@@ -365,8 +365,10 @@ def test_tables_hold_what_a_hand_reckons() -> None:
         ("J1", "mrad", pytest.approx(np.sqrt(0.5)), pytest.approx(1.0)),
         ("J2", "mm", pytest.approx(np.sqrt(2.0)), pytest.approx(2.0)),
     )
-    assert found.headline().startswith(
-        "1 of 2 targets: largest error 4.000 mm, 7.000 mrad -> 0.004 mm, 0.002 mrad"
+    assert found.headline() == (
+        "1 of 2 targets: largest error 3.000 mm, 1.000 mrad -> 0.003 mm, 0.000 mrad; "
+        "1 missed: largest error 4.000 mm, 7.000 mrad -> 0.004 mm, 0.002 mrad, "
+        "as the calibrated model sees it."
     )
     assert found.complaint().startswith("1 of 2 targets are missed: limit at line 3: ")
     told = found.to_dict()
