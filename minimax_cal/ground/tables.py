@@ -126,9 +126,10 @@ class Table:
 
 
 def show(cell: Cell, spec: str) -> str:
-    """One cell as text: numbers by the column's format, missing numbers as a dash."""
+    """One cell as text: numbers by the column's format, missing ones as a dash, no minus zero."""
     if isinstance(cell, str):
         return cell
     if isinstance(cell, float) and math.isnan(cell):
         return "-"
-    return format(cell, spec)
+    text = format(cell, spec)
+    return text[1:] if text.startswith("-") and not text.strip("-0.") else text

@@ -6,7 +6,7 @@ import pytest
 
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_text, write_whole
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Table, show
 
 TABLE = Table(
     "errors & more",
@@ -22,6 +22,15 @@ def test_one_number_reads_the_same_everywhere() -> None:
         assert "0.1234" not in text
         assert "nan" not in text.lower()
     assert "0.12345" in TABLE.csv()  # full precision for further work
+
+
+@pytest.mark.parametrize(
+    ("value", "spec", "text"),
+    [(-0.2, ".0f", "0"), (-0.001, ".2f", "0.00"), (-0.6, ".0f", "-1"), (-0.0, "", "0.0"),
+     (-12, "d", "-12"), (-0.01, ".2f", "-0.01")],
+)  # fmt: skip
+def test_nothing_has_no_sign(value: float, spec: str, text: str) -> None:
+    assert show(value, spec) == text
 
 
 def test_cells_are_literal_text() -> None:
