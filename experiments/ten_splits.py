@@ -102,7 +102,7 @@ def arms_table(arms: Sequence[str], told: Sequence[Sequence[Told]]) -> Table:
                      100.0 * sure))  # fmt: skip
     return Table(
         "diagnoses of all poses, a fifth of them held out; medians",
-        ("arm", "splits", "verdicts", "geometry mm", "final mm", "at most mm",
+        ("arm", "splits", "verdicts", "geometry mm", "final mm", "worst split mm",
          "of sound points mm", "closed %", "by established causes %"),
         tuple(rows),
         ("", "d", "", ".4f", ".4f", ".4f", ".4f", ".0f", ".0f"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint, joint
-from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step
+from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.evidence.noise import Noise
@@ -190,12 +190,13 @@ def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:
     Turns of a joint [rad], or motion of a target [m].
     """
     told = scene.known_masses or scene.measured_torques
-    if told or not set(finding.units) <= set(TOLD_AS):
+    units = {as_motion(finding.term.effect, unit) for unit in finding.units}
+    if told or "" in units:
         return ()
     out: list[float] = []
     for term in finding.terms:
         columns = term.columns(scene)
-        turns = finding.units[0] == "rad/(N m)"
+        turns = units == {TOLD_AS["rad/(N m)"]}
         fields = columns.turn if turns else columns.displacement(scene)
         size = np.abs(fields) if turns else np.linalg.norm(fields, axis=2)
         out += [float(part.max()) for part in size]

@@ -53,6 +53,13 @@ NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
+def as_motion(effect: str, unit: str) -> str:
+    """How a value is told whose unit rests on masses that are not; '' where none does."""
+    own = TOLD_AS.get(unit, "")
+    moves = EFFECTS[effect].moves if effect in EFFECTS else "arm"
+    return TOLD_AS["1/(N m^2)"] if own and moves == "foot" else own  # no joint turns
+
+
 @dataclass(frozen=True)
 class Alternative:
     """Another effect that these data cannot tell from the one named.
@@ -176,7 +183,7 @@ class Finding:
         units = tuple(in_files(unit)[1] for unit in self.units)
         if self.motion:
             scale = [1e3 * size for size in self.motion]
-            units = tuple(TOLD_AS.get(unit, unit) for unit in self.units)
+            units = tuple(as_motion(self.term.effect, unit) or unit for unit in self.units)
         return [
             {
                 "name": name,

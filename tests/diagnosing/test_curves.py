@@ -20,8 +20,10 @@ from minimax_cal.diagnosing.curves import (
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects import drivers
 from minimax_cal.modelling.effects.drivers import own_value
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
+from minimax_cal.robots.gravity import masses_of
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.sampling import random_poses
 
@@ -102,6 +104,16 @@ def static_torque(left: Leftover, joint: int) -> Array:
     return np.asarray(left.scene.gravity[joint])
 
 
+def test_torques_of_masses_that_were_told_do_not_say_that_they_are_assumed() -> None:
+    scene = left_by(NOTHING).scene
+    mass, com = masses_of(scene.robot)
+    told = replace(scene, robot=replace(scene.robot, mass=mass, com=com))
+    measured = {f"tau{j + 1}": np.ones(M) for j in range(scene.joints)}
+    felt = replace(scene, data=replace(scene.data, columns={**scene.data.columns, **measured}))
+    for one in (told, felt):
+        assert drivers.torque(one, 1, {})[0] == "static torque of joint 2 (N m)"
+
+
 def wave(left: Leftover, joint: int) -> Array:
     return np.asarray(np.degrees(left.data.q[:, joint]) % (360.0 / 121.0))
 
@@ -113,8 +125,10 @@ def degrees(left: Leftover, joint: int) -> Array:
 @pytest.mark.parametrize(
     ("effects", "law", "joint", "label"),
     [
-        (fitted("link_bending", "L2", [1e-6]), static_torque, 1, "static torque of joint 2 (N m)"),
-        (fitted("base_flex", "frame", [5e-7]), static_torque, 1, "static torque of joint 2 (N m)"),
+        (fitted("link_bending", "L2", [1e-6]), static_torque, 1,
+         "static torque of joint 2, masses assumed (N m)"),
+        (fitted("base_flex", "frame", [5e-7]), static_torque, 1,
+         "static torque of joint 2, masses assumed (N m)"),
         (fitted("gear_ripple", "J3", [2e-4, 1e-4], turns=121.0), wave, 2,
          "joint 3 within a wave of 2.98° (deg)"),
         (fitted("encoder_gain", "J4", [1e-3]), degrees, 3, "joint 4 (deg)"),

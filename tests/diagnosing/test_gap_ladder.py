@@ -222,6 +222,13 @@ def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:
     long = replace(finding("link_bending", "L2", unit="1/(N m^2)"), terms=(LONG,))
     moved = LONG.columns(scene).displacement(scene)
     assert_allclose(motions(scene, long), np.sqrt((moved**2).sum(axis=2)).max(axis=(1, 2)))
+    foot = Term("base_flex", "frame")
+    tilt = replace(finding("base_flex", "frame", unit="rad/(N m)"), terms=(foot,))
+    moved = foot.columns(scene).displacement(scene)
+    assert_allclose(motions(scene, tilt), np.sqrt((moved**2).sum(axis=2)).max(axis=(1, 2)))
+    units = [one.parameters()[0]["unit"] for one in (
+        replace(f, motion=motions(scene, f)) for f in (soft, long, tilt))]  # fmt: skip
+    assert units == ["mrad at most", "mm at most", "mm at most"]
     assert motions(scene, replace(finding("backlash", "J2"), terms=(PLAY,))) == ()
     assert motions(scene, replace(soft, units=("rad/(N m)", "rad"))) == ()
     assert motions(play.scene, soft) == ()  # whose masses are told

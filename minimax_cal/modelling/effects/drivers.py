@@ -40,7 +40,9 @@ def of_source(scene: Scene, joint: int, choice: Choice) -> Axis:
 
 def torque(scene: Scene, joint: int, choice: Choice) -> Axis:
     """Gravity's torque."""
-    return f"static torque of joint {joint + 1} (N m)", scene.gravity[joint]
+    told = scene.known_masses or scene.measured_torques
+    masses = "" if told else ", masses assumed"
+    return f"static torque of joint {joint + 1}{masses} (N m)", scene.gravity[joint]
 
 
 def last_move(scene: Scene, joint: int, choice: Choice) -> Axis:
