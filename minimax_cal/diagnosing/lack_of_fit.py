@@ -19,7 +19,7 @@ from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import visits
+from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.modelling.effects.scene import Scene, joint_of, turning
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
@@ -407,13 +407,9 @@ def repeats(scene: Scene, rest: Rest) -> tuple[float, float]:
     used = np.count_nonzero(rest.root.reshape(block.shape), axis=1)
     size = (block**2).sum(axis=1)
     sound = stats.chi2.sf(size, np.maximum(used, 1)) * scene.poses >= STRUCTURE
-    group = np.where(sound, visits(scene.data), -1)
-    names, count = np.unique(group[sound], return_counts=True)
-    pure, pure_dof = 0.0, 0
-    for name in names[count > 1]:
-        mine = block[group == name]
-        pure += float(((mine - mine.mean(axis=0)) ** 2).sum())
-        pure_dof += (len(mine) - 1) * int(np.count_nonzero(np.ptp(mine, axis=0) > 0.0))
+    seen = np.where(rest.root.reshape(block.shape) > 0.0, block, np.nan)
+    off, free = from_means(seen[sound], visits(scene.data)[sound])
+    pure, pure_dof = float((off**2).sum()), round(float(free.sum()))
     dof = rest.dof - int(used[~sound].sum()) - pure_dof
     if pure_dof < 20 or dof < 20:
         return 1.0, 0.0

@@ -319,10 +319,6 @@ class Uncertainty:
         """The same with all sigmas times a factor."""
         return replace(self, covariance=factor**2 * self.covariance)
 
-    def half_width(self, level: float = 0.95) -> Array:
-        """(p,) half of the interval of each parameter: Student's quantile times sigma [SI]."""
-        return quantile(level, self.dof) * self.sigma
-
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the identified parameters, lengths in millimetres."""
         known = np.flatnonzero(self.active)

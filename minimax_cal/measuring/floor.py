@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import visits
+from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
 
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
@@ -157,15 +157,9 @@ def deviations(error: Array, group: Array) -> tuple[Array, Array]:
     error: (k, m, 3), NaN unknown [m].  group: (m,).
     """  # fmt: skip
     square, member = [np.zeros(0)], [np.zeros(0, dtype=int)]
-    names, inverse, counts = np.unique(group, return_inverse=True, return_counts=True)
     for points in error:
-        seen = np.isfinite(points[:, 0]) & (counts[inverse] > 1)
-        index = inverse[seen]
-        number = np.bincount(index, minlength=len(names))
-        middle = np.stack([np.bincount(index, x, len(names)) for x in points[seen].T], axis=1)
-        off = points[seen] - (middle / np.maximum(number, 1)[:, None])[index]
-        more = number[index] > 1
-        wide = number[index][more] / (number[index][more] - 1.0)
-        square.append((off[more] ** 2).sum(axis=1) * wide)
-        member.append(names[index][more])
+        off, free = from_means(points, group)
+        again = free[:, 0] > 0.0
+        square.append((off[again] ** 2).sum(axis=1) / free[again, 0])
+        member.append(group[again])
     return np.concatenate(square), np.concatenate(member)

@@ -87,6 +87,27 @@ def visits(data: Measurements) -> Array:
     return np.asarray(np.unique(both, axis=1, return_inverse=True)[1]).reshape(-1)
 
 
+def summed(rows: Array, group: Array) -> Array:
+    """Sums of rows (m, ...) over each group."""
+    _, place = np.unique(group, return_inverse=True)
+    out = np.zeros((place.max() + 1, *rows.shape[1:]))
+    np.add.at(out, place, rows)
+    return out
+
+
+def from_means(values: Array, group: Array) -> tuple[Array, Array]:
+    """Deviations (m, c) from the mean of the group, 0 for NaN, and degrees of freedom of each."""
+    known = np.isfinite(values)
+    _, place = np.unique(group, return_inverse=True)
+    count = np.maximum(summed(known.astype(float), group), 1.0)[place]
+    # means of what is left after one row of each group are exact to rounding, far from the origin
+    first = np.unique(place, return_index=True)[1][place]
+    moved = np.where(known & known[first], values - values[first], 0.0)
+    moved = np.where(known & ~known[first], values, moved)
+    alone = np.where(known, moved - (summed(moved, group)[place] / count), 0.0)
+    return alone, np.where(known, 1.0 - 1.0 / count, 0.0)
+
+
 def mislabelled(data: Measurements) -> str:
     """Which `pose` label stands at poses that are not one, to people; '' for none.
 

@@ -17,7 +17,6 @@ from minimax_cal.diagnosing.diagnose import located
 from minimax_cal.diagnosing.where import Where, joint_equivalent, noise_of, triage_table, where
 from minimax_cal.diagnosing.where.mean_squares import (
     lack_of_fit,
-    scatter,
     shape_energy,
     shape_scatter,
 )
@@ -32,7 +31,7 @@ from minimax_cal.diagnosing.where.significance import flips, score_flips, struct
 from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import from_means, groups
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Truth, gravity, simulate
 from minimax_cal.robots import kinematics
@@ -420,7 +419,7 @@ def test_a_missing_target_takes_its_distances_only(rng: np.random.Generator) -> 
 
 def test_scatter_counts_what_was_measured() -> None:
     values = np.array([[1.0, np.nan], [3.0, 5.0], [10.0, 7.0], [np.nan, 8.0]])
-    off, free = scatter(values, np.array([0, 0, 1, 1]))
+    off, free = from_means(values, np.array([0, 0, 1, 1]))
     assert_allclose(off, [[-1.0, 0.0], [1.0, 0.0], [0.0, -0.5], [0.0, 0.5]])
     assert_allclose(free, [[0.5, 0.0], [0.5, 0.0], [0.0, 0.5], [0.0, 0.5]])
 

@@ -25,6 +25,7 @@ from minimax_cal.fitting.uncertainty import (
     point_share,
     position_covariance,
     position_factor,
+    quantile,
     uncertainty_from_dict,
     uncertainty_of,
 )
@@ -369,8 +370,7 @@ def test_correlation_and_root(result: mc.Fit) -> None:
     assert_allclose(np.diag(known.correlation)[known.active], 1.0, rtol=1e-12)
     assert np.nanmax(np.abs(known.correlation)) <= 1.0 + 1e-9
     alike((known.root @ known.root.T)[inside], known.covariance[inside], 1e-9)
-    width = known.half_width(0.95)[known.active] / known.sigma[known.active]
-    assert_allclose(width, 1.96, rtol=0, atol=0.01)  # many degrees of freedom
+    assert_allclose(quantile(0.95, known.dof), 1.96, rtol=0, atol=0.01)  # many degrees of freedom
 
 
 # ---- positions -----------------------------------------------------------------------------------

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from minimax_cal.diagnosing.where.answer import CANNOT_TELL, Part, Triage
-from minimax_cal.diagnosing.where.residual import Residual, summed
+from minimax_cal.diagnosing.where.residual import Residual
 from minimax_cal.diagnosing.where.significance import flips
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
 
 
@@ -53,12 +53,12 @@ def triage(data: Measurements, rest: Residual, noise: float, known: float, dof: 
         told["shape"] = (max(0.0, shape / shape_free - known**2) * left, p)
         if p < 0.01:
             least, behind = shape / shape_free, shape_free
-    repeat, repeat_free, visits = revisit_scatter(data)
+    repeat, repeat_free, again = revisit_scatter(data)
     if repeat_free >= 1.0 and (given or shape_free >= 1.0):
         own = sum(square for square, _ in told.values()) / left * repeat_free
         kept = max(0.0, 1.0 - rest.fitted / (3.0 * points - shape_free))
         p = above(repeat, repeat_free, least, behind)
-        told["repeat"] = (max(0.0, repeat - own) / visits * kept, p)
+        told["repeat"] = (max(0.0, repeat - own) / again * kept, p)
     static = max(0.0, total - sum(square for square, _ in told.values()))
     told["pose"] = (static, lack_of_fit(rest) if repeat_free >= 1.0 else math.nan)
     whole = max(sum(square for square, _ in told.values()), 1e-300)
@@ -77,11 +77,11 @@ def noise_of(data: Measurements) -> float:
 
     Distances: median over pairs of the robust scatter / sqrt(2).  NaN if there are neither.
     """
-    off, weight = scatter(distances(data), np.zeros(data.poses, dtype=int))
+    off, weight = from_means(distances(data), np.zeros(data.poses, dtype=int))
     if weight.sum() >= 8.0:
         spread = [np.median(np.abs(c[w > 0])) for c, w in zip(off.T, weight.T, strict=True)]
         return float(np.median(spread)) * 1.4826 / math.sqrt(2.0)
-    off, weight = scatter(data.y.reshape(data.poses, -1), groups(data))
+    off, weight = from_means(data.y.reshape(data.poses, -1), visits(data))
     dof = float(weight.sum())
     return math.sqrt(float((off**2).sum()) / dof) if dof >= 8.0 else math.nan
 
@@ -95,19 +95,6 @@ def distances(data: Measurements) -> Array:
     """Between all pairs of targets: (m, pairs), NaN where not both were measured [m]."""
     pair = pairs(len(data.target_names))
     return np.asarray(np.linalg.norm(data.y[:, pair[:, 0]] - data.y[:, pair[:, 1]], axis=-1))
-
-
-def scatter(values: Array, group: Array) -> tuple[Array, Array]:
-    """Deviations (m, c) from the mean of the group, 0 for NaN, and degrees of freedom of each."""
-    known = np.isfinite(values)
-    _, place = np.unique(group, return_inverse=True)
-    count = np.maximum(summed(known.astype(float), group), 1.0)[place]
-    # means of what is left after one row of each group are exact to rounding, far from the origin
-    first = np.unique(place, return_index=True)[1][place]
-    moved = np.where(known & known[first], values - values[first], 0.0)
-    moved = np.where(known & ~known[first], values, moved)
-    alone = np.where(known, moved - (summed(moved, group)[place] / count), 0.0)
-    return alone, np.where(known, 1.0 - 1.0 / count, 0.0)
 
 
 def shape_energy(data: Measurements, off: Array) -> tuple[Array, Array]:
@@ -145,7 +132,7 @@ def shape_scatter(data: Measurements) -> tuple[float, float]:
     From the scatter of inter-target distances over all poses: free of model and fit.  White noise
     of s per coordinate gives s^2 times the degrees of freedom; more is instrument, nests, bracket.
     """
-    off, _ = scatter(distances(data), np.zeros(data.poses, dtype=int))
+    off, _ = from_means(distances(data), np.zeros(data.poses, dtype=int))
     energy, rank = shape_energy(data, off)
     return float(energy.sum()), float(rank.sum() - rank.max(initial=0.0))
 
@@ -155,9 +142,9 @@ def revisit_scatter(data: Measurements) -> tuple[float, float, float]:
 
     The targets' motion against each other is taken off: it is told by `shape_scatter`.
     """
-    group = groups(data)
-    off, weight = scatter(data.y.reshape(data.poses, -1), group)
-    apart, free = scatter(distances(data), group)
+    group = visits(data)
+    off, weight = from_means(data.y.reshape(data.poses, -1), group)
+    apart, free = from_means(distances(data), group)
     energy, rank = shape_energy(data, apart)
     most = free.max(axis=1, initial=0.0)
     points = float(weight.sum()) / 3.0

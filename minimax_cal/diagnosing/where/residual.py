@@ -153,11 +153,3 @@ def base_rows(point: Array, up: Array, seen: Array) -> Array:
     growth = np.stack([centred / size - height, height], axis=-1)
     rows, _ = blocks(np.concatenate([axes, turns, growth], axis=-1))
     return np.where(seen[..., None], rows, 0.0)
-
-
-def summed(rows: Array, group: Array) -> Array:
-    """Sums of rows (m, ...) over each group."""
-    _, place = np.unique(group, return_inverse=True)
-    out = np.zeros((place.max() + 1, *rows.shape[1:]))
-    np.add.at(out, place, rows)
-    return out

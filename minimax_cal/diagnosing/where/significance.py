@@ -11,8 +11,9 @@ import math
 import numpy as np
 from scipy.stats import chi2, norm
 
-from minimax_cal.diagnosing.where.residual import Residual, flat_of, summed
+from minimax_cal.diagnosing.where.residual import Residual, flat_of
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import summed
 
 FLAT = 1e-8  # share of a feature's energy below which the fit has taken it
 

@@ -8,7 +8,7 @@ from scipy.special import chdtri
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FEWEST, between
 from minimax_cal.measuring.faults.fault import Amount, Fault
-from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
 
@@ -43,7 +43,7 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
 
 def revisit_scatter(data: Measurements) -> Array:
     """Squared differences of coordinates at poses visited again, halved: variances [m^2]."""
-    group = groups(data)
+    group = visits(data)
     order = np.argsort(group, kind="stable")
     again = np.flatnonzero(np.diff(group[order]) == 0)[::2]
     change = data.y[order[again + 1]] - data.y[order[again]]
