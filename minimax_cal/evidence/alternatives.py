@@ -6,7 +6,7 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import BAND, ENOUGH, LIGHT, LUCK
+from minimax_cal.evidence.limits import BAND, ENOUGH, LEVEL, LIGHT, LUCK
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.ground.arrays import Array
 
@@ -15,7 +15,8 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
     """Other effects or places that may be the truth, with rho^2 and the power to tell them apart.
 
     Those that do nearly as well; and those that do worse by some luck, the data having too little
-    power to tell them apart.
+    power to tell them apart.  Where they have it, what is needed beside another too is no other
+    name for it: both are there, or something else is.
     """
     out, seen = [], {one.candidate.key, *(c.key for c in table.chosen)}
     for other in table.everyone:
@@ -27,7 +28,7 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
             continue
         size, rho2 = table.likeness(one, other.candidate)
         power = size * (1.0 - rho2)
-        if close or power < ENOUGH:
+        if power < ENOUGH or (close and table.p_beside(one, other.candidate) >= LEVEL):
             seen.add(other.candidate.key)
             out.append((other, rho2, power))
     return out

@@ -142,10 +142,6 @@ class Bench:
         """The bench for the library's lines."""
         return self.beside(self.library.lines or self.library.aside(()))
 
-    def knows(self, c: Candidate) -> bool:
-        """Whether the candidate was stored, or one of the lines, when this bench was made."""
-        return max(c.main) < self.settings.pull.shape[1] or self.line(c) is not None
-
     def line(self, c: Candidate) -> Candidate | None:
         """The line that was stored as a candidate later."""
         lines = self.library.lines.candidates if self.library.lines else ()
@@ -234,18 +230,35 @@ class Bench:
         shared = float((across / scale) @ inverse @ (across / scale))
         return size / one.variance, min(shared / max(size, 1e-300), 1.0)
 
+    def p_beside(self, one: Added, other: Candidate) -> float:
+        """`p_value` of an effect where another, with its doubts free, is there as well."""
+        fields = [self.library.fields(other), self.library.fields(one.candidate)[: len(one.value)]]
+        columns = np.concatenate(fields)
+        settings = self.settings_of(columns, columns.T)
+        least = []
+        for count in (len(fields[0]), len(columns)):
+            index = np.arange(count)[None]
+            none = np.zeros((len(settings.ratios), 1, count))
+            gain = settings.solve(index, settings.blocks(index), none)[2][:, 0]
+            rest = np.maximum(settings.total - gain, 1e-300)
+            least.append(float((self.dof * np.log(rest) + settings.logs).min()))
+        return self.p_value(replace(one, gain=max(least[0] - least[1], 0.0)))
+
     def beside(self, aside: Aside) -> Bench:
         """The bench for candidates that are not stored, instead of those that are."""
+        return replace(self, settings=self.settings_of(aside.clear, aside.raw))
+
+    def settings_of(self, clear: Array, raw: Array) -> Settings:
+        """The settings for columns that are not stored.  clear: (d, N), raw: (N, d), as `Aside`."""
         weights = self.fixed.weights
-        part, pull = self.fixed.projected(aside.clear)
-        settings = replace(
+        part, pull = self.fixed.projected(clear)
+        return replace(
             self.settings,
             part=part,
             pull=pull,
-            whole=(weights @ aside.raw**2),
-            own=lambda index: np.moveaxis(within(aside.clear[index], weights), -1, 0),
+            whole=(weights @ raw**2),
+            own=lambda index: np.moveaxis(within(clear[index], weights), -1, 0),
         )
-        return replace(self, settings=settings)
 
 
 @dataclass(frozen=True, eq=False)

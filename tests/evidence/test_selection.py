@@ -145,6 +145,34 @@ def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
             assert power >= 0.0
 
 
+def test_two_effects_that_are_both_there_are_no_rivals() -> None:
+    """Fits as good as one another, of which each is needed beside the other."""
+    names = (("encoder_gain", "J2"), ("backlash", "J2"))
+    made = opened(*(Cause(*name, 300.0) for name in names), seed=4)
+    lib = library(made.scene, made.rows)
+    table = bench(lib, ())
+    pair = [next(c for c in lib.candidates if c.key == name) for name in names]
+    for one, other in (pair, pair[::-1]):
+        best = table.added(one)
+        assert other.key not in {found.candidate.key for found, _, _ in alternatives(table, best)}
+        beside = bench(lib, (other,))  # at noises of its own: the gain is the same to a tenth
+        expected = beside.chance(beside.added(one))
+        found = table.p_beside(best, other) / table.looked_at(one)
+        assert_allclose(np.log(found), np.log(expected), rtol=0.1)
+
+
+def test_a_cause_and_what_resembles_it_stay_rivals() -> None:
+    """The one that is not there is of no use beside the truth, ten times of ten."""
+    for seed in range(10):
+        made = opened(Cause("joint_compliance", "J2", 400.0), seed=seed)
+        lib = library(made.scene, made.rows)
+        table = bench(lib, ())
+        names = (("joint_compliance", "J2"), ("base_flex", "frame"))
+        truth, like = (next(c for c in lib.candidates if c.key == name) for name in names)
+        assert table.p_beside(table.added(like), truth) >= LEVEL
+        assert table.p_beside(table.added(truth), truth) == 1.0
+
+
 def test_lambda_is_the_one_that_was_asked_for() -> None:
     """The generator's detectability and the diagnosis' agree to 35 %, masses being 15 % off."""
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
