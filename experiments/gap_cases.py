@@ -814,10 +814,14 @@ def world_of(case: Case, rng: np.random.Generator) -> World:
     )
 
 
+class Unseen(ValueError):
+    """Poses at which a law shows nothing."""
+
+
 def sized(world: World, measure_of: Judge, cause: Cause, unit: Deviation) -> float:
     """Amplitude at which a law's deviation has the detectability that is asked for.
 
-    Laws are nearly linear in it: a few corrections reach it to rounding.
+    Laws are nearly linear in it: a few corrections reach it to rounding.  Raises Unseen.
     """
     if cause.law in FAULTS or cause.power == 0.0:
         return FAULTS.get(cause.law, 1.0) * cause.power
@@ -826,7 +830,7 @@ def sized(world: World, measure_of: Judge, cause: Cause, unit: Deviation) -> flo
     for _ in range(5):
         power = measure_of.power(measure(world, unit * amplitude) - still)
         if not power > 0.0:
-            raise ValueError(f"{cause.law} at {cause.place} moves nothing that geometry does not")
+            raise Unseen(f"{cause.law} at {cause.place} moves nothing that geometry does not")
         amplitude *= np.sqrt(cause.power / power)
     return float(amplitude)
 

@@ -37,6 +37,7 @@ from minimax_cal.robots.gravity import tubes
 from minimax_cal.robots.robot import Robot, load_robot
 
 NAN = float("nan")
+TRIES, NEXT = 5, 1_000_000_000_000  # choices of poses that may show nothing; between their seeds
 HELD_OUT = 60
 REVISITED = 0.1  # of the training poses, measured twice
 HALF = 0.5  # of a joint's range, in half a workspace
@@ -387,7 +388,17 @@ def world_of(asked: Asked, rng: np.random.Generator) -> World:
 
 
 def make(asked: Asked, laws: dict[str, Law] = LAWS) -> Made:
-    """Build the arm of a case and measure it."""
+    """Build the arm of a case and measure it; where its poses show nothing of a law, others."""
+    for more in range(TRIES):
+        try:
+            return made_of(replace(asked, seed=asked.seed + more * NEXT), laws)
+        except gap_cases.Unseen:
+            continue
+    raise ValueError(f"{asked.causes} show nothing at {TRIES} choices of the poses")
+
+
+def made_of(asked: Asked, laws: dict[str, Law]) -> Made:
+    """The arm of a case by its seed, measured.  Raises Unseen."""
     rng = np.random.default_rng(asked.seed)
     world = world_of(asked, rng)
     still = measure(world, rigid(world))

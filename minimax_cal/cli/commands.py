@@ -47,7 +47,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         ),
         "compare": (
             "compare",
-            "What differs between two calibrations A and B: before and after a repair, or two months.",
+            "What differs between two calibrations A and B: before and after a repair, say.",
         ),
         "fleet": (
             "fleet",

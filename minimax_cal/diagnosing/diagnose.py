@@ -266,8 +266,8 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint) -> Floor:
     """What noise alone would leave beneath the last rung."""
-    most = noise_at_most(last.train.rms_mm, sum(last.train.counts), last.poses.left_free)
-    return floor_of(data, last.cell.error(data), robot.repeatability, most)
+    error = last.cell.error(data)
+    return floor_of(data, error, robot.repeatability, noise_at_most(error, last.poses.left_free))
 
 
 def steps_of(

@@ -3,29 +3,38 @@
 Each test asks whether some motion (of a joint, the base, a target) still follows some functions of
 the poses.  Under the null hypothesis what is left after weighing and projection is white, so that
 its share in the span of motion times functions has an F distribution, exactly.  Few motions and
-few functions a test: a small unknown effect of one joint is not to drown among all others.
+few functions a test: a small unknown effect of one joint is not to drown among all others.  A
+motion may scatter more than the rest does, where a joint comes back badly or the floor shakes: its
+functions must tell more than they leave of that motion itself, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from scipy import stats
 
+from minimax_cal.diagnosing.where.residual import evened
+from minimax_cal.diagnosing.where.significance import score_flips
 from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import from_means, visits
+from minimax_cal.measuring.grouping import from_means, summed, visits
 from minimax_cal.modelling.effects.scene import Scene, joint_of, turning
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.robots.kinematics import cross
 
 SHARE = 0.3  # of the degrees of freedom that a test may take at most
+PRIOR = 10.0  # degrees of freedom by which a motion is taken to scatter as all do
+LOUD = 0.05  # chance above which nobody asks why
+HALF_OF = 0.5  # of those of its own motion
+FAINT = 1e-6  # of the largest motion, below which there is none
 FASTEST = 6  # waves a turn, of two joints together, that are looked for
 STEPS = 5  # joint values at which a joint, or its play, may jump
 LEAST, MOST = 1e-300, 0.99  # chances as they are combined: one of 1 would outweigh all others
@@ -44,7 +53,7 @@ class Probe:
 def probes(scene: Scene) -> Iterator[Probe]:
     """Every question that is asked of the rest."""
     angles, circle = turning(scene), around(scene)
-    pairs = summed(scene, angles)
+    pairs = sums_of(scene, angles)
     bare = [unit(q - q.mean()) for q in scene.q]
     powers = [*bare, *(u * u for u in bare), *(u * v for u, v in combinations(bare, 2))]
     load, move, side = scene.gravity, scene.each("move"), scene.each("approach")
@@ -68,7 +77,7 @@ def probes(scene: Scene) -> Iterator[Probe]:
         if led:
             yield Probe(f"{name} with its last move", motion, np.array(led))
     first = angles[:3]
-    wide = [row for i in first for row in circle[i]] + summed(scene, first)
+    wide = [row for i in first for row in circle[i]] + sums_of(scene, first)
     for axis, letter in enumerate("xyz"):
         motion = np.zeros((1, *scene.points.shape))
         motion[0, :, axis] = 1.0
@@ -113,7 +122,7 @@ def at_targets(scene: Scene, course: Array) -> Iterator[Probe]:
         yield Probe(f"{name} along the line of sight", sight, feature)
 
 
-def summed(scene: Scene, angles: Sequence[int]) -> list[Array]:
+def sums_of(scene: Scene, angles: Sequence[int]) -> list[Array]:
     """Cosines and sines of the sums and differences of two joint angles."""
     return [
         row
@@ -168,7 +177,8 @@ class Rest:
     """What is left, white under the null hypothesis.
 
     rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
-    the weights.  dof: degrees of freedom.  group: (N,) of rows at the same pose, from 0.
+    the weights.  dof: degrees of freedom.  group: (N,) of rows at the same pose, from 0.  width: of
+    rows a visit.
     """
 
     rows: Array
@@ -176,11 +186,36 @@ class Rest:
     root: Array
     dof: int
     group: Array
+    width: int
 
     @property
     def total(self) -> float:
         """Its square."""
         return float(self.rows @ self.rows)
+
+    @cached_property
+    def even(self) -> Array:
+        """(N,) the rows as large as they were before the fit: `evened`."""
+        m, r = len(self.rows) // self.width, self.width
+        spread = np.broadcast_to(np.eye(r), (m, r, r))
+        basis = self.basis.reshape(m, r, -1)
+        return evened(self.rows.reshape(m, r), basis, spread, self.group[::r]).reshape(-1)
+
+    def along(self, motion: Array, told: Array) -> tuple[float, float]:
+        """Square of what functions of the poses leave along a motion, and its degrees of freedom.
+
+        motion: (N, e), at each visit any combination of its columns.  told: (N, d) orthonormal, the
+        functions, none of which was fitted.
+        """
+        block = motion.reshape(-1, self.width, motion.shape[1])
+        span, size, _ = np.linalg.svd(block, full_matrices=False)
+        span = span * (size > FAINT * max(float(size.max(initial=0.0)), 1e-300))[:, None]
+        left = self.rows - told @ (told.T @ self.rows)
+        square, free = (
+            float(((np.swapaxes(span, 1, 2) @ part.reshape(*block.shape[:2], -1)) ** 2).sum())
+            for part in (left, np.concatenate([self.basis, told], axis=1))
+        )
+        return square, float((span**2).sum()) - free
 
 
 def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
@@ -191,7 +226,7 @@ def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
     basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
     rest = rows.error * root
     rest = rest - basis @ (basis.T @ rest)
-    return Rest(rest, basis, root, rows.count - basis.shape[1], rows.group)
+    return Rest(rest, basis, root, rows.count - basis.shape[1], rows.group, rows.weight.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,16 +307,17 @@ def structure(
         moved = rows.of(probe.motion) * rest.root[:, None]
         spread = np.repeat(probe.feature.T, r, axis=0)
         features = (moved[:, :, None] * spread[:, None, :]).reshape(len(moved), -1)
-        found.append(Trace(probe.name, *share(features, rest), doubts=number >= len(wide)))
+        found.append(Trace(probe.name, *share(features, rest, moved), doubts=number >= len(wide)))
     for one in names:
+        moved = (one.motion * rest.root).T
         for name, functions in doubted(scene, one):
             spread = np.repeat(functions, r, axis=1) * rest.root
             features = (one.motion[:, None] * spread).reshape(-1, len(rest.root)).T
-            found.append(Trace(name, *share(features, rest), doubts=True))
+            found.append(Trace(name, *share(features, rest, moved), doubts=True))
         size = one.size(scene, rows)  # a law that is not in proportion to what drives it
         spread = np.repeat([size, size**2], r, axis=1) * rest.root
         found.append(Trace(f"{one.term.label} with its own size",
-                           *share((one.whole * spread).T, rest), doubts=True))  # fmt: skip
+                           *share((one.whole * spread).T, rest, moved), doubts=True))  # fmt: skip
     found.append(Trace("a wave of two joint angles", *strongest_wave(scene, rows, rest)))
     found.append(Trace("poses compared with repeated poses", *repeats(scene, rest)))
     return tuple(found)
@@ -323,10 +359,11 @@ def explained(rows: Rows, choice: Choice) -> float:
     return without - left
 
 
-def share(features: Array, rest: Rest) -> tuple[float, float]:
+def share(features: Array, rest: Rest, motion: Array) -> tuple[float, float]:
     """F test that the rest has no more than its share in the span of features (N, D).
 
-    If the pose that tells most is off by itself, without it: one outlier is no structure.
+    If the pose that tells most is off by itself, without it: one outlier is no structure.  motion:
+    (N, e) which the features are, times functions of the poses.
     """
     before = np.linalg.norm(features, axis=0)
     features = features[:, before > 0.0] / before[before > 0.0]
@@ -334,7 +371,8 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     if not features.shape[1]:
         return 1.0, 0.0
     values, vectors = np.linalg.eigh(features.T @ features)
-    most = max(int(SHARE * rest.dof), 1)
+    poses = len(rest.rows) // rest.width
+    most = max(int(min(SHARE * rest.dof, HALF_OF * poses * motion.shape[1])), 1)
     kept = np.flatnonzero(values > 1e-6 * max(float(values[-1]), 1e-4))[::-1][:most]
     unit = vectors[:, kept] / np.sqrt(values[kept])
     pull = unit.T @ (features.T @ rest.rows)
@@ -346,7 +384,12 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
     outside = max(rest.total - inside, 1e-300)
     if d == 0 or rest.dof - d < 5:
         return 1.0, 0.0
-    p = float(stats.f.sf((inside / d) / (outside / (rest.dof - d)), d, rest.dof - d))
+    all_left = outside, float(rest.dof - d)
+    p = exceeds(inside, d, all_left)
+    by_itself = exceeds(inside, d, shrunk(rest.along(motion, told), all_left))
+    if p < LOUD and by_itself > p:
+        signs = score_flips(float(pull @ pull), summed(told * rest.even[:, None], rest.group))
+        p = max(p, min(by_itself, signs))
     own = rest.group == int(np.argmax(np.bincount(rest.group, field * rest.rows)))
     size = float(rest.rows[own] @ rest.rows[own])
     if stats.chi2.sf(size, own.sum()) * (rest.group.max() + 1) < STRUCTURE:
@@ -355,6 +398,22 @@ def share(features: Array, rest: Rest) -> tuple[float, float]:
         ratio = ((inside - gain) / fewer) / (max(outside - size + gain, 1e-300) / free)
         p = max(p, float(stats.f.sf(ratio, fewer, free)))
     return p, inside - d
+
+
+def exceeds(told: float, d: int, left: tuple[float, float]) -> float:
+    """p that so much is told by d functions, beside what is left: its square and freedom."""
+    square, free = left
+    return float(stats.f.sf((told / d) / max(square / free, 1e-300), d, free))
+
+
+def shrunk(own: tuple[float, float], left: tuple[float, float]) -> tuple[float, float]:
+    """What is left of a motion itself, taken to scatter as all does by `PRIOR`; or all, if less.
+
+    own, left: square and degrees of freedom, of the motion and of all.
+    """
+    mean, free = left[0] / left[1], max(own[1], 0.0) + PRIOR
+    square = max(own[0], 0.0) + PRIOR * mean
+    return (square, free) if square > free * mean else left
 
 
 def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
@@ -378,7 +437,7 @@ def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
         return np.where(good, top / np.where(good, det, 1.0), 0.0)
 
     alone = gain(harmonic[1:].reshape(-1, scene.poses))
-    found = [(float(alone.max()), 2, alone.size)]
+    found = [(alone.max(axis=0), 2, alone.size)]
     sums: list[Array] = []
     for i, j in combinations(range(len(angles)), 2):
         sums += [
@@ -388,13 +447,16 @@ def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
     if sums:
         each = gain(np.concatenate(sums)).reshape(len(sums) // 2, 2, -1, scene.joints)
         both = each.sum(axis=1)  # a product of waves is a sum wave and a difference wave
-        found += [(float(each.max()), 2, each.size), (float(both.max()), 4, both.size)]
+        found += [(each.max(axis=(0, 1, 2)), 2, each.size), (both.max(axis=(0, 1)), 4, both.size)]
+    none = np.zeros((len(arms), 0))
+    own = [rest.along(arms[:, [j]], none) for j in range(scene.joints)]
     best = (1.0, 0.0)
     for most, d, tries in found:
-        free = max(rest.dof - d, 1)
-        ratio = (most / d) / (max(rest.total - most, 1e-300) / free)
-        p = float(min(1.0, stats.f.sf(ratio, d, free) * tries * len(found)))
-        best = min(best, (p, most - d))
+        for told, (square, left) in zip(most.tolist(), own, strict=True):
+            all_left = max(rest.total - told, 1e-300), float(max(rest.dof - d, 1))
+            p = max(exceeds(told, d, one) for one in (
+                all_left, shrunk((square - told, left - d), all_left)))  # fmt: skip
+            best = min(best, (min(1.0, p * tries * len(found)), told - d))
     return best
 
 

@@ -82,12 +82,18 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     return Floor(both, low, both, DECLARED)
 
 
-def noise_at_most(rms: float, points: int, dof: float) -> float:
+def noise_at_most(error: Array, dof: float) -> float:
     """RMS distance of the noise, 97.5 times in 100 less than this, by what a fit leaves [mm].
 
-    What the fit lacks only adds to it.  rms: of its points [mm].  dof: coordinates less parameters.
+    What the fit lacks only adds to it.  error: (k, m, 3) of its points, NaN unknown [m].  dof:
+    coordinates less parameters; they tell as much as the poses' squares vary little, since what
+    joints do moves all points of a pose together [Satterthwaite 1946].
     """
-    return rms * math.sqrt(3.0 * points / float(chdtri(dof, 0.975)))
+    square = 1e6 * np.nansum(error**2, axis=(0, 2))
+    count = 3.0 * np.count_nonzero(np.isfinite(error[..., 0]))
+    told = 2.0 * float(square.sum()) ** 2 / max(len(square) * float(np.var(square)), 1e-300)
+    free = max(dof * min(told / count, 1.0), 1.0)
+    return math.sqrt(3.0 * float(square.sum()) / dof * free / float(chdtri(free, 0.975)))
 
 
 def declared(data: Measurements, repeatability: float) -> tuple[float, float] | None:

@@ -9,8 +9,17 @@ from problems_fit import study
 from scipy import stats
 
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing.lack_of_fit import Named, repeats, rest_of, structure
+from minimax_cal.diagnosing.lack_of_fit import (
+    Named,
+    chance_of,
+    exceeds,
+    repeats,
+    rest_of,
+    shrunk,
+    structure,
+)
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.evidence.noise import Noise, restricted
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import Term
@@ -98,6 +107,60 @@ def test_one_pose_that_is_off_is_no_structure() -> None:
         error[row] += 9.0 * spread[row]
         found = structure(made.scene, replace(made.rows, error=error), noise, none)
         assert min(t.p for t in found if "wave" not in t.name) * len(found) > 0.005
+
+
+def shaken(made: Study, kind: str, rng: np.random.Generator) -> Array:
+    """(N,) rows of an arm whose poses scatter: all targets along x, y, z alike, or one joint."""
+    own = 1.5e-5 * rng.normal(size=made.scene.points.shape)
+    if kind == "shakes":
+        moved = np.broadcast_to(2.5e-5 * rng.normal(size=(1, 3, made.scene.poses)), own.shape)
+    else:
+        moved = made.scene.jacobian[int(kind[1:]) - 1] * (1e-4 * rng.normal(size=made.scene.poses))
+    error = made.rows.of((own + moved)[None])[:, 0]
+    return error - made.rows.basis @ (made.rows.basis.T @ error)
+
+
+@pytest.mark.parametrize("kind", ["shakes", "J5", "J3"])
+def test_scatter_from_visit_to_visit_is_no_structure(kind: str) -> None:
+    """However it moves the targets: twelve drawings, of which one at most is called structure.
+
+    And a law of the joint's angle beside its scatter still is, in all of them.
+    """
+    made = study(6e-6, 1.0, 0)
+    rng, none = np.random.default_rng(7), np.zeros((len(made.rows.error), 0))
+    bent = (made.scene.jacobian[4] * (2e-4 * np.sin(made.scene.q[1] + made.scene.q[2])))[None]
+    law = made.rows.of(bent)[:, 0]
+    law -= made.rows.basis @ (made.rows.basis.T @ law)
+    chances = []
+    for _ in range(12):
+        error = shaken(made, kind, rng)
+        drawn = [replace(made.rows, error=part) for part in (error, error + law)]
+        chances.append([chance_of(structure(made.scene, rows, restricted(rows, none), none))
+                        for rows in drawn])  # fmt: skip
+    alone, beside = np.array(chances).T
+    assert np.count_nonzero(alone < STRUCTURE) <= 1
+    assert np.all(beside < STRUCTURE)
+
+
+def test_a_motion_counts_by_its_own_scatter_where_that_is_larger() -> None:
+    """White rows of one variance, and those along one joint of nine times that."""
+    made, rng = study(6e-6, 1.0, 0), np.random.default_rng(3)
+    none = np.zeros((len(made.rows.error), 0))
+    joint = made.rows.of(made.scene.jacobian[2:3])
+    width = made.rows.weight.shape[1]
+    block = joint.reshape(-1, width)
+    unit = block / np.linalg.norm(block, axis=1, keepdims=True)
+    white = rng.normal(size=block.shape)
+    for scale, expected in ((1.0, 1.0), (3.0, 9.0)):
+        along = (unit * white).sum(axis=1, keepdims=True)
+        error = 1e-5 * (white + (scale - 1.0) * along * unit).ravel()
+        rest = rest_of(replace(made.rows, error=error), Noise(0.0, 1e-10, 0.0), none)
+        square, free = rest.along(joint, none)
+        assert abs(square / free / expected - 1.0) < 4.0 * np.sqrt(2.0 / free)
+        assert 0.5 * made.scene.poses < free < made.scene.poses
+    assert shrunk((90.0, 20.0), (1000.0, 1000.0)) == (100.0, 30.0)
+    assert shrunk((10.0, 20.0), (1000.0, 1000.0)) == (1000.0, 1000.0)
+    assert_allclose(exceeds(30.0, 3, (100.0, 10.0)), stats.f.sf(1.0, 3, 10.0), rtol=1e-12)
 
 
 def test_poses_that_are_off_are_no_lack_of_fit() -> None:
