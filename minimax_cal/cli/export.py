@@ -12,6 +12,7 @@ from minimax_cal.cli.options import (
     RUNG,
     InGroups,
     Output,
+    can,
     options_of,
     output,
     plain_option,
@@ -59,6 +60,7 @@ FORMAT = "The format"
 @output("the robot")
 @QUIET
 @with_output
+@can("rows")
 def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
     """Write the robot of FIT (a saved result or a robot) as a file others can load."""
     made = exported(fit, kind, to.path, **chosen)

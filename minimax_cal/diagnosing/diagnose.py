@@ -111,7 +111,7 @@ def diagnose(
         if name not in EFFECTS:
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
     checks.check_joints(robot, given)
-    checks.check_spread(given)
+    checks.check_spread(robot, given)
     options = DiagnosisOptions(seed, holdout, holdout_by, instrument, tuple(exclude), quick)
     raw = with_groups(with_history(with_instrument(given, instrument)))
     held, notices = held_out(raw, holdout, seed, holdout_by)
@@ -192,7 +192,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         beyond = beyond_of(study, causes, judges, options.holdout_by, progress)
     wrong = against(robot, floor, steps[-1])
     alarming = (*doubts(robot, study.fit, study.nominal.error(study.data)), *filter(None, [wrong]))
-    told = (*asked.data.notices, *notices, *clean.remarks)
+    unread = filter(None, [study.scene.unused_torques])
+    told = (*asked.data.notices, *notices, *clean.remarks, *unread)
     if late:
         told = (*told, f"points that stand out beside all that was found: {listed(late)}")
     every = ladder.last.cell.placed(clean.given)

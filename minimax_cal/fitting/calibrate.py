@@ -202,7 +202,7 @@ def check(robot: Robot, data: Measurements, options: Options) -> None:
     if isinstance(options.qp, str):
         usable(options.qp)
     checks.check_joints(robot, data)
-    checks.check_spread(data)
+    checks.check_spread(robot, data)
 
 
 def parted(robot: Robot, data: Measurements, options: Options) -> Parts:

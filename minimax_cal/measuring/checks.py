@@ -15,6 +15,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot
 
 STANDS_OUT = 8.0  # times the typical error, and 4 times what 95 % keep to: worth a look
+STAYS = 50.0  # factor by which points may spread less than the flange
+MOVES = 0.3  # spread that is one [m]
 MOST_ORDERED = 5  # targets of which all orders are tried
 TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
 
@@ -168,9 +170,30 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
     ]
 
 
-def check_spread(data: Measurements) -> None:
-    """Raise DataError if one target's points spread a hundred times more than another's."""
+def check_spread(robot: Robot, data: Measurements) -> None:
+    """Raise DataError if the points cannot be those of targets on this arm.
+
+    If one target's spread a hundred times more than another's, if two targets have the same points,
+    or if they stay while the flange moves: by another factor than 1000, which `suspicions` tells.
+    """
+    for i, j in combinations(range(len(data.target_names)), 2):
+        both = data.seen[:, i] & data.seen[:, j]
+        apart = np.abs(data.y[both, i] - data.y[both, j])
+        if both.any() and not apart.any():
+            names = f"{data.target_names[i]} and {data.target_names[j]}"
+            raise DataError(
+                f"{data.source}: {names} have the same points at all poses; leave one of them out, "
+                "or mend its columns"
+            )
     spread = np.nanstd(data.y, axis=0).max(axis=1)
+    flange, points = robot.pose(data.q)[:, :3, 3].std(axis=0).max(), float(np.nanmax(spread))
+    stay = 0.0 < points < flange / STAYS and not 0.5 < 1e3 * points / flange < 2.0
+    if data.poses > 2 and stay and flange > MOVES:
+        raise DataError(
+            f"{data.source}: the points spread over {points:.3g} m, but the flange of {robot.name} "
+            f"over {flange:.3g} m at these joint values; check their units, and whether they "
+            "belong together"
+        )
     if spread.max() > 100.0 * spread.min() and np.all(data.seen.sum(axis=0) > 5):
         big, small = (data.target_names[i] for i in (int(spread.argmax()), int(spread.argmin())))
         raise DataError(

@@ -34,6 +34,12 @@ PLAUSIBLE = {  # column: its header, least and largest value in SI, what a heade
     "payload": ("payload_kg", 0.0, 3e3, 1.0),  # the strongest arms carry 2.3 t
     "u95": ("u95_mm", 0.0, 1.0, 1e3),
 }
+OF_EACH = {  # the same of columns that joints or targets have each, by what stands before a number
+    "tau": ("{}_Nm", -1e5, 1e5, 1.0),  # the strongest joints hold some 1e4 N m
+    "base": ("{}_mm", -FARTHEST, FARTHEST, 1e3),
+    "qread": ("{}", -1e3, 1e3, 1.0),
+}
+NUMBERED = re.compile(r"(tau|base|qread)\d+(?:_[xyz])?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +170,15 @@ def check_finite(data: Measurements) -> Measurements:
 
 def check_columns(data: Measurements) -> Measurements:
     """The data, if their optional columns can be.  Raises DataError."""
-    for name, (header, low, high, scale) in PLAUSIBLE.items():
-        values = data.columns.get(name, np.zeros(0))
+    each = {found[0]: OF_EACH[found[1]] for found in map(NUMBERED.fullmatch, data.columns) if found}
+    for name, (header, low, high, scale) in (PLAUSIBLE | each).items():
+        values = np.asarray(data.columns.get(name, np.zeros(0)), dtype=float)
         odd = (values < low) | (values > high)
         if odd.any():
             row = int(np.argmax(odd))
             raise DataError(
-                f"{data.source}:{data.line[row]}: column {header}: {scale * values[row]:g} cannot "
+                f"{data.source}:{data.line[row]}: column {header.format(name)}: "
+                f"{scale * values[row]:g} cannot "
                 f"be; expected {scale * low:g} to {scale * high:g}, or an empty cell"
             )
     for name in filter(APPROACH.fullmatch, data.columns):

@@ -95,6 +95,22 @@ def test_one_target_in_another_unit(robot: mc.Robot, noisy: Simulation) -> None:
     assert "wrong unit" in message
 
 
+def test_targets_that_are_one_are_refused(robot: mc.Robot, noisy: Simulation) -> None:
+    """A column that was copied: also where some of its points are missing."""
+    y = noisy.data.y.copy()
+    y[:, 2], y[4, 2], y[9, 0] = y[:, 0], np.nan, np.nan
+    message = refused(robot, noisy.data.with_y(y))
+    assert "smr1 and smr3 have the same points" in message
+    y[11, 2] += 1e-6
+    mc.calibrate(robot, noisy.data.with_y(y))  # one point tells them apart
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1e-2])
+def test_points_of_no_arm_are_refused(factor: float, robot: mc.Robot, noisy: Simulation) -> None:
+    message = refused(robot, noisy.data.with_y(noisy.data.y * factor))
+    assert "but the flange of" in message
+
+
 def test_an_outlier_is_named_wherever_it_is(robot: mc.Robot, noisy: Simulation) -> None:
     y = noisy.data.y.copy()
     y[30, 1] += [0.0, 0.05, 0.0]

@@ -145,6 +145,9 @@ def test_the_same_seed_gives_the_same_split() -> None:
     [
         ("temperature", -500.0, "column temperature_C: -500 cannot be"),
         ("payload", -2.0, "column payload_kg: -2 cannot be"),
+        ("tau3", 2e80, "column tau3_Nm: 2e\\+80 cannot be"),
+        ("base2_y", -1e12, "column base2_y_mm: -1e\\+15 cannot be"),
+        ("qread4", 1e50, "column qread4: 1e\\+50 cannot be"),
         ("u95", 1e305, "column u95_mm: 1e\\+308 cannot be"),
     ],
 )

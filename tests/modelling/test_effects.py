@@ -293,6 +293,22 @@ def test_measured_torques_replace_computed_ones() -> None:
     assert not len(scene.gravity_parts)  # what is measured is not doubted
 
 
+@pytest.mark.parametrize("lacks", ["a joint", "a pose", "any change"])
+def test_torques_that_tell_too_little_are_not_used(lacks: str) -> None:
+    """They would take gravity off the joints that they say nothing of: a notice tells."""
+    torques = {name: values.copy() for name, values in TAU.items()}
+    if lacks == "a joint":
+        del torques["tau3"]
+    else:
+        torques["tau2"][slice(3, 4) if lacks == "a pose" else slice(None)] = np.nan
+        torques["tau2"] = torques["tau2"] if lacks == "a pose" else np.zeros(40)
+    scene = scene_of(ROBOT, replace(DATA, columns={**DATA.columns, **torques}))
+    assert not scene.measured_torques
+    assert_allclose(scene.gravity, SCENE.gravity, rtol=0, atol=0)
+    assert "computed, not read here" in scene.unused_torques
+    assert SCENES["torques"].unused_torques == SCENE.unused_torques == ""
+
+
 def test_torques_of_guessed_masses_stay_so_where_torques_are_measured() -> None:
     guessed, measured = (
         scene_of(NO_MASSES, data) for data in (DATA, replace(DATA, columns={**DATA.columns, **TAU}))

@@ -19,6 +19,7 @@ from minimax_cal.robots.robot import Robot
 
 MASS_DOUBT = 0.2  # relative sigma of the masses and centres of gravity in a robot file
 BESIDE = 5e-5  # error of a coordinate beside which priors of effects are weighed [m]
+LOADED = 0.05  # of the largest load, below which a joint carries no weight
 LEAST_ARM = 0.02  # sigma of a centre of gravity, where 20 % of it is less [m]
 
 
@@ -109,12 +110,34 @@ class Scene:
         timed = self.has("clock") or followed is None or bool(followed.any()) or self.poses < 2
         return "" if timed else "; the file tells no order"
 
-    @property
+    @cached_property
     def measured_torques(self) -> bool:
-        """Whether the data hold measured torques."""
-        columns = self.data.columns
-        stems = [f"tau{j + 1}" for j in range(self.joints)]
-        return any(np.isfinite(columns[stem]).any() for stem in stems if stem in columns)
+        """Whether the data hold a torque, at all poses, of every joint that gravity loads.
+
+        Columns of some joints or poses, and those that never vary, tell less than assumed masses.
+        """
+        load = np.abs(self.torque(*self.masses) + self.payload).max(axis=1, initial=0.0)
+        heavy = np.flatnonzero(load > LOADED * load.max(initial=0.0))
+        return bool(len(heavy)) and all(self.varies(f"tau{j + 1}") for j in heavy)
+
+    @property
+    def unused_torques(self) -> str:
+        """What to say of torques that are not used; empty where there are none."""
+        known = [j + 1 for j in range(self.joints) if f"tau{j + 1}" in self.data.columns]
+        if self.measured_torques or not known:
+            return ""
+        names = ", ".join(f"tau{j}_Nm" for j in known)
+        return (
+            f"{names}: gravity's torques are computed, not read here: measured ones count where "
+            "every joint that carries weight has them, at every pose and not always the same"
+        )
+
+    def varies(self, stem: str) -> bool:
+        """Whether an optional column has a number at every pose, and not one alone for all."""
+        values = self.data.columns.get(stem)
+        if values is None or not np.isfinite(values.astype(float)).all():
+            return False
+        return self.poses < 2 or self.has(stem)
 
     def each(self, stem: str) -> Array:
         """(n, m) the optional columns stem1 ... stemn, in the sense of `q`."""
