@@ -41,6 +41,15 @@ from minimax_cal.simulators.mjcf import weigh
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
 DEEPEST = 20  # includes within includes
+NESTED = 100  # elements within elements
+MOST = {  # what a model of an arm and its cell may hold, and what it is called
+    "elements": (10_000.0, "elements, replicated ones too"),
+    "body": (1_000.0, "bodies"),
+    "freejoint": (50.0, "bodies that float freely"),
+    "hfield": (4e6, "<hfield>: cells"),
+    "texture": (2e7, "<texture>: pixels"),
+    "size": (1e5, "<size>: numbers set aside"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +69,7 @@ class Given:
         text = ET.tostring(assets_from(self.tree if tree is None else tree, self.folder.resolve()))
         try:
             return mujoco().MjModel.from_xml_string(text.decode())
-        except ValueError as error:
+        except (ValueError, RuntimeError) as error:
             raise RobotError(f"{self.source}: MuJoCo refuses it: {one(error)}") from error
 
 
@@ -79,7 +88,48 @@ def read_model(path: Path | str) -> Given:
         return Given(str(path), from_urdf(path), path.parent, marked)
     if top.tag != "mujoco":
         raise RobotError(f"{path}: is neither MJCF nor URDF: its root is <{top.tag}>")
-    return Given(str(path), written_out(path, path.parent, 0), path.parent)
+    tree = written_out(path, path.parent, 0)
+    check_size(tree, str(path))
+    return Given(str(path), tree, path.parent)
+
+
+def check_size(tree: ET.Element, source: str) -> None:
+    """Raise RobotError for what fills any memory, or never ends, once MuJoCo makes it.
+
+    Elements count as often as what they stand in is replicated.
+    """
+    kinds, stack = dict.fromkeys(MOST, 0.0), [(tree, 1.0, 0)]
+    while stack:
+        element, times, depth = stack.pop()
+        tag = str(element.tag)
+        if depth > NESTED:
+            raise RobotError(f"{source}: elements within elements, {NESTED} deep: no arm is so")
+        times *= product(element.get("count"))
+        told = {"elements": times, tag: times}
+        if tag == "joint" and element.get("type") == "free":
+            told["freejoint"] = times
+        if tag == "hfield":
+            told[tag] = product(element.get("nrow")) * product(element.get("ncol"))
+        if tag == "texture":
+            told[tag] = product(element.get("width")) * product(element.get("height"))
+        if tag == "size":
+            told[tag] = max([1.0, *(product(v) for k, v in element.items() if k != "memory")])
+        for kind, amount in told.items():
+            if kind in kinds:
+                kinds[kind] += amount
+        stack += [(child, times, depth + 1) for child in element]
+    for kind, amount in kinds.items():
+        if not amount <= MOST[kind][0]:
+            what, most = MOST[kind][1], MOST[kind][0]
+            raise RobotError(f"{source}: {what}: {amount:.3g}, at most {most:g} are taken")
+
+
+def product(text: str | None) -> float:
+    """Of the numbers of an attribute; 1 without it, or where MuJoCo will refuse it."""
+    try:
+        return float(np.prod([abs(float(word)) for word in (text or "1").split()]))
+    except ValueError:
+        return 1.0
 
 
 def parsed(path: Path) -> ET.Element:
@@ -118,7 +168,7 @@ def from_urdf(path: Path) -> ET.Element:
         spec = mujoco().MjSpec.from_file(str(path))
         model = spec.compile()
         root = ET.fromstring(spec.to_xml())
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         raise RobotError(f"{path}: MuJoCo refuses it: {one(error)}") from error
     for element in root.iter("body"):
         body = model.body(element.get("name"))

@@ -200,3 +200,29 @@ def test_base_and_targets_are_found_from_poses() -> None:
     poses = cell.robot.pose(simulation.data.q)
     error = placed_error(poses, simulation.data, train, (start, cell.target_positions + 0.01))
     assert_allclose(error, 0.0, **EXACT)
+
+
+@pytest.mark.parametrize(
+    ("before", "within", "says"),
+    [
+        ('<asset><hfield name="m" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>', "",
+         "<hfield>: cells: 1e+10"),
+        ('<asset><texture name="m" type="2d" builtin="flat" width="60000" height="60000"/></asset>',
+         "", "<texture>: pixels"),
+        ("", '<replicate count="200">' * 2 + '<geom size="1"/>' + "</replicate>" * 2,
+         "elements, replicated ones too: 8.02e+04"),
+        ('<size nuser_body="100000000"/>', "", "<size>: numbers set aside"),
+        ("", '<body><freejoint/><geom size="1"/></body>' * 60, "float freely: 60, at most 50"),
+        ("", "<body>" * 3000 + "</body>" * 3000, "100 deep"),
+        ("", '<body pos="0 0 1"><geom size="1"/></body>' * 1200, "bodies: 1.2e+03, at most 1000"),
+    ],
+)  # fmt: skip
+def test_models_that_no_memory_holds_are_refused(
+    tmp_path: Path, before: str, within: str, says: str
+) -> None:
+    file = tmp_path / "bad.xml"
+    file.write_text(f"<mujoco>{before}<worldbody>{within}</worldbody></mujoco>")
+    with pytest.raises(mc.CalibrationError) as caught:
+        read_model(file)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert says in str(caught.value)
