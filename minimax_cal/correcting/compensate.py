@@ -26,7 +26,7 @@ from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.reach import Outcome, Reach, arm_of, bent, lever_of, motion, seen
 from minimax_cal.robots import kinematics
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.sampling import random_poses
 
 FRAMES = ("best-fit", "flange", "own")
@@ -144,7 +144,7 @@ class Compensation:
 def compensate(
     fit: Result,
     targets: Measurements | Array | Sequence[Sequence[float]],
-    nominal: Robot | None = None,
+    nominal: Robot | str | Path | None = None,
     *,
     frame: str = "best-fit",
     tolerance: float = 1e-5,
@@ -157,16 +157,17 @@ def compensate(
 
     fit: a calibration, its cell, a diagnosis, a relative calibration, or its file.  targets: (m, n)
     commanded joints in the order of the path [rad, m], or measurements, whose columns (payload,
-    approach ...) then count. nominal: the arm the controller believes in; that of the fit unless
-    given. frame: where the nominal arm stands, one of FRAMES.  tolerance: of the position, and of
-    the orientation times the lever [m].  most_change: of a joint [rad; half as many m for a slide].
-    lever: what a radian counts as [m], NaN for the targets' own.  clock: moment of the
-    calibration's session, 0 to 1, that effects of time are taken at.  rung: of a diagnosis, the
-    last unless given.  Raises CalibrationError for wrong input.
+    approach ...) then count.  nominal: the arm the controller believes in, its file or its name;
+    that of the fit unless given.  frame: where the nominal arm stands, one of FRAMES.  tolerance:
+    of the position, and of the orientation times the lever [m].  most_change: of a joint [rad; half
+    as many m for a slide].  lever: what a radian counts as [m], NaN for the targets' own.  clock:
+    moment of the calibration's session, 0 to 1, that effects of time are taken at.  rung: of a
+    diagnosis, the last unless given.  Raises CalibrationError for wrong input.
 
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)
+    nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
     cell, robot, drawn = cells_of(fit, rung)
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None

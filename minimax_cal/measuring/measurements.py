@@ -14,6 +14,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.words import one_line
 from minimax_cal.measuring.columns import (
     JOINT,
     TARGET,
@@ -120,7 +121,7 @@ def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
 
     >>> data = mc.measurements(q, y, order=range(len(q)))
     """
-    q, y = np.array(q, dtype=float), np.array(y, dtype=float)
+    q, y = real("q", q), real("y", y)
     y = y[:, None, :] if y.ndim == 2 else y
     if q.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or len(q) != len(y):
         raise DataError(f"q must be (m, n) and y (m, k, 3); got {q.shape} and {y.shape}")
@@ -128,11 +129,22 @@ def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
     sliding = np.zeros(q.shape[1], dtype=bool)
     extra = {name: np.asarray(column) for name, column in columns.items()}
     for name, column in extra.items():
-        if len(column) != len(q):
+        if column.shape != (len(q),):
             raise DataError(
-                f"column {name} has {len(column)} entries, but there are {len(q)} poses"
+                f"column {name} must be one value a pose ({len(q)},), not {column.shape}"
             )
     return check_finite(Measurements(q, y, names, sliding, np.arange(len(q)) + 1, extra))
+
+
+def real(name: str, values: Array) -> Array:
+    """Numbers as floats.  Raises DataError."""
+    try:
+        found = np.array(values)
+        if np.iscomplexobj(found):
+            raise DataError(f"{name} must be real numbers, not complex ones")
+        return found.astype(float)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} must be an array of numbers ({one_line(str(error))})") from error
 
 
 def check_finite(data: Measurements) -> Measurements:

@@ -70,9 +70,9 @@ class Cell:
         """Where the instrument should see each target: (m, k, 3) [m].  q: (m, n) [rad, m].
 
         Effects that depend on time, payload or the way there are those of an arm at rest: `follow`
-        takes them from measurements.
+        takes them from measurements.  Raises RobotError for joint values of another arm.
         """
-        q = np.atleast_2d(np.asarray(q, dtype=float))
+        q = self.robot.own_joints(np.atleast_2d(np.asarray(q, dtype=float)))
         if self.effects.terms:
             return self.follow(still(q, self.target_names, self.robot))
         pose = self.base @ self.robot.pose(q)

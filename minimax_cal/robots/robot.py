@@ -124,11 +124,24 @@ class Robot:
         return len(self.mdh)
 
     def pose(self, q: Array) -> Array:
-        """Pose of the last frame in the base: (..., 4, 4) [m].  q: (..., n) [rad, m]."""
-        q = np.asarray(q)
+        """Pose of the last frame in the base: (..., 4, 4) [m].  q: (..., n) [rad, m].
+
+        Raises RobotError for joint values of another arm.
+        """
+        q = self.own_joints(q)
         flat = q.reshape(-1, self.joints)
         pose = kinematics.forward(self.mdh, flat * self.sign, self.prismatic)
         return pose.reshape(*q.shape[:-1], 4, 4)
+
+    def own_joints(self, q: Array) -> Array:
+        """Joint values (..., n), if they are of so many joints.  Raises RobotError."""
+        q = np.asarray(q)
+        if not q.ndim or q.shape[-1] != self.joints:
+            raise RobotError(
+                f"{self.name} has {self.joints} joints: joint values must be (..., {self.joints}), "
+                f"not {q.shape}"
+            )
+        return q
 
     def inverse(self, pose: Array, near: Array | None = None) -> Array:
         """Joints (..., n) that bring the last frame to poses in the base, within the limits.
@@ -191,8 +204,11 @@ class Robot:
         write_whole(path, json_text(self.to_dict()))
 
     def with_mdh(self, mdh: Array) -> Robot:
-        """The same robot with another geometry."""
-        return replace(self, mdh=np.array(mdh))
+        """The same robot with another geometry (n, 5).  Raises RobotError for another shape."""
+        new = np.array(mdh)
+        if new.shape != self.mdh.shape:
+            raise RobotError(f"{self.name}: mdh must be {self.mdh.shape}, not {new.shape}")
+        return replace(self, mdh=new)
 
 
 def checked_poses(pose: Array, near: Array | None, joints: int) -> tuple[Array, Array | None]:

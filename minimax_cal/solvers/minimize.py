@@ -77,8 +77,13 @@ def minimize_max(
     0.5
     """
     x = np.array(x0, dtype=float).reshape(-1)
+    if not len(x):
+        raise OptionError("minimize_max: x0 is empty; give the variables to begin with")
     if not np.all(np.isfinite(x)):
         raise OptionError("minimize_max: x0 holds NaN or infinite entries")
+    if not (0.0 < tol < 1.0 and maxiter >= 1):
+        raise OptionError(f"minimize_max: tol {tol:g}, maxiter {maxiter}: give tol between 0 and 1 "
+                          "and maxiter of 1 or more")  # fmt: skip
     listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
     box = bounds if bounds is None or isinstance(bounds, Bounds) else box_of(bounds, len(x))
     rows = Rows.of(len(x), box, listed)

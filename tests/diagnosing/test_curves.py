@@ -108,7 +108,7 @@ def test_torques_of_masses_that_were_told_do_not_say_that_they_are_assumed() -> 
     scene = left_by(NOTHING).scene
     mass, com = masses_of(scene.robot)
     told = replace(scene, robot=replace(scene.robot, mass=mass, com=com))
-    measured = {f"tau{j + 1}": np.ones(M) for j in range(scene.joints)}
+    measured = {f"tau{j + 1}": np.arange(M) for j in range(scene.joints)}
     felt = replace(scene, data=replace(scene.data, columns={**scene.data.columns, **measured}))
     for one in (told, felt):
         assert drivers.torque(one, 1, {})[0] == "static torque of joint 2 (N m)"

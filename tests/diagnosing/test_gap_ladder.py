@@ -232,7 +232,7 @@ def test_a_unit_that_rests_on_masses_is_told_as_a_motion(play: Study) -> None:
     assert motions(scene, replace(finding("backlash", "J2"), terms=(PLAY,))) == ()
     assert motions(scene, replace(soft, units=("rad/(N m)", "rad"))) == ()
     assert motions(play.scene, soft) == ()  # whose masses are told
-    torque = {"tau1": np.ones(scene.poses)}
+    torque = {f"tau{j + 1}": np.arange(scene.poses) for j in range(scene.joints)}
     measured = replace(scene.data, columns={**scene.data.columns, **torque})
     assert motions(replace(scene, data=measured), soft) == ()
 

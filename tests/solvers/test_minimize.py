@@ -139,6 +139,9 @@ def test_unbounded_problem_does_not_claim_success() -> None:
     [
         ({"jac": "exact"}, "jac 'exact'"),
         ({"x0": [1.0, np.nan]}, "x0 holds"),
+        ({"x0": []}, "x0 is empty"),
+        ({"tol": np.inf}, "give tol between"),
+        ({"maxiter": 0}, "give tol between"),
         ({"fun": lambda x: x * np.nan}, "finite"),
         ({"constraints": [{"type": "ineq"}]}, "not dict"),
         ({"constraints": LinearConstraint(np.eye(3), 0, 1)}, "3 columns"),
