@@ -79,6 +79,22 @@ def test_beyond_is_asked_of_the_worst_part(
     assert "choose within or beyond" in capsys.readouterr().err
 
 
+def test_an_arm_of_half_its_lengths_is_not_signed_unseen(
+    robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Points that are scaled by half give links of half their length: told on the sheet itself."""
+    made = mc.simulate(robot, 60, seed=4)
+    for factor, told in ((0.5, True), (1.0, False)):
+        fit = mc.calibrate(robot, made.data.with_y(factor * made.data.y))
+        fit.save(tmp_path / "fit.json")
+        page = tmp_path / "report.html"
+        assert run("report", tmp_path / "fit.json", "--tolerance", "rms 5", "-o", page, "-q") == 0
+        said = capsys.readouterr().out
+        assert said.startswith("passed")
+        assert ("Implausibly large changes: a1 by" in said) == told
+        assert ("another arm's" in Seen(page.read_text()).text["verdict"]) == told
+
+
 def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None:
     plain = rendered(WORDING, results / "fit.json", results / "gap.json")
     assert any(title == "Model: geometry alone" for title in plain.tables)

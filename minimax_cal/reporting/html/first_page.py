@@ -12,6 +12,7 @@ from minimax_cal.diagnosing.sentences import NOTHING_MM
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.same_arm import wild
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.judging.tolerance import (
@@ -30,9 +31,11 @@ from minimax_cal.judging.tolerance import (
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
+from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Note, text
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
+from minimax_cal.robots.robot import Robot
 
 CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
 CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
@@ -42,11 +45,15 @@ NO_LIMIT = "No requirement was given: the result is stated, and nothing is passe
 
 @dataclass(frozen=True)
 class Signed:
-    """The judgement of a report.  claims: within, then beyond where there is one."""
+    """The judgement of a report.  claims: within, then beyond where there is one.
+
+    wild: links that no whole arm changes so much, empty where there are none.
+    """
 
     model: str
     claims: tuple[Claim, ...]
     judged: tuple[Judgement, ...]
+    wild: str = ""
 
     @property
     def verdict(self) -> str:
@@ -55,9 +62,12 @@ class Signed:
 
     @property
     def besides(self) -> list[str]:
-        """What a requirement that is passed should not hide: a claim that is above it."""
+        """What a requirement that is passed should not hide: a claim above it, another arm."""
         pairs = ((one, claim) for one in self.judged for claim in self.claims)
-        return [said for said in (elsewhere(one, claim) for one, claim in pairs) if said]
+        other = f"Implausibly large changes: {self.wild}: the robot file may be another arm's"
+        return [said for said in (elsewhere(one, claim) for one, claim in pairs) if said] + (
+            [other] if self.wild else []
+        )
 
     def lines(self) -> list[str]:
         """For a terminal."""
@@ -81,7 +91,14 @@ def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | 
     chosen = next((claim for claim in claims if claim.name == which), None)
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
-    return Signed(model, claims, tuple(judge(limit, chosen) for limit in limits))
+    fit, asked = sources.fit, tuple(judge(limit, chosen) for limit in limits)
+    return Signed(model, claims, asked, changed(fit.before.robot, fit.robot) if fit else "")
+
+
+def changed(before: Robot, after: Robot) -> str:
+    """Links that no whole arm changes so much; empty where there are none."""
+    change = links_of(after.mdh - before.mdh)
+    return wild(Names(before.joints, ()), change, before.reach())
 
 
 def model_of(fit: Fit) -> str:
