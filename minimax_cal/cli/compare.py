@@ -16,7 +16,7 @@ from minimax_cal.judging.watching.comparison import compare
 @click.argument("b", type=PATH)
 @result_options("the comparison (JSON)")
 def compare_command(a: Path, b: Path, to: Output) -> int:
-    """What differs between two calibrations A and B: before and after a repair, or two months.
+    """What differs between two calibrations A and B: before and after a repair, say.
 
     Both are what `calibrate` or `check` wrote with -o, the earlier first.  Base and reflectors may
     stand anew; parameters that these imitate are told as they are drawn in both.
