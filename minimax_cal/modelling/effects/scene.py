@@ -116,9 +116,12 @@ class Scene:
 
         Columns of some joints or poses, and those that never vary, tell less than assumed masses.
         """
+        told = np.array([self.varies(f"tau{j + 1}") for j in range(self.joints)])
+        if not told.any():  # as nearly always: no torque is computed
+            return False
         load = np.abs(self.torque(*self.masses) + self.payload).max(axis=1, initial=0.0)
-        heavy = np.flatnonzero(load > LOADED * load.max(initial=0.0))
-        return bool(len(heavy)) and all(self.varies(f"tau{j + 1}") for j in heavy)
+        heavy = load > LOADED * load.max(initial=0.0)
+        return bool(heavy.any() and told[heavy].all())
 
     @property
     def unused_torques(self) -> str:
