@@ -20,7 +20,7 @@ from scipy import stats
 
 from minimax_cal.diagnosing.where.residual import evened
 from minimax_cal.diagnosing.where.significance import score_flips
-from minimax_cal.evidence.limits import MATTERS, STRUCTURE, WORTH
+from minimax_cal.evidence.limits import MATTERS, SCATTER, STRUCTURE, WORTH
 from minimax_cal.evidence.noise import Noise, Rows, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
@@ -31,7 +31,6 @@ from minimax_cal.modelling.effects.time import ROOM
 from minimax_cal.robots.kinematics import cross
 
 SHARE = 0.3  # of the degrees of freedom that a test may take at most
-PRIOR = 10.0  # degrees of freedom by which a motion is taken to scatter as all do
 LOUD = 0.05  # chance above which nobody asks why
 HALF_OF = 0.5  # of those of its own motion
 FAINT = 1e-6  # of the largest motion, below which there is none
@@ -386,10 +385,11 @@ def share(features: Array, rest: Rest, motion: Array) -> tuple[float, float]:
         return 1.0, 0.0
     all_left = outside, float(rest.dof - d)
     p = exceeds(inside, d, all_left)
-    by_itself = exceeds(inside, d, shrunk(rest.along(motion, told), all_left))
-    if p < LOUD and by_itself > p:
-        signs = score_flips(float(pull @ pull), summed(told * rest.even[:, None], rest.group))
-        p = max(p, min(by_itself, signs))
+    if p < LOUD:
+        by_itself = exceeds(inside, d, shrunk(rest.along(motion, told), all_left))
+        if by_itself > p:
+            signs = score_flips(float(pull @ pull), summed(told * rest.even[:, None], rest.group))
+            p = max(p, min(by_itself, signs))
     own = rest.group == int(np.argmax(np.bincount(rest.group, field * rest.rows)))
     size = float(rest.rows[own] @ rest.rows[own])
     if stats.chi2.sf(size, own.sum()) * (rest.group.max() + 1) < STRUCTURE:
@@ -407,12 +407,12 @@ def exceeds(told: float, d: int, left: tuple[float, float]) -> float:
 
 
 def shrunk(own: tuple[float, float], left: tuple[float, float]) -> tuple[float, float]:
-    """What is left of a motion itself, taken to scatter as all does by `PRIOR`; or all, if less.
+    """What is left of a motion itself, taken to scatter as all does by `SCATTER`; or all, if less.
 
     own, left: square and degrees of freedom, of the motion and of all.
     """
-    mean, free = left[0] / left[1], max(own[1], 0.0) + PRIOR
-    square = max(own[0], 0.0) + PRIOR * mean
+    mean, free = left[0] / left[1], max(own[1], 0.0) + SCATTER
+    square = max(own[0], 0.0) + SCATTER * mean
     return (square, free) if square > free * mean else left
 
 

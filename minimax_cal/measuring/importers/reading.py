@@ -111,15 +111,17 @@ class Reading:
 
     def left_out(self) -> Reading:
         """Without the rows that are marked deleted."""
-        kept = [i for i in range(len(self.line)) if i not in set(self.deleted)]
+        gone = set(self.deleted)
+        kept = [i for i in range(len(self.line)) if i not in gone]
         columns = tuple(replace(c, cells=tuple(c.cells[i] for i in kept)) for c in self.columns)
         told = replace(self, columns=columns, line=self.line[kept], deleted=())
         return told.noticing(f"left out: {self.where}")
 
     def emptied(self) -> Reading:
         """With rows that are marked deleted as poses at which nothing was measured."""
+        gone = set(self.deleted)
         columns = tuple(
-            replace(c, cells=tuple("" if i in self.deleted else cell
+            replace(c, cells=tuple("" if i in gone else cell
                                    for i, cell in enumerate(c.cells)))
             if c.family in ("smr", "u95") else c
             for c in self.columns
