@@ -5,7 +5,6 @@ Edge, the page's Chromium with its chromedriver); a picture of a study by its na
 by running that study in full.
 """
 
-import contextlib
 import shutil
 import subprocess
 import sys
@@ -49,10 +48,8 @@ def example() -> None:
 
 def diagnosis() -> None:
     """The README's picture of a diagnosis, as its commands make it."""
-    made = mc.simulate("ur10", 100, 3, seed=1, truth=mc.Truth(compliance=2e-6))
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        mc.write_measurements("gap.csv", made.data)
-        save_diagnosis(mc.diagnose("ur10", "gap.csv", quick=True), IMAGES / "diagnosis.png")
+    found = mc.diagnose("irb2600", ROOT / "examples" / "irb2600.csv")
+    save_diagnosis(found, IMAGES / "diagnosis.png")
 
 
 def report() -> None:
