@@ -6,6 +6,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # small matrices: threads only cost
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MINIMAX_CAL_LOOPS", "plain")  # half a minute of compiling for brief loops
+os.environ.setdefault("MINIMAX_CAL_NO_FSYNC", "1")  # what tests write outlives no power cut
 
 import numpy as np
 import pytest

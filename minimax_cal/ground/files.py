@@ -10,7 +10,7 @@ import tempfile
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -19,13 +19,16 @@ from minimax_cal.ground.errors import CalibrationError, OptionError
 
 LARGEST = 1 << 30  # bytes of a file that is read: a million poses take a quarter of this
 SHORT = 40  # letters of a name that stand in that of its temporary neighbour
+NO_FSYNC = "MINIMAX_CAL_NO_FSYNC"  # "1" in the environment of studies that write many files
+CANNOT_SYNC = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of file systems without fsync
 MOST = 1e100  # no number of a result is larger; squares and products of these still are numbers
 
 
 def write_whole(path: Path | str, content: str | bytes) -> None:
     """Write content to path in one step: a reader sees the old file or the new one.
 
-    Raises CalibrationError when the folder does not exist or cannot be written.
+    So does who starts the machine again after a power cut: file and folder are on the disk before
+    this returns.  Raises CalibrationError when the folder does not exist or cannot be written.
     """
     path = resolved(path)  # a link keeps pointing at what is written
     raw = content.encode("utf-8") if isinstance(content, str) else content
@@ -36,11 +39,43 @@ def write_whole(path: Path | str, content: str | bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(raw)
+            put_on_disk(stream)
         os.chmod(name, mode_of(path))
-        os.replace(name, path)
+        replace_on_disk(name, path)
     except OSError as error:
         Path(name).unlink(missing_ok=True)
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def put_on_disk(stream: IO[bytes]) -> None:
+    """Flush what was written to an open file as far as the disk.  Raises OSError."""
+    stream.flush()
+    if os.environ.get(NO_FSYNC) == "1":
+        return
+    try:
+        os.fsync(stream.fileno())
+    except OSError as error:
+        if error.errno not in CANNOT_SYNC:
+            raise
+
+
+def replace_on_disk(source: Path | str, path: Path) -> None:
+    """Give a file another's name, and put the folder with that name on the disk.
+
+    Without the second a power cut can bring back the old entry [fsync(2), Linux].  Windows cannot
+    open a folder, and its file systems keep a journal of names.  Raises OSError.
+    """
+    os.replace(source, path)
+    if os.environ.get(NO_FSYNC) == "1" or os.name == "nt":
+        return
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    except OSError as error:
+        if error.errno not in CANNOT_SYNC:
+            raise
+    finally:
+        os.close(folder)
 
 
 def beside(path: Path) -> tuple[int, str]:

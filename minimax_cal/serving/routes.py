@@ -19,6 +19,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import put_on_disk, replace_on_disk
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.page import needed, part, template
 from minimax_cal.serving.cell import view_of
@@ -218,7 +219,8 @@ async def put(request: Request) -> Response:
                 if size > room:
                     return said(too_large, 413)
                 stream.write(chunk)
-        os.replace(part_of_it, path)
+            put_on_disk(stream)
+        replace_on_disk(part_of_it, path)
     except OSError as error:
         raise OptionError(f"{path.name}: cannot be kept ({error.strerror})") from error
     finally:

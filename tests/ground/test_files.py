@@ -1,8 +1,10 @@
 """Files that come and go whole, whatever lies in their way."""
 
+import errno
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -48,3 +50,56 @@ def test_a_name_may_be_long_and_not_longer(tmp_path: Path) -> None:
         with pytest.raises(CalibrationError, match="its name is too long"):
             write(tmp_path / ("n" * 300))
     assert os.listdir(tmp_path) == ["n" * 255]
+
+
+def listen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is put on the disk and renamed, in its order."""
+    heard: list[str] = []
+    sync, replace = os.fsync, os.replace
+
+    def fsync(handle: int) -> None:
+        heard.append("folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file")
+        sync(handle)
+
+    def renamed(*names: Any) -> None:
+        heard.append("name")
+        replace(*names)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", renamed)
+    return heard
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cannot open a folder")
+def test_file_and_folder_are_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name must not reach the disk before its content, nor the caller hear "done" before both."""
+    heard = listen(monkeypatch)
+    monkeypatch.delenv("MINIMAX_CAL_NO_FSYNC", raising=False)
+    write_whole(tmp_path / "fit.json", "text")
+    assert heard == ["file", "name", "folder"]
+    heard.clear()
+    monkeypatch.setenv("MINIMAX_CAL_NO_FSYNC", "1")
+    write_whole(tmp_path / "fit.json", "text")
+    assert heard == ["name"]
+
+
+@pytest.mark.parametrize(("number", "is_refused"), [(errno.EIO, True), (errno.EINVAL, False)])
+def test_a_disk_that_fails_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, is_refused: bool
+) -> None:
+    """EIO is a broken disk, EINVAL a file system that has no fsync."""
+    path = tmp_path / "fit.json"
+    path.write_text("old")
+
+    def fsync(handle: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.delenv("MINIMAX_CAL_NO_FSYNC", raising=False)
+    monkeypatch.setattr(os, "fsync", fsync)
+    if is_refused:
+        with pytest.raises(CalibrationError, match="cannot be written"):
+            write_whole(path, "new")
+    else:
+        write_whole(path, "new")
+    assert path.read_text() == ("old" if is_refused else "new")
+    assert os.listdir(tmp_path) == ["fit.json"]
