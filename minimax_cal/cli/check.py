@@ -17,9 +17,9 @@ from minimax_cal.cli.options import (
     result_options,
     show,
 )
+from minimax_cal.cli.stderr import tell
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
-from minimax_cal.ground.words import one_line
 from minimax_cal.judging.watching.health import check
 
 ASKED = "What is asked"
@@ -60,5 +60,5 @@ def check_command(
     else:
         show(*found.tables(), headline=found.headline())
     if not found.valid:
-        click.echo(f"error: {one_line(found.headline())}", err=True)
+        tell("error", found.headline(), exit_code=FAILED)
     return 0 if found.valid else FAILED

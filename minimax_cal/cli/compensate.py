@@ -21,6 +21,7 @@ from minimax_cal.cli.options import (
     plain_option,
     result_options,
 )
+from minimax_cal.cli.stderr import AS_JSON, tell
 from minimax_cal.correcting.compensate import cells_of, compensate
 from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_program
 from minimax_cal.correcting.target_file import read_targets
@@ -117,10 +118,12 @@ def compensate_command(
         if sys.stdout.isatty():
             text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
         click.echo(text, nl=False)
-        if not to.quiet:
+        if AS_JSON.get():
+            tell("summary", found.headline())
+        elif not to.quiet:
             click.echo(found.summary(WIDTH), err=True)
     if found.failed.any():
-        click.echo(f"error: {found.complaint()}", err=True)
+        tell("error", found.complaint(), exit_code=FAILED)
         return FAILED
     return 0
 

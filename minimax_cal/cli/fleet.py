@@ -8,6 +8,7 @@ import click
 
 from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import PATH, InGroups, Output, plain_option, result_options, show
+from minimax_cal.cli.stderr import tell
 from minimax_cal.reporting.fleet.overview import fleet
 
 WORK = "Who does the work"
@@ -43,5 +44,5 @@ def fleet_command(
         show(found.table(), headline=found.headline())
     if found.failed:
         names = ", ".join(row.cell for row in found.failed)
-        click.echo(f"error: {len(found.failed)} cells failed: {names}", err=True)
+        tell("error", f"{len(found.failed)} cells failed: {names}", exit_code=FAILED)
     return FAILED if found.failed else 0

@@ -19,11 +19,12 @@ from rich.text import Text
 
 from minimax_cal.cli import FAILED
 from minimax_cal.cli.progress import stages
+from minimax_cal.cli.stderr import PROGRESS, tell
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.options import SI, Option, names_of, pair
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.words import one_line, visible, without_formulas
+from minimax_cal.ground.words import visible, without_formulas
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ RUNG = click.option(
 JSON = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON and nothing else on stdout."
 )
-QUIET = click.option(
+NO_NOTICES = click.option(
     "--quiet", "-q", is_flag=True, help="Print no notices and no progress on stderr."
 )
 SAFE_CELLS = click.option(
@@ -99,6 +100,9 @@ def plain_option(group: str, *names: str, **more: Any) -> Decorator:
 def stacked(*decorators: Decorator) -> Decorator:
     """Several decorators as one, the first on top."""
     return lambda command: reduce(lambda made, each: each(made), reversed(decorators), command)
+
+
+QUIET = stacked(NO_NOTICES, PROGRESS)
 
 
 def option_of(name: str, default: Any, told: Option) -> Decorator:
@@ -207,9 +211,9 @@ class Output:
         for text in shown:
             at = click.get_current_context(silent=True)
             said = in_flags(text, at.command) if at else text
-            click.echo(f"notice: {one_line(said)}", err=True)
+            tell("notice", said)
         if shown and len(texts) > MOST_NOTICES:
-            click.echo(f"notice: and {len(texts) - MOST_NOTICES} more, in the JSON", err=True)
+            tell("notice", f"and {len(texts) - MOST_NOTICES} more, in the JSON")
 
     def cells(self, text: str, safe: bool) -> str:
         """CSV that holds text of its input; what a spreadsheet would run is said, or made safe."""
@@ -335,7 +339,7 @@ def terminal() -> Console:
 
 def say_written(path: Path) -> None:
     """Say on stderr that a file was written, whatever its name."""
-    click.echo(f"written: {one_line(str(path))}", err=True)
+    tell("written", str(path))
 
 
 def show(*tables: Table, headline: str = "") -> None:
@@ -369,5 +373,5 @@ def exit_code(status: Status) -> int:
     """Of how the numbers ended, with a line of error where they did not work out."""
     if status is Status.CONVERGED:
         return 0
-    click.echo(f"error: {status}: {status.advice}", err=True)
+    tell("error", f"{status}: {status.advice}", exit_code=FAILED)
     return FAILED

@@ -11,8 +11,8 @@ import click
 
 from minimax_cal.cli import FAILED, INTERRUPTED, MISUSED
 from minimax_cal.cli.commands import ENTRIES, Commands, Workflow
+from minimax_cal.cli.stderr import AS_JSON, tell
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
-from minimax_cal.ground.words import one_line
 
 
 @click.group(
@@ -27,6 +27,15 @@ def cli() -> None:
 
 def outcome(arguments: Sequence[str] | None) -> int:
     """The exit code of a command line; whatever went wrong is one line of error."""
+    token = AS_JSON.set(False)
+    try:
+        return run_command(arguments)
+    finally:
+        AS_JSON.reset(token)
+
+
+def run_command(arguments: Sequence[str] | None) -> int:
+    """As `outcome`, which also ends what an option said about stderr."""
     if sys.stdout is None:  # a file that is opened next would take its place
         return complain("stdout is closed and the result would be lost; end with >/dev/null")
     for stream in (sys.stdout, sys.stderr):
@@ -80,5 +89,5 @@ def numerical(error: Exception) -> int:
 
 def complain(message: str, code: int = MISUSED) -> int:
     """One line on stderr."""
-    click.echo(f"error: {one_line(message)}", err=True)
+    tell("error", message, exit_code=code)
     return code

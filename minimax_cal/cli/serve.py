@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import webbrowser
+from contextlib import ExitStack
 from pathlib import Path
 
 import click
 
 from minimax_cal.cli.options import PATH, InGroups
-from minimax_cal.serving.server import FOLDER, PORT, serve
+from minimax_cal.serving.server import FOLDER, PORT, redirecting, serve
 
 
 @click.command(name="serve", cls=InGroups)
@@ -32,15 +33,16 @@ def serve_command(port: int | None, folder: Path, no_browser: bool) -> int:
     It prints one address, with a token that opens it.  Only this machine can reach it, nothing
     leaves the machine, and each click shows the command line that does the same.  Ctrl-C ends it.
     """
+    with ExitStack() as files:
 
-    def ready(url: str) -> None:
-        click.echo(url)
-        click.echo(f"sessions are kept in {folder}; Ctrl-C ends the page", err=True)
-        if not no_browser:
-            webbrowser.open(url)
+        def ready(url: str) -> None:
+            click.echo(url)
+            click.echo(f"sessions are kept in {folder}; Ctrl-C ends the page", err=True)
+            if not no_browser:
+                webbrowser.open(files.enter_context(redirecting(folder, url)).as_uri())
 
-    try:
-        serve(folder, port, ready)
-    except KeyboardInterrupt:
-        click.echo("ended; the sessions stay where they are", err=True)
+        try:
+            serve(folder, port, ready)
+        except KeyboardInterrupt:
+            click.echo("ended; the sessions stay where they are", err=True)
     return 0

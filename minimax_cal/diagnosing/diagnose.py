@@ -56,6 +56,7 @@ from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.stages import name_rung
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.faults import (
     Fault,
@@ -176,7 +177,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
-        progress(f"rung {step.name}: {step.holdout.rms_mm:.3f} mm")
+        progress(name_rung(step.name, step.holdout.rms_mm))
     floor = floor_beneath(robot, clean.data, ladder.last)
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)

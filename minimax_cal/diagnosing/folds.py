@@ -16,6 +16,7 @@ from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.stages import count_stage
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.modelling.parameters import State
 
@@ -53,7 +54,7 @@ def beyond_of(
         if state is None:
             errors.miss(part.name)
             continue
-        progress(f"part {number + 1} of {len(found)} left out: {part.name}")
+        progress(count_stage("part", number + 1, len(found), f" left out: {part.name}"))
         fits = fold_of(study, causes, ~mask, state).fits
         rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))

@@ -15,6 +15,8 @@ from minimax_cal.fitting.minimax_problem import DISTANCE_FORMS
 from minimax_cal.fitting.robust import LOSSES, SQUARE, check_robust
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
+from minimax_cal.ground.stages import Progress as Progress
+from minimax_cal.ground.stages import silent as silent
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.kinematics import MDH_NAMES
@@ -31,14 +33,9 @@ UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.01
 LENGTHS = ("mm", "um", "m")
 
 
-Progress = Callable[[str], None]
 Solver = Callable[[Problem], Solution]
 QpSolver = str | Solver
 T = TypeVar("T")
-
-
-def silent(message: str) -> None:
-    """Say nothing."""
 
 
 LEAST_SIGMA, MOST_SIGMA = 1e-12, 1e6  # of a prior that says something [m, rad]

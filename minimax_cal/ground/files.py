@@ -152,11 +152,18 @@ def json_text(content: object) -> str:
 def json_of(text: str | bytes) -> Any:
     """JSON whose every key stands once, of numbers to reckon with; NaN and Infinity are no JSON.
 
-    Raises ValueError.
+    Raises ValueError, also for lists in lists that Python's stack cannot hold.
     """
-    return json.loads(
-        text, parse_constant=refuse, object_pairs_hook=once, parse_float=within, parse_int=within
-    )
+    try:
+        return json.loads(
+            text,
+            parse_constant=refuse,
+            object_pairs_hook=once,
+            parse_float=within,
+            parse_int=within,
+        )
+    except RecursionError as error:
+        raise ValueError("its lists and objects are nested too deep") from error
 
 
 def within(text: str) -> float:

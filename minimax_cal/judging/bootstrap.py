@@ -25,6 +25,7 @@ from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.units import for_people, in_files
 from minimax_cal.judging.redrawn import Draw, solved_at_once
@@ -222,7 +223,7 @@ def stepped(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Array]:
     ]
     for done, number in enumerate(np.flatnonzero(good).tolist()):
         if done % PACE == 0:
-            progress(f"replicate {number + 1} of {len(good)}")
+            progress(count_stage("replicate", number + 1, len(good)))
         problem = SumOfSquares(replace(model, weight=model.weight * draws.rows(number)))
         x = problem.step(state, change[number])
         _, gradient, gram = problem.normal(x)
@@ -244,7 +245,7 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
     rest = good.copy()
     for first in range(0, int(good.sum()) if alike else 0, TOGETHER):
         some = np.flatnonzero(good)[first : first + TOGETHER]
-        progress(f"replicate {some[0] + 1} of {len(good)}")
+        progress(count_stage("replicate", int(some[0]) + 1, len(good)))
         told, draw = drawn_distances(fit, np.stack([draws.rows(i) for i in some.tolist()]))
         ends, met = solved_at_once(estimator.model, state, draw, mu, settings)
         for i in np.flatnonzero(told & met):
@@ -252,7 +253,7 @@ def solved_again(fit: Fit, draws: Draws, progress: Progress) -> tuple[Array, Arr
         rest[some[told & met]] = False
     for done, number in enumerate(np.flatnonzero(rest).tolist()):
         if done % PACE == 0:
-            progress(f"replicate {number + 1} of {len(good)}")
+            progress(count_stage("replicate", number + 1, len(good)))
         rows = np.repeat(np.arange(len(draws.member)), draws.rows(number))
         model = estimator.at(rows).model
         distances = measured_distances(train.take(rows), options.distance_tolerance)

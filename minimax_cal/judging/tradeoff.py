@@ -29,6 +29,7 @@ from minimax_cal.fitting.solve import QP_TOLERANCE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
@@ -134,7 +135,7 @@ def curve_of(
         return float(np.linalg.norm((b.place - a.place) / span)) if bends else 0.0
 
     while len(curve) < steps + 2:
-        progress(f"compromise {len(curve) - 1} of {steps}")
+        progress(count_stage("compromise", len(curve) - 1, steps))
         gaps = [width(a, b) for a, b in itertools.pairwise(curve)]
         at = int(np.argmax(gaps))
         if gaps[at] == 0.0:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from minimax_cal.fitting.opened import Result
-from minimax_cal.fitting.options import silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.planning.candidates import Poses, candidates, near, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse
@@ -28,7 +28,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 
 STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the joints' ranges
 AROUND, KEPT = 2400, 400  # poses tried around all of them, and those kept, each time
-Progress = Callable[[str], None]
 
 
 def plan(

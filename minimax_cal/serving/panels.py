@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -13,6 +12,7 @@ from numpy import nan_to_num
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.fitting.fit import load_fit
 from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import json_of
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.reporting.html.more_charts import waterfall
@@ -153,7 +153,7 @@ def understood_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | N
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_bytes())
+        content = json_of(path.read_bytes())
         headline = (
             f"{content['poses']} poses, {content['joints']} joints, "
             f"targets {', '.join(map(str, content['targets']))}"

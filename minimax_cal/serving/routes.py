@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import json
-import os
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
 from functools import lru_cache, wraps
@@ -19,7 +17,7 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import Route
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.files import put_on_disk, replace_on_disk
+from minimax_cal.ground.files import json_of, put_on_disk, replace_on_disk
 from minimax_cal.reporting.html.charts import PALETTE
 from minimax_cal.reporting.html.page import needed, part, template
 from minimax_cal.serving.cell import view_of
@@ -37,6 +35,7 @@ from minimax_cal.serving.steps import DIAGNOSIS, FIT, REPORT, STEPS
 from minimax_cal.serving.work import Work
 
 MOST_WORDS = 1 << 20  # bytes of choices
+MOST_DIGITS = 19  # of a file's length: more than any disk holds
 SEALED = "sandbox allow-scripts allow-downloads allow-modals"  # a report has no part in the page
 KINDS = {"css": "text/css", "js": "text/javascript"}
 Answer = Callable[[Request], Awaitable[Response]]
@@ -95,7 +94,7 @@ async def words_of(request: Request) -> dict[str, Any]:
         if len(raw) > MOST_WORDS:
             raise OptionError("that is too much for choices")
     try:
-        content = json.loads(raw)
+        content = json_of(raw)
     except ValueError:
         content = None
     if not isinstance(content, dict):
@@ -204,29 +203,29 @@ async def put(request: Request) -> Response:
     at = session_of(request)
     path = at.file(GIVEN, request.query_params.get("name", ""))
     room = at.room(path.name)
-    told = request.headers.get("content-length", "0")
+    told = request.headers.get("content-length", "")
+    if not told.isdecimal():
+        return said(OptionError(f"{path.name}: comes without its length"), 411)
     too_large = OptionError(
         f"{path.name}: is larger than {room >> 20} MiB; that is no file of measurements"
     )
-    if not told.isdigit() or int(told) > room:
+    if len(told) > MOST_DIGITS or int(told) > room:
         return said(too_large, 413)
-    part_of_it = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
-    size = 0
+    part_of_it: Path | None = None
     try:
-        with part_of_it.open("wb") as stream:
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size > room:
-                    return said(too_large, 413)
+        part_of_it = at.part(path.name, int(told))
+        with part_of_it.open("r+b") as stream:
+            async for chunk in request.stream():  # no more than its length: the server sees to it
                 stream.write(chunk)
             put_on_disk(stream)
         replace_on_disk(part_of_it, path)
     except OSError as error:
         raise OptionError(f"{path.name}: cannot be kept ({error.strerror})") from error
     finally:
-        with suppress(OSError):
-            part_of_it.unlink(missing_ok=True)
-    return JSONResponse({"name": path.name, "bytes": size})
+        if part_of_it:
+            with suppress(OSError):
+                part_of_it.unlink(missing_ok=True)
+    return JSONResponse({"name": path.name, "bytes": int(told)})
 
 
 @asked

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
@@ -23,6 +25,7 @@ GIVEN, LOG = "given", "log"  # folders of a session: what people dropped, how ea
 CHOICES, SCRIPT = "session.json", "commands.sh"
 MOST_BYTES = 256 << 20  # of a file that is dropped: a million poses
 MOST_FILES, MOST_TOGETHER = 200, 1 << 30  # of a session: how many, and their bytes
+ABANDONED = 3600.0  # [s]; 256 MiB take less on any line to this machine itself
 NAME = re.compile(r"[\w(][\w .()+@=-]{0,119}")
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.I)  # devices of Windows
 SESSION = re.compile(r"[a-z0-9][a-z0-9-]{0,59}")
@@ -116,13 +119,23 @@ class Session:
         return sorted(path.name for path in (self.folder / GIVEN).iterdir() if is_whole(path))
 
     def room(self, name: str) -> int:
-        """How many bytes a file may have that is dropped now.  Raises OptionError for none."""
-        others = [self.folder / GIVEN / one for one in self.given() if one != name]
-        left = MOST_TOGETHER - sum(path.stat().st_size for path in others)
+        """How many bytes a file may have that is dropped now.  Raises OptionError for none.
+
+        Files that are being written count with the length that they are to have.
+        """
+        others = [path for path in (self.folder / GIVEN).iterdir() if path.name != name]
+        left = MOST_TOGETHER - sum(mark(path)[2] for path in others)
         if len(others) >= MOST_FILES or left <= 0:
             most = f"{MOST_FILES} files and {MOST_TOGETHER >> 30} GiB"
             raise OptionError(f"a session holds {most}; remove some, or begin another")
         return min(MOST_BYTES, left)
+
+    def part(self, name: str, size: int) -> Path:
+        """A new hidden file as long as what will be written into it, so that others count it."""
+        path = self.folder / GIVEN / f".{name}.{os.urandom(4).hex()}"
+        with open(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as stream:
+            stream.truncate(size)
+        return path
 
     def remove(self, name: str) -> Choices:
         """Remove a file that was dropped, and every choice of it."""
@@ -194,6 +207,15 @@ def sessions(root: Path) -> list[Session]:
     return sorted(found, key=lambda one: one.folder.stat().st_mtime, reverse=True)
 
 
+def remove_parts(root: Path) -> None:
+    """Remove files that a server began to write and that nobody has written to for long."""
+    for one in sessions(root):
+        for path in (one.folder / GIVEN).glob(".*"):
+            with suppress(OSError):
+                if time.time() - path.stat().st_mtime > ABANDONED:
+                    path.unlink()
+
+
 def has_given(path: Path) -> bool:
     """Whether a folder is one of a session."""
     return (path / GIVEN).is_dir()
@@ -209,7 +231,7 @@ def new_session(root: Path, title: str) -> Session:
     )
     try:
         for folder in (root / name, root / name / GIVEN, root / name / LOG):
-            folder.mkdir()
+            folder.mkdir(mode=0o700)
     except OSError as error:
         raise CalibrationError(f"{root / name}: cannot be made ({error.strerror})") from error
     return Session(root / name)

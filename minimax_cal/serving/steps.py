@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import json_of
 from minimax_cal.robots.robot import builtin_robots
 from minimax_cal.serving.sessions import GIVEN, Choices, Session, mark
 
@@ -144,7 +144,7 @@ def fitted(at: Session) -> str:
 def data_of(path: str, moment: int, size: int) -> str:
     """SHA-256 of the measurements of a result's file at a moment, empty where it tells none."""
     try:
-        content = json.loads(Path(path).read_bytes())
+        content = json_of(Path(path).read_bytes())
         return str(content["provenance"]["data_sha256"])
     except (OSError, ValueError, KeyError, TypeError):
         return ""

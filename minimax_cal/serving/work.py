@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import re
 import shlex
 import sys
 import time
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, json_text, write_whole
+from minimax_cal.ground.stages import clock
 from minimax_cal.ground.words import one_line
 from minimax_cal.serving.sessions import LOG, SCRIPT, Session
 from minimax_cal.serving.steps import Command
@@ -27,9 +27,6 @@ PATIENCE = 5.0  # seconds from asking a process to end to ending it
 MOST_TOLD = 20_000  # letters of stdout that are kept
 MOST_LINES = 400
 MOST_LINE = 1 << 20  # bytes of a line on stderr
-STAGE = re.compile(r"progress: (.*) \(([^()]*)\)")
-COUNT = re.compile(r"(\d+) of (\d+)")
-RUNG = re.compile(r"rung (.+): ([\d.]+) mm")
 
 
 class Record(BaseModel):
@@ -64,7 +61,7 @@ class Job:
     expected: float
     began: float = field(default_factory=time.monotonic)
     stage: str = "waiting for a free core"
-    left: str = ""
+    left: float | None = None
     part: tuple[int, int] | None = None
     rungs: list[tuple[str, str]] = field(default_factory=list)
     notices: list[str] = field(default_factory=list)
@@ -75,27 +72,32 @@ class Job:
     task: asyncio.Task[None] | None = None
 
     def hear(self, line: str) -> None:
-        """A line that the process wrote on stderr."""
-        kind, _, text = line.partition(": ")
-        if found := STAGE.fullmatch(line):
-            stage, times = found.groups()
-            if rung := RUNG.search(stage):
-                self.rungs.append((rung[1], rung[2]))
-            count = COUNT.search(stage)
-            self.part = (int(count[1]) - 1, int(count[2])) if count else None
-            self.stage, self.left = stage, times.partition(", ")[2]
+        """A line that the process wrote on stderr: an event as `cli.stderr` writes it, or not."""
+        try:
+            event = json_of(line)
+            kind, text = event["event"], event["text"]
+        except (ValueError, TypeError, KeyError):
+            kind, text = "", line
+        if kind == "progress":
+            if rung := event.get("rung"):
+                self.rungs.append((rung["name"], f"{rung['holdout_rms_mm']:.3f}"))
+            self.part = (event["part"] - 1, event["parts"]) if "parts" in event else None
+            self.stage, self.left = text, event.get("seconds_left")
         elif kind == "error":
             self.error = text
-        elif kind == "notice" and len(self.notices) < MOST_LINES:
-            self.notices.append(text)
-        elif line:
-            self.other.append(line)
+        elif kind == "notice":
+            if len(self.notices) < MOST_LINES:
+                self.notices.append(text)
+        elif not kind and text:
+            self.other.append(one_line(text))
 
     def state(self) -> dict[str, Any]:
         """For the page."""
         seconds = time.monotonic() - self.began
         rest = self.expected - seconds
-        left = self.left or (f"about {rest:.0f} s left, as last time" if rest >= 1.0 else "")
+        left = f"about {rest:.0f} s left, as last time" if rest >= 1.0 else ""
+        if self.left is not None:
+            left = f"{clock(self.left)} left"
         done = self.part[0] / max(self.part[1], 1) if self.part else None
         return {"step": self.step, "stage": self.stage, "seconds": round(seconds), "left": left,
                 "done": done, "rungs": self.rungs}  # fmt: skip
@@ -146,7 +148,7 @@ class Work:
         """Run a command line; its exit code and what it printed."""
         pipe = asyncio.subprocess.PIPE
         job.process = process = await asyncio.create_subprocess_exec(
-            *child(), str(job.at.folder), *command.words, stdin=pipe, stdout=pipe, stderr=pipe,
+            *child(), str(job.at.folder), *in_json(command), stdin=pipe, stdout=pipe, stderr=pipe,
             limit=MOST_LINE, env={**os.environ, "PYTHONUTF8": "1"},
         )  # fmt: skip
         out, told = (cast(asyncio.StreamReader, s) for s in (process.stdout, process.stderr))
@@ -186,6 +188,11 @@ def child() -> list[str]:
     return [sys.executable, *safe, "-m", "minimax_cal.cli.child"]
 
 
+def in_json(command: Command) -> tuple[str, ...]:
+    """The words of a command that says each stage in a line of JSON."""
+    return (command.words[0], "--progress", "json", *command.words[1:])
+
+
 async def listen(job: Job, stream: asyncio.StreamReader) -> None:
     """Hear every line of stderr."""
     while True:
@@ -195,7 +202,7 @@ async def listen(job: Job, stream: asyncio.StreamReader) -> None:
             continue
         if not raw:
             return
-        job.hear(one_line(raw.decode("utf-8", "replace")))
+        job.hear(raw.decode("utf-8", "replace").strip())
 
 
 def digests(at: Session, command: Command) -> dict[str, str]:

@@ -17,6 +17,7 @@ from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.stages import count_stage
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements
@@ -269,7 +270,7 @@ class Run:
 
         def heard(done: int) -> None:
             if done % 20 == 0 or done == count:
-                self.progress(f"{name}: {done} of {count} poses")
+                self.progress(count_stage(f"{name}:", done, count, " poses"))
 
         rested = at_rest(chain, q, asked, play, heard)
         self.tell(name, rested.moving, rested.touching)

@@ -8,7 +8,8 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.cli import progress
-from minimax_cal.cli.progress import Stages, clock, stages
+from minimax_cal.cli.progress import Stages, stages
+from minimax_cal.ground.stages import Stage, clock, count_stage
 
 
 class Hands:
@@ -24,15 +25,19 @@ class Hands:
 def test_time_left_is_that_of_the_steps_so_far() -> None:
     now = Hands()
     told = Stages(now)
+
+    def replicate(part: int) -> Stage:
+        return count_stage("replicate", part, 10)
+
     assert told.line("geometry") == "geometry (0 s)"
     now.at += 60.0
-    assert told.line("replicate 1 of 10") == "replicate 1 of 10 (1 min 0 s)"
+    assert told.line(replicate(1)) == "replicate 1 of 10 (1 min 0 s)"
     now.at += 4.0  # two steps took four seconds, eight are left
-    assert told.line("replicate 3 of 10") == "replicate 3 of 10 (1 min 4 s, 16 s left)"
+    assert told.line(replicate(3)) == "replicate 3 of 10 (1 min 4 s, 16 s left)"
     now.at += 10.0
-    assert (
-        told.line("part 1 of 3 left out: joint 2") == "part 1 of 3 left out: joint 2 (1 min 14 s)"
-    )
+    first = count_stage("part", 1, 3, " left out: joint 2")
+    assert told.line(first) == "part 1 of 3 left out: joint 2 (1 min 14 s)"
+    assert told.line("rung 3 of 9") == "rung 3 of 9 (1 min 14 s)"  # words are never read back
     assert clock(125.4) == "2 min 5 s"
 
 
@@ -92,3 +97,25 @@ def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None
     places = [out.index(title) for title in titles]
     assert places == sorted(places)
     assert out.index("--cv") > out.index("What is held out:")
+
+
+def test_events_are_lines_of_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every line of stderr is one, in whatever order options stand; the next command is silent."""
+    mc.write_measurements(tmp_path / "poses.csv", mc.simulate("irb120", 30, 2, seed=1).data)
+    command = ("calibrate", "irb120", tmp_path / "poses.csv", "--objective", "sum", "-o",
+               tmp_path / "fit.json", "--bootstrap", 20)  # fmt: skip
+    assert run(*command, "--progress", "json") == 0
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    by_kind = {event["event"]: event for event in events}
+    assert {"progress", "written"} <= set(by_kind)
+    assert by_kind["written"]["text"] == str(tmp_path / "fit.json")
+    counted = [event for event in events if "parts" in event]
+    assert counted[0]["text"] == "replicate 1 of 20"
+    assert (counted[0]["part"], counted[0]["parts"]) == (1, 20)
+    for wrong in (("--objective", "best"), ("--holdout", "-1")):
+        assert run("calibrate", "irb120", tmp_path / "poses.csv", *wrong, "--progress", "json") == 2
+        (event,) = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+        assert (event["event"], event["exit_code"]) == ("error", 2)
+        assert not event["text"].startswith("error")
+    assert run("calibrate", "irb120", tmp_path / "none.csv") == 2
+    assert capsys.readouterr().err.startswith("error: ")

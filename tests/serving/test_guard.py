@@ -1,9 +1,15 @@
 """Who may ask: the right host, the page itself, the token; and what every answer carries."""
 
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
-from served import Served
+from served import PATIENCE, Served
 
 pytest.importorskip("uvicorn", reason="the page needs pip install minimax-cal[app]")
 
@@ -105,3 +111,33 @@ def test_the_pages_name_nothing_outside() -> None:
         text = path.read_text()
         assert "http:" not in text, path
         assert "https:" not in text, path
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the browser is a script of a shell")
+def test_the_token_is_not_in_the_command_line_of_the_browser(tmp_path: Path) -> None:
+    """Whoever shares the machine may read command lines, but not a private file."""
+    browser, heard = tmp_path / "browser", tmp_path / "heard"
+    browser.write_text(f'#!/bin/sh\nprintf %s "$*" > {heard}.part && mv {heard}.part {heard}\n')
+    browser.chmod(0o755)
+    command = [sys.executable, "-m", "minimax_cal.cli", "serve", "--port", "0", "--folder"]
+    process = subprocess.Popen(
+        [*command, str(tmp_path / "sessions")], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, env={**os.environ, "BROWSER": str(browser)},
+    )  # fmt: skip
+    assert process.stdout
+    try:
+        url = process.stdout.readline().strip()
+        end = time.monotonic() + PATIENCE
+        while not heard.exists():
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        said = heard.read_text()
+        assert url.partition("token=")[2] not in said
+        page = Path(said.removeprefix("file://"))
+        assert stat.S_IMODE(page.stat().st_mode) == 0o600
+        assert stat.S_IMODE(page.parent.stat().st_mode) == 0o700
+        assert f'content="0; url={url}"' in page.read_text()
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+    assert not page.exists()

@@ -1,6 +1,8 @@
 """A session is a folder; no name leads out of it, and no choice breaks it."""
 
 import os
+import stat
+import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from minimax_cal.serving.sessions import (
     Session,
     new_session,
     plain_name,
+    remove_parts,
     session,
     sessions,
 )
@@ -106,3 +109,38 @@ def test_the_stamp_changes_with_every_file(at: Session) -> None:
     assert at.stamp() == before
     (at.folder / "fit.json").write_text("{}")
     assert at.stamp() != before
+
+
+def test_files_that_are_being_written_take_their_room(
+    at: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two that are sent at once must not fill a session beyond its limit."""
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_TOGETHER", 1000)
+    part = at.part("large.csv", 900)
+    assert part.stat().st_size == 900
+    assert at.given() == ["poses.csv"]  # it is not there yet
+    assert at.room("new.csv") == 1000 - 900 - 7
+    monkeypatch.setattr("minimax_cal.serving.sessions.MOST_FILES", 2)
+    with pytest.raises(OptionError, match="remove some"):
+        at.room("new.csv")
+
+
+def test_parts_that_a_killed_server_left_are_removed(at: Session) -> None:
+    old, new = at.part("old.csv", 10), at.part("new.csv", 10)
+    os.utime(old, (time.time() - 7200.0,) * 2)
+    remove_parts(at.folder.parent)
+    assert not old.exists()
+    assert new.exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
+def test_sessions_are_private(at: Session) -> None:
+    folders = (at.folder, at.folder / GIVEN, at.folder / "log")
+    assert {stat.S_IMODE(path.stat().st_mode) for path in folders} == {0o700}
+    assert stat.S_IMODE(at.part("x.csv", 3).stat().st_mode) == 0o600
+
+
+def test_choices_nested_too_deep_are_refused(at: Session) -> None:
+    (at.folder / CHOICES).write_text("[" * 100_000)
+    with pytest.raises(OptionError, match=r"session\.json"):
+        at.choices  # noqa: B018

@@ -1,8 +1,10 @@
 """The page's work is the command line's: same numbers, whole files, ended when it is to end."""
 
+import http.client
 import json
 import os
 import socket
+import stat
 import sys
 import time
 from pathlib import Path
@@ -215,6 +217,49 @@ def test_what_does_not_tell_its_length_is_counted(server: Served, fitted: str) -
     while any("huge" in name for name in names) and time.monotonic() < end:
         names = {path.name for path in (folder_of(server, fitted) / "given").iterdir()}
     assert names == {"tracker.csv"}
+
+
+def test_a_file_without_its_length_is_refused(server: Served, fitted: str) -> None:
+    line = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
+    line.putrequest("PUT", f"{fitted}/given?name=x.csv")
+    line.putheader("cookie", f"minimax-cal-{server.port}={server.token}")
+    line.putheader("transfer-encoding", "chunked")
+    line.endheaders()
+    assert line.getresponse().status == 411
+    line.close()
+
+
+DEEP = "[" * 100_000
+
+
+def test_json_nested_too_deep_is_refused(server: Served) -> None:
+    home = server.begin()
+    for method, path in (("PATCH", f"{home}/choices"), ("POST", "/sessions")):
+        answer = server.ask(method, path, DEEP)
+        assert (answer.status, answer.json["error"]) == (400, "expected a JSON object")
+
+
+@pytest.mark.parametrize(
+    "name", ["fit.json", "diagnosis.json", "understood.json", "log/fit.json", "given/robot.json"]
+)
+def test_deep_json_in_a_session_leaves_its_page(server: Served, name: str) -> None:
+    home = server.begin()
+    (folder_of(server, home) / name).write_text('{"a":' * 100_000)
+    if name.startswith("given"):
+        server.choose(home, robot="robot.json")
+    answer = server.ask("GET", f"{home}/state")
+    assert answer.status == 200
+    assert set(answer.json["steps"]) >= {"read", "fit"}
+    assert server.ask("GET", f"{home}/view/workspace").status in (400, 404)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
+def test_what_a_session_holds_is_private(server: Served, fitted: str) -> None:
+    folder = folder_of(server, fitted)
+    found = {path: stat.S_IMODE(path.stat().st_mode) for path in [folder, *folder.rglob("*")]}
+    assert len(found) > 6
+    for path, mode in found.items():
+        assert mode == (0o700 if path.is_dir() else 0o600), path
 
 
 @pytest.mark.parametrize("body", ["", "[]", "{", '{"robot": 1}', '{"x": 1}', "x" * (2 << 20)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +13,13 @@ from minimax_cal.fitting.options import Options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
+from minimax_cal.ground.stages import Progress as Progress
+from minimax_cal.ground.stages import silent as silent
 from minimax_cal.measuring.measurements import FARTHEST
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.solvers.least_squares import AUTO, METHODS
 
-Progress = Callable[[str], None]
 Known = tuple[str, str, float]
-
-
-def silent(message: str) -> None:
-    """Say nothing."""
 
 
 def known_of(text: str) -> Known:

@@ -12,6 +12,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, json_text, made_folder, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.parallel import look_for
+from minimax_cal.ground.stages import count_stage
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import NOT_PASSED, PASSED
 from minimax_cal.judging.watching.result import NOT_VALID, VALID
@@ -121,10 +122,10 @@ def fleet(
     if folder is not None:
         made_folder(folder)
     rows: dict[str, Row] = {}
-    progress(f"cells: 1 of {len(jobs)}")
+    progress(count_stage("cells:", 1, len(jobs)))
     for row in arriving(jobs, processes, cluster):
         rows[row.cell] = row
-        progress(f"cells: {min(len(rows) + 1, len(jobs))} of {len(jobs)}")
+        progress(count_stage("cells:", min(len(rows) + 1, len(jobs)), len(jobs)))
     found = Fleet(tuple(rows[job.told.name] for job in jobs), Path(path).name)
     if page is not None:
         write_whole(page, found.html())

@@ -1,0 +1,41 @@
+"""What commands say on stderr: a line of words each, or a line of JSON for a program that reads."""
+
+from __future__ import annotations
+
+import json
+from contextvars import ContextVar
+from typing import Any
+
+import click
+
+from minimax_cal.ground.words import one_line
+
+AS_JSON: ContextVar[bool] = ContextVar("AS_JSON", default=False)  # of the command that is at work
+
+
+def tell(event: str, text: str, **more: Any) -> None:
+    """Say what happened on stderr.
+
+    event: "progress", "notice", "written", "error" or "summary".  more: what else the JSON holds.
+    """
+    line = one_line(text)
+    if AS_JSON.get():
+        click.echo(json.dumps({"event": event, "text": line, **more}), err=True)
+    else:
+        click.echo(f"{event}: {line}", err=True)
+
+
+def tell_json(_: click.Context, __: click.Parameter, form: str) -> None:
+    """Say all that follows as JSON, where that is asked for."""
+    AS_JSON.set(form == "json")
+
+
+PROGRESS = click.option(
+    "--progress",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    is_eager=True,
+    expose_value=False,
+    callback=tell_json,
+    help="Say notices, progress and errors on stderr as text, or as a line of JSON each.",
+)
