@@ -11,10 +11,10 @@ ROOT = Path(__file__).parent.parent
 FOLDERS = (
     "ground",
     "solvers",
+    "evidence",
     "robots",
     "measuring",
     "modelling",
-    "evidence",
     "fitting",
     "judging",
     "diagnosing",
@@ -57,7 +57,7 @@ def test_imports_point_down(path: Path) -> None:
 
 def test_no_name_of_an_effect_is_compared() -> None:
     """What an effect does, it states; who must speak of one takes the name from its law."""
-    above = {"faults/nests.py", "faults/sessions.py", "evidence/periodogram.py"}  # name their own
+    above = {"faults/nests.py", "faults/sessions.py", "modelling/periodogram.py"}  # name their own
     found = set()
     for path in MODULES:
         if path.parent.name != "effects" or path.parent.parent.name != "modelling":

@@ -24,17 +24,18 @@ from minimax_cal.diagnosing.scatter import weighed_anew
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.library import Candidate, Library, library
-from minimax_cal.evidence.limits import ENOUGH, EXACT, STRUCTURE
+from minimax_cal.evidence.library import Candidate, Library
+from minimax_cal.evidence.limits import ENOUGH, STRUCTURE
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import elsewhere, in_company
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
+from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
+from minimax_cal.modelling.periodogram import elsewhere, in_company
 
 FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
@@ -90,7 +91,7 @@ def causes_of(
         exclude = (*exclude, *play)
         lib, choice = chosen(study, exclude)
         traces = left_by(study, choice)
-    if choice.noise.variance < EXACT**2:
+    if choice.noise.variance < study.rows.exact**2:
         traces = (Trace("rounding", 1.0, 0.0),)
     every, told = (*faults, *read_back), lib.untestable
     causes = Causes(every, lib, tuple(exclude), choice, (), traces, told, wary=False)
@@ -104,26 +105,27 @@ def found_again(study: Study, causes: Causes) -> Causes:
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
-    again = judged_again(found, choice, study.data, causes.library, causes.ripple)
+    again = judged_again(found, choice, study, causes.library, causes.ripple)
     effects = again.findings
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(study, choice, causes.traces) is not None
     return replace(causes, effects=effects, wary=wary, met=again.met)
 
 
-def believed(causes: Causes) -> list[Finding]:
+def believed(causes: Causes, scene: Scene) -> list[Finding]:
     """The effects that are in the model: found often enough, and not held back."""
     every = [term for found in causes.effects for term in found.terms]
-    return [one for one in often(causes.effects) if not held_back(one.terms, every, causes)]
+    often_found = often(causes.effects)
+    return [one for one in often_found if not held_back(one.terms, every, causes, scene)]
 
 
-def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes) -> bool:
+def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes, scene: Scene) -> bool:
     """Whether an effect is a best guess that is in no model.
 
     Names that are one must help the fifths without which they were sought, and none is a wave by
     itself.  terms: of the effect, every: of all that were found with it.
     """
-    return causes.wary and (causes.met > 1.0 or lone(terms, every, causes.library.scene))
+    return causes.wary and (causes.met > 1.0 or lone(terms, every, scene))
 
 
 def lone(terms: Sequence[Term], every: Sequence[Term], scene: Scene) -> bool:
@@ -191,7 +193,7 @@ def chosen(
     study: Study, exclude: Sequence[str], first: Sequence[Candidate] = ()
 ) -> tuple[Library, Choice]:
     """The library and what it explains.  first: what was chosen with other weights."""
-    lib = library(study.scene, study.rows, exclude)
+    lib = arm_library(study.scene, study.rows, exclude)
     if SESSION_JUMP.name not in exclude:
         lib = with_jumps(lib, study)
     return lib, selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
@@ -277,7 +279,7 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
         for i in unclear:
             rival = found[i][0].candidate.term
             advice[i] = separate_with(site, Pair(one.candidate.term, one.value, rival, others))
-    columns = one.candidate.term.columns(table.library.scene)
+    columns = one.candidate.term.columns(study.scene)
     size, _ = table.likeness(one, one.candidate)
     return Finding(
         terms=(one.candidate.term,),

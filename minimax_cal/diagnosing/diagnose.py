@@ -43,7 +43,6 @@ from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
 from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
-from minimax_cal.evidence.library import library
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
@@ -72,6 +71,7 @@ from minimax_cal.measuring.grouping import clusters, held_out, split, with_group
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
 from minimax_cal.robots.robot import Robot, load_robot
@@ -250,7 +250,7 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
 
     With the error maps, and fine waves, that joints have besides.
     """
-    often = believed(causes)
+    often = believed(causes, study.scene)
     chosen = [term for finding in often for term in finding.terms]
     causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
     ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)
@@ -400,4 +400,5 @@ def resemblance(
     moved = np.einsum("ab,kma->kbm", study.fit.state.rotation, displacement[:, rows])
     clock = np.unique(study.scene.column("clock"))  # a jump may be at any moment
     study = replace(study, moments=clock[EARLIEST : len(clock) - EARLIEST])
-    return resemblances(with_jumps(library(study.scene, study.rows), study), moved)
+    lib = with_jumps(arm_library(study.scene, study.rows), study)
+    return resemblances(lib, study.rows.of(moved[None]))

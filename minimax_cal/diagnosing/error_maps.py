@@ -29,12 +29,12 @@ from minimax_cal.diagnosing.remainder import (
 )
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.evidence.limits import NEARLY
-from minimax_cal.evidence.periodogram import Line, elsewhere, expected
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
 from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
 from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.periodogram import Line, elsewhere, expected
 
 LEVEL = 1e-3  # chance that groups gain so much by a map of a joint that has none
 USUAL = 1e-3  # size of slow laws [rad]

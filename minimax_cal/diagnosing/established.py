@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.bench import Added, Bench, bench
 from minimax_cal.evidence.library import Library
@@ -31,7 +32,6 @@ from minimax_cal.evidence.limits import (
 from minimax_cal.evidence.noise import identified, remaining
 from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import EFFECTS
 
 UNASKED = float("nan")  # how often an effect is found again where poses are too few to ask
@@ -51,7 +51,7 @@ class Again:
 
 
 def judged_again(
-    findings: Sequence[Finding], whole: Choice, data: Measurements, library: Library, ripple: bool
+    findings: Sequence[Finding], whole: Choice, study: Study, library: Library, ripple: bool
 ) -> Again:
     """The findings, sought anew without each fifth.
 
@@ -59,11 +59,11 @@ def judged_again(
     """
     if not findings:
         return Again((), UNASKED)
-    part = folds(data, FOLDS)
+    part = folds(study.data, FOLDS)
     known: list[list[bool]] = [[] for _ in findings]
     rich, choices = 0, []
     for number in range(FOLDS):
-        rest = library.only(part != number)
+        rest = library.only(study.rows.at(part != number))
         rich += rest.products.dof(NOTHING) >= LEAST_DOF
         choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
         choices.append(choice)

@@ -29,9 +29,11 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
-    choice = select(causes.library.only(rows), ripple=causes.ripple, seldom=MOST)
+    choice = select(causes.library.only(study.rows.at(rows)), ripple=causes.ripple, seldom=MOST)
     every = [candidate.term for candidate in choice.chosen]
-    named = [terms for terms in effects_of(choice) if not held_back(terms, every, causes)]
+    named = [
+        terms for terms in effects_of(choice) if not held_back(terms, every, causes, study.scene)
+    ]
     return climbed(small, causes.maps.beside(named), wary=causes.wary)
 
 

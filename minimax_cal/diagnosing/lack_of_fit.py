@@ -21,13 +21,14 @@ from scipy import stats
 from minimax_cal.diagnosing.where.residual import evened
 from minimax_cal.diagnosing.where.significance import score_flips
 from minimax_cal.evidence.limits import MATTERS, SCATTER, STRUCTURE, WORTH
-from minimax_cal.evidence.noise import Noise, Rows, inflation
+from minimax_cal.evidence.noise import Noise, inflation
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import from_means, summed, visits
 from minimax_cal.modelling.effects.scene import Scene, joint_of, turning
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import ROOM
+from minimax_cal.modelling.rows import Rows
 from minimax_cal.robots.kinematics import cross
 
 SHARE = 0.3  # of the degrees of freedom that a test may take at most
@@ -225,7 +226,7 @@ def rest_of(rows: Rows, noise: Noise, known: Array) -> Rest:
     basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
     rest = rows.error * root
     rest = rest - basis @ (basis.T @ rest)
-    return Rest(rest, basis, root, rows.count - basis.shape[1], rows.group, rows.weight.shape[1])
+    return Rest(rest, basis, root, rows.count - basis.shape[1], rows.group, rows.width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +301,7 @@ def structure(
     """
     rest = rest_of(rows, noise, known)
     found = []
-    r = rows.weight.shape[1]
+    r = rows.width
     wide, narrow = list(probes(scene)), [p for one in names for p in narrowly(scene, one)]
     for number, probe in enumerate((*wide, *narrow)):
         moved = rows.of(probe.motion) * rest.root[:, None]
@@ -419,7 +420,7 @@ def shrunk(own: tuple[float, float], left: tuple[float, float]) -> tuple[float, 
 def strongest_wave(scene: Scene, rows: Rows, rest: Rest) -> tuple[float, float]:
     """The strongest wave cos(a q_i + b q_j) of any joint, all waves tried."""
     angles = turning(scene)
-    r = rows.weight.shape[1]
+    r = rows.width
     arms = rows.of(scene.jacobian) * rest.root[:, None]
     score = (arms * rest.rows[:, None]).reshape(-1, r, scene.joints).sum(axis=1)
     size = (arms**2).reshape(-1, r, scene.joints).sum(axis=1)

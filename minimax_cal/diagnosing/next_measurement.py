@@ -15,13 +15,14 @@ from functools import cached_property
 import numpy as np
 
 from minimax_cal.evidence.limits import ENOUGH
-from minimax_cal.evidence.noise import Noise, Rows, identified, rows_of
+from minimax_cal.evidence.noise import Noise, identified
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term, fields_of, of_sessions
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.rows import Rows, rows_of
 from minimax_cal.robots.transforms import level_to
 
 MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal

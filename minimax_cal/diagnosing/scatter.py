@@ -16,9 +16,10 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.limits import EXACT, LEAST_DOF, UNLIKE
-from minimax_cal.evidence.noise import linearised, orthonormal, restricted
+from minimax_cal.evidence.limits import LEAST_DOF, UNLIKE
+from minimax_cal.evidence.noise import orthonormal, restricted
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.rows import linearised
 from minimax_cal.robots.kinematics import cross
 
 LEAST = 1e-7  # standard deviation that is none [m, rad]
@@ -33,9 +34,9 @@ def weighed_anew(study: Study, known: Array, *, each: bool = True) -> Study:
     structure is left, which would pass for scatter of its joint.
     """
     whole = np.asarray((study.rows.weight > 0.0).all(axis=1))
-    dof = int(whole.sum()) * study.rows.weight.shape[1] - study.rows.basis.shape[1] - known.shape[1]
+    dof = int(whole.sum()) * study.rows.width - study.rows.basis.shape[1] - known.shape[1]
     noise = restricted(study.rows, known)
-    if dof < LEAST_DOF or noise.variance < EXACT**2:
+    if dof < LEAST_DOF or noise.variance < study.rows.exact**2:
         return study
     joints, sight = motions(study)
     rest = WholePoses.of(study, known, whole)
@@ -81,7 +82,7 @@ def weighed(study: Study, joints: Array, sight: Sequence[Array], size: Array) ->
         more * np.sqrt(max(along, across) - both) / usual,
     ])  # fmt: skip
     rows = linearised(study.model, study.fit.state, parts)
-    return replace(study, rows=replace(rows, poses=study.rows.poses), uneven=mean / both)
+    return replace(study, rows=rows.with_poses(study.rows.poses), uneven=mean / both)
 
 
 @dataclass(frozen=True, eq=False)

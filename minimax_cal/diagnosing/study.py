@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Rows, linearised
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.ground.arrays import Array
@@ -17,6 +16,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.joint_fit import extended, scene_of
 from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.rows import Rows, linearised
 from minimax_cal.robots.robot import Robot
 
 SUM = Options(objective="sum")
@@ -58,5 +58,5 @@ def studied(robot: Robot, data: Measurements, fit: Solved) -> Study:
     if fit.effects.terms:
         model, _ = extended(model, robot, data, state, fit.effects.terms)
     scene = scene_of(robot, data, model, state)
-    rows = replace(linearised(model, state, scene.jacobian), poses=groups(data))
+    rows = linearised(model, state, scene.jacobian).with_poses(groups(data))
     return Study(robot, data, model, fit, scene, rows)

@@ -23,7 +23,7 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
         if other.candidate.key in seen or other.evidence <= 0.0:
             continue
         close = near(one, other)
-        alike = other.candidate.term.effect == one.candidate.term.effect  # as all joints hold one
+        alike = other.candidate.family == one.candidate.family  # as all joints hold one
         if not close and (alike or other.evidence < one.evidence - LUCK):
             continue
         size, rho2 = table.likeness(one, other.candidate)
@@ -42,18 +42,17 @@ def near(one: Added, other: Added) -> bool:
     """
     if other.evidence > one.evidence - BAND:
         return True
-    if other.candidate.term.effect == one.candidate.term.effect:
+    if other.candidate.family == one.candidate.family:
         return False
     fit, rival = (x.gain - 2.0 * len(x.candidate.main) for x in (one, other))
     return rival > fit - LIGHT
 
 
-def resemblances(lib: Library, displacement: Array) -> dict[tuple[str, str], float]:
-    """rho^2 of every candidate with a displacement (k, 3, m) in base axes [m]: the best variant.
+def resemblances(lib: Library, column: Array) -> dict[tuple[str, str], float]:
+    """rho^2 of every candidate with rows (N, 1) that something adds to the error: the best variant.
 
     Projected on what geometry cannot imitate and weighed by the noise that the data show with it.
     """
-    column = lib.rows.of(displacement[None])
     noise = restricted(lib.rows, column)
     root = np.sqrt(noise.weights(lib.rows))[:, None]
     basis = np.linalg.qr(lib.rows.basis * root)[0]

@@ -13,7 +13,6 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
-from minimax_cal.evidence.periodogram import is_expected
 from minimax_cal.evidence.products import LEAST, At, within
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
@@ -145,7 +144,7 @@ class Bench:
     def line(self, c: Candidate) -> Candidate | None:
         """The line that was stored as a candidate later."""
         lines = self.library.lines.candidates if self.library.lines else ()
-        return next((one for one in lines if one.term.text == c.term.text), None)
+        return next((one for one in lines if one.text == c.text), None)
 
     def added(self, c: Candidate) -> Added:
         """A candidate beside what was chosen, at its best ratio."""
@@ -204,7 +203,7 @@ class Bench:
         if not c.is_line:
             return self.tries / (1.0 - 2.0 * LINES)
         heard = [one.term for one in self.chosen if one.is_line]
-        return c.tries / (1.0 if is_expected(self.library.scene, c.term, heard) else LINES)
+        return c.tries / (1.0 if self.library.dictionary.is_expected(c.term, heard) else LINES)
 
     def improbable(self, one: Added, level: float) -> bool:
         """Whether a gain is less probable than a level, by all rows and by groups of them."""

@@ -1,52 +1,49 @@
-"""All effects that data can test: candidates with the columns of their motions."""
+"""All laws that data can test: candidates with the columns of a dictionary, each stored once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Rows
+from minimax_cal.evidence.dictionary import Dictionary, Key, Spec
+from minimax_cal.evidence.noise import Problem
 from minimax_cal.evidence.products import Columns, Products
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import EFFECTS, FREE, Term
 
 GONE = 1e-8  # share of a field that poses must show
-SHAPES = FREE - {"turns"}  # found by a search whose tries are counted
 FAINT = 1e-5  # share of a field that must remain after projection for it to be tested
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A term with its columns in the matrix of all candidates.
+    """A law with its columns in the matrix of all candidates.
 
     main: (d,) columns.  doubt: (r,) further columns, one sigma each per unit of main[owner].
-    tries: of a line, how many frequencies were looked at, at all joints, to find it and its like.
-    upward: (d,) True for parameters that no body has below 0.
+    tries: of a line, how many frequencies were looked at, at all places, to find it and its like.
+    upward: (d,) True for parameters that are never below 0.  The others as in `Spec`.
     """
 
-    term: Term
+    term: Any
+    text: str
+    key: Key
     main: Array
     doubt: Array
     owner: Array
     tries: float
     upward: Array
+    typical: float
+    shapes: int
+    repeats: bool
+    course: str
 
     @property
-    def shapes(self) -> int:
-        """Numbers of its law that are tuned, and cost as parameters do: not those that `tries`
-        counts.
-        """
-        tuned = (value for name, value in self.term.choice.items() if name in SHAPES)
-        return int(sum(np.isfinite(value) for value in tuned))
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Effect and place."""
-        return self.term.effect, self.term.place
+    def family(self) -> str:
+        """The effect, wherever it is."""
+        return self.key[0]
 
     @property
     def is_line(self) -> bool:
@@ -76,7 +73,6 @@ class Kind:
     def of(same: Sequence[Candidate]) -> Kind:
         """Of candidates."""
         main, doubt = (np.array([getattr(c, name) for c in same]) for name in ("main", "doubt"))
-        effects = [EFFECTS[c.term.effect] for c in same]
         return Kind(
             tuple(same),
             main,
@@ -84,7 +80,7 @@ class Kind:
             np.array([c.owner for c in same]),
             np.array([len(c.main) + c.shapes for c in same]),
             np.array([c.tries for c in same]),
-            np.array([effect.typical for effect in effects]),
+            np.array([c.typical for c in same]),
             np.array([len(c.upward) == 1 and c.upward.all() for c in same]),
         )
 
@@ -118,44 +114,59 @@ class Aside:
 class Library:
     """All candidates that these data can test.
 
-    products: of their columns, which all libraries of the same data share.  untestable: effect and
-    what the data lack.  found: candidates stored later, by the text of their terms.  lines: of
-    gears, as the last search found them.
+    products: of their columns, which all libraries of the same data share.  untestable: family and
+    what the data lack.  found: candidates stored later, by their text.  lines: as the last search
+    found them.
     """
 
-    scene: Scene
-    rows: Rows
+    dictionary: Dictionary
     products: Products
     candidates: tuple[Candidate, ...]
-    untestable: tuple[tuple[str, str], ...] = ()
+    untestable: tuple[Key, ...] = ()
     found: dict[str, Candidate] = field(default_factory=dict)
     lines: Aside | None = None
 
     @staticmethod
-    def empty(scene: Scene, rows: Rows) -> Library:
+    def empty(dictionary: Dictionary) -> Library:
         """No candidates yet."""
-        return Library(scene, rows, Products(Columns(rows), np.ones(len(rows.error), bool)), ())
+        rows = dictionary.problem
+        products = Products(Columns(rows), np.ones(len(rows.error), bool))
+        return Library(dictionary, products, ())
+
+    @staticmethod
+    def of(dictionary: Dictionary, terms: Sequence[Any], untestable: Sequence[Key]) -> Library:
+        """Of some laws, without those that the nuisance columns imitate."""
+        lib = Library.empty(dictionary)
+        stack = Stack(dictionary)
+        candidates = tuple(c for c in map(stack.add, terms) if c is not None)
+        lib.products.columns.append(stack.columns)
+        return replace(lib, candidates=candidates, untestable=tuple(untestable)).shown()
+
+    @property
+    def rows(self) -> Problem:
+        """The problem."""
+        return self.dictionary.problem
 
     @property
     def columns(self) -> Array:
         """(N, D) fields of all candidates as rows."""
         return self.products.columns.raw
 
-    def with_terms(self, terms: Sequence[tuple[Term, float]]) -> list[Candidate]:
+    def with_terms(self, terms: Sequence[tuple[Any, float]]) -> list[Candidate]:
         """Candidates of further terms, their columns stored.  terms: with their tries."""
-        stack = Stack(self.scene, self.rows, self.products.columns.count)
+        stack = Stack(self.dictionary, self.products.columns.count)
         out = []
         for term, tries in terms:
             c = self.found.get(term.text) or stack.add(term, tries)
             if c is not None:
-                self.found[term.text] = c
+                self.found[c.text] = c
                 out.append(c)
         self.products.columns.append(stack.columns)
         return out
 
-    def aside(self, terms: Sequence[tuple[Term, float]]) -> Aside:
+    def aside(self, terms: Sequence[tuple[Any, float]]) -> Aside:
         """Candidates of further terms that are not stored.  terms: with their tries."""
-        stack = Stack(self.scene, self.rows)
+        stack = Stack(self.dictionary)
         found = (stack.add(term, tries) for term, tries in terms)
         candidates = tuple(c for c in found if c is not None)
         return Aside(candidates, stack.columns, self.products.columns.cleared(stack.columns))
@@ -175,12 +186,11 @@ class Library:
             return np.asarray(self.lines.clear[index])
         return self.products.clear(index)
 
-    def only(self, poses: Array) -> Library:
-        """The library for some of the poses, of which the others' columns are taken away.
+    def only(self, kept: Array) -> Library:
+        """The library for some of the rows, of which the others' columns are taken away.
 
-        poses: (m,) whether each counts.
+        kept: (N,) True for rows that count.
         """
-        kept = np.repeat(np.asarray(poses, dtype=bool), self.rows.weight.shape[1])
         return replace(self, products=self.products.of(kept)).shown()
 
     def shown(self) -> Library:
@@ -191,7 +201,7 @@ class Library:
         every = (products.columns.raw**2).sum(axis=0)  # what a part shows less of is rounding
         clear = (left > FAINT * whole[0]) & (whole[0] > GONE * every)
         shown = tuple(c for c in self.candidates if clear[c.main].all())
-        gone = {c.term.effect for c in self.candidates} - {c.term.effect for c in shown}
+        gone = {c.family for c in self.candidates} - {c.family for c in shown}
         lacking = [(name, "poses at which geometry does not imitate it") for name in sorted(gone)]
         return replace(self, candidates=shown, untestable=(*self.untestable, *lacking))
 
@@ -199,9 +209,9 @@ class Library:
 class Stack:
     """Columns as they are gathered, each stored once."""
 
-    def __init__(self, scene: Scene, rows: Rows, count: int = 0) -> None:
-        self.scene, self.rows, self.count = scene, rows, count
-        self.blocks: list[Array] = [np.zeros((len(rows.error), 0))]
+    def __init__(self, dictionary: Dictionary, count: int = 0) -> None:
+        self.dictionary, self.count = dictionary, count
+        self.blocks: list[Array] = [np.zeros((len(dictionary.problem.error), 0))]
         self.seen: dict[bytes, int] = {}
 
     @property
@@ -209,10 +219,10 @@ class Stack:
         """(N, d) all of them."""
         return np.concatenate(self.blocks, axis=1)
 
-    def place(self, fields: Array) -> Array:
-        """Indices of the columns of fields (d, k, 3, m)."""
+    def place(self, columns: Array) -> Array:
+        """Indices of columns (N, d)."""
         out = []
-        for column in self.rows.of(fields).T:
+        for column in columns.T:
             mark = np.float32(column).tobytes()
             if mark not in self.seen:
                 self.seen[mark] = self.count
@@ -221,37 +231,26 @@ class Stack:
             out.append(self.seen[mark])
         return np.array(out, dtype=int)
 
-    def add(self, term: Term, tries: float = 1.0) -> Candidate | None:
-        """One candidate; None if nothing of it moves a point."""
-        columns = term.columns(self.scene)
-        fields = columns.displacement(self.scene)
-        if not np.any(fields):
-            return None
-        every, owners = [fields], []
-        for number, doubt in columns.doubts(self.scene):
-            every.append(doubt)
-            owners += [number] * len(doubt)
-        main, doubt = np.split(self.place(np.concatenate(every)), [len(fields)])
-        upward = EFFECTS[term.effect].upward(columns)
-        return Candidate(term, main, doubt, np.array(owners, dtype=int), tries, upward)
+    def add(self, term: Any, tries: float = 1.0) -> Candidate | None:
+        """One candidate; None if it adds nothing to any row."""
+        found = self.dictionary.spec(term)
+        return None if found is None else self.candidate(found, tries)
 
-
-def library(scene: Scene, rows: Rows, exclude: Sequence[str] = ()) -> Library:
-    """Every effect at every place in every variant that the data can test."""
-    terms, untestable = [], []
-    for name, effect in EFFECTS.items():
-        if name in exclude or effect.is_map:  # maps are sought when the rest is known
-            continue
-        if missing := effect.needs(scene):
-            untestable.append((name, missing))
-            continue
-        places = effect.places(scene)
-        for place in places:
-            terms += [Term(name, place, c) for c in effect.choices(scene, place)]
-        if not places:
-            untestable.append((name, "poses or joints at which it would show"))
-    lib = Library.empty(scene, rows)
-    stack = Stack(scene, rows)
-    candidates = tuple(c for c in map(stack.add, terms) if c is not None)
-    lib.products.columns.append(stack.columns)
-    return replace(lib, candidates=candidates, untestable=tuple(untestable)).shown()
+    def candidate(self, found: Spec, tries: float) -> Candidate:
+        """A law whose columns are stored here."""
+        columns = np.concatenate([found.columns, found.doubts], axis=1)
+        main, doubt = np.split(self.place(columns), [found.columns.shape[1]])
+        return Candidate(
+            term=found.term,
+            text=found.text,
+            key=found.key,
+            main=main,
+            doubt=doubt,
+            owner=found.owner,
+            tries=tries,
+            upward=found.nonnegative,
+            typical=found.typical,
+            shapes=found.tuned,
+            repeats=found.repeats,
+            course=found.course,
+        )

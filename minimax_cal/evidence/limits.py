@@ -7,7 +7,6 @@ is `python -m experiments.machine_gap`, with seeds other than that of the printe
 # ---- what is named -------------------------------------------------------------------------------
 
 LEVEL = 0.005  # chance of any name on data without an effect: half of the budget
-EXACT = 1e-8  # noise below which data were computed, not measured [m]
 LEAST_DOF = 15  # rows beyond parameters: of fewer nothing is said
 TIE = 2.0  # of evidence that a replacement must gain, so that choices do not go round
 REFINED = 6  # effects among which each is compared anew with all others: more change nothing

@@ -1,105 +1,61 @@
-"""The linearised fit with two kinds of noise: of the instrument, and of the joints at every pose.
+"""A linear problem with two kinds of noise, and its noises by restricted maximum likelihood.
 
-A pose's errors have the covariance s^2 I + t^2 S S', with S the motion of its points per radian of
-each joint: the joints do not stop exactly where they are told.  In the eigenvectors of S S' that
-matrix is diagonal for any s and t, so that one rotation of the rows makes every later step plain
-weighted least squares.  s and t are estimated by restricted maximum likelihood [Patterson and
-Thompson 1971].
+The rows are given such that the covariance s^2 I + t^2 V of the two noises is diagonal, V the
+variance ratios: then every later step is plain weighted least squares.  s and t are estimated by
+restricted maximum likelihood [Patterson and Thompson 1971].  Nothing here knows a robot.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from minimax_cal.evidence.ratios import likeliest
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Model
-from minimax_cal.modelling.parameters import State
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
 SAME = 1e-12  # added to products of unit columns where some are the same
+ROUNDING = 0.1  # of the noise of computed rows: no variance is estimated below its square
 FREE = 3  # degrees of freedom below which no noise is told from another
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Rows of a linear fit, poses rotated so that both noises are diagonal.
+class Problem:
+    """Rows of a linear fit in which two noises are diagonal.
 
-    error: (N,) what the geometry leaves [m].  basis: (N, p) orthonormal span of the geometry.
-    variance_ratio: (N,) variance of a row per variance of the joints, relative to its mean.
-    size: the mean [m^2/rad^2].  count: rows that were measured.
-    turn: (m, r, r) the rotations, r = 3k.  weight: (m, r) square roots of the points' weights.
-    poses: (m,) a number, from 0, of each pose, of repeats the same.
+    error: (N,) what is to be explained.  basis: (N, p) orthonormal span of the nuisance columns,
+    always projected out.  variance_ratio: (N,) variance that the second noise adds to a row, over
+    that of the first, relative to its mean; size: the mean.  group: (N,) from 0, of rows that err
+    together.  measured: (N,) False for rows that hold no number.  exact: a noise below it is
+    rounding: the rows were computed, not measured.
     """
 
     error: Array
     basis: Array
     variance_ratio: Array
     size: float
-    count: int
-    turn: Array
-    weight: Array
-    poses: Array
+    group: Array
+    measured: Array
+    exact: float
 
     @property
-    def group(self) -> Array:
-        """(N,) the pose of each row."""
-        return np.repeat(self.poses, self.weight.shape[1])
+    def count(self) -> int:
+        """Rows that were measured."""
+        return int(np.count_nonzero(self.measured))
 
-    def of(self, fields: Array) -> Array:
-        """(N, D) displacement fields (D, k, 3, m) as rows."""
-        d, k, _, m = fields.shape
-        flat = np.moveaxis(fields.reshape(d, 3 * k, m), -1, 0) * self.weight[:, None, :]
-        return np.asarray((flat @ self.turn).swapaxes(1, 2).reshape(3 * k * m, d))
+    def beside(self, columns: Array) -> Self:
+        """With columns (N, q) projected out as nuisance is, as far as they are determined.
 
-    def beside(self, columns: Array) -> Rows:
-        """With columns (N, q) projected out as geometry is, as far as they are told.
-
-        columns: of factors whose priors weigh as one row of unit error; what is told of a direction
-        by no more than that is left.
+        columns: of factors whose priors weigh as one row of unit error; a direction that is
+        determined by no more than that is left.
         """
         rest = columns - self.basis @ (self.basis.T @ columns)
         span, size, _ = np.linalg.svd(rest, full_matrices=False)
         span = span[:, size > 1.0]
         error = self.error - span @ (span.T @ self.error)
         return replace(self, error=error, basis=np.concatenate([self.basis, span], axis=1))
-
-    def back(self, rows: Array) -> Array:
-        """(k, 3, m) rows (N,) as points again; what was not measured is 0."""
-        m, r = self.weight.shape
-        flat = (self.turn @ rows.reshape(m, r, 1))[..., 0]
-        plain = np.where(self.weight > 0, flat / np.where(self.weight > 0, self.weight, 1.0), 0.0)
-        return np.asarray(plain.T.reshape(r // 3, 3, m))
-
-
-def rows_of(error: Array, jacobian: Array, joint_jacobian: Array, weight: Array) -> Rows:
-    """Rows from an error (k, 3, m), geometry's Jacobian (k, p, 3, m), slope (n, k, 3, m).
-
-    weight: (k, m) of each point, 0 where not measured.
-    """
-    k, _, m = error.shape
-    root = np.repeat(np.sqrt(weight)[:, None], 3, axis=1).reshape(3 * k, m).T
-    arm = (
-        np.moveaxis(joint_jacobian.reshape(len(joint_jacobian), 3 * k, m), -1, 0) * root[:, None, :]
-    )
-    spread, turn = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)
-    spread = np.maximum(spread, 0.0).reshape(-1)
-    count = 3 * int(np.count_nonzero(weight))
-    size = float(spread.sum() / count)
-    alone = np.arange(m)
-    bare = Rows(np.zeros(0), np.zeros((0, 0)), spread / size, size, count, turn, root, alone)
-    matrix = bare.of(np.moveaxis(jacobian, 1, 0))
-    rest = bare.of(np.where(weight[:, None] > 0, error, 0.0)[None])[:, 0]
-    return replace(bare, error=rest, basis=orthonormal(matrix))
-
-
-def linearised(model: Model, state: State, joint_jacobian: Array) -> Rows:
-    """The rows of a model at a fitted state.  joint_jacobian: (n, k, 3, m) as `Scene.jacobian`."""
-    error = np.nan_to_num(np.swapaxes(model.error(state), -1, -2))
-    jacobian = np.moveaxis(model.jacobian(state), (1, 2, 3), (3, 2, 1))
-    return rows_of(error, jacobian, joint_jacobian, model.weight)
 
 
 def orthonormal(matrix: Array) -> Array:
@@ -154,12 +110,12 @@ class Noise:
     variance: float
     jitter: float
 
-    def weights(self, rows: Rows) -> Array:
+    def weights(self, rows: Problem) -> Array:
         """(N,) inverse variances [1/m^2]."""
         return np.asarray(1.0 / (self.variance * (1.0 + self.ratio * rows.variance_ratio)))
 
 
-def remaining(rows: Rows, weight: Array, known: Array) -> Array:
+def remaining(rows: Problem, weight: Array, known: Array) -> Array:
     """(N,) what the weighted least squares on geometry and known columns leaves of the error [m].
 
     weight: (N,) inverse variances, 0 for rows that are not fitted.  known: (N, q).
@@ -171,12 +127,16 @@ def remaining(rows: Rows, weight: Array, known: Array) -> Array:
     return np.asarray(rows.error - columns @ value)
 
 
-def restricted(rows: Rows, known: Array) -> Noise:
+def restricted(rows: Problem, known: Array) -> Noise:
     """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
     dof = rows.count - columns.shape[1] + 1
     if dof < FREE:
-        return Noise(0.0, float(rows.error @ rows.error) / max(rows.count, 1) + 1e-18, 0.0)
+        return Noise(
+            0.0,
+            float(rows.error @ rows.error) / max(rows.count, 1) + (ROUNDING * rows.exact) ** 2,
+            0.0,
+        )
 
     def cost(ratios: Array) -> tuple[Array, Array]:
         halves = (columns / np.sqrt(1.0 + r * rows.variance_ratio)[:, None] for r in ratios)
@@ -187,7 +147,7 @@ def restricted(rows: Rows, known: Array) -> Noise:
     return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
 
-def noise_of(ratio: float, variance: float, rows: Rows) -> Noise:
+def noise_of(ratio: float, variance: float, rows: Problem) -> Noise:
     """Both noises of a ratio and of the variance of the instrument."""
     return Noise(ratio, variance, float(np.sqrt(ratio * variance / rows.size)))
 

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import FREE, Noise, Rows, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.noise import FREE, Noise, Problem, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
 from minimax_cal.ground.arrays import Array
 
@@ -28,7 +28,7 @@ class Columns:
     is lost where products of what is left are differences.
     """
 
-    def __init__(self, rows: Rows) -> None:
+    def __init__(self, rows: Problem) -> None:
         self.rows = rows
         self.fixed = rows.basis.shape[1] + 1  # geometry and the error
         self.count = 0
@@ -359,9 +359,7 @@ class Products:
     @cached_property
     def count(self) -> int:
         """Rows that were measured and count."""
-        rows = self.columns.rows
-        lost = ~self.kept.reshape(rows.weight.shape) & (rows.weight > 0.0)
-        return rows.count - int(np.count_nonzero(lost))
+        return int(np.count_nonzero(self.kept & self.columns.rows.measured))
 
     def dof(self, index: Array) -> int:
         """Degrees of freedom beside the geometry and some of the candidates' columns."""

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +24,10 @@ from minimax_cal.evidence.bench import (
     credible,
     together,
 )
+from minimax_cal.evidence.dictionary import Dictionary
 from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
-    EXACT,
     LEAST_DOF,
     LEVEL,
     MOST,
@@ -36,13 +37,9 @@ from minimax_cal.evidence.limits import (
     TIE,
     TUNINGS,
 )
-from minimax_cal.evidence.noise import FREE, Noise, Rows
-from minimax_cal.evidence.periodogram import strongest_lines
+from minimax_cal.evidence.noise import FREE, Noise
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.effects.scene import Scene
-from minimax_cal.modelling.effects.table import EFFECTS, Term
 
-DRIVEN = {"time": "time", "move": "move", "approach": "move"}  # effects that follow one thing
 NOTHING: Array = np.zeros(0, dtype=int)
 
 
@@ -114,7 +111,7 @@ def select(
     """
     lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
-    if noise.variance < EXACT**2 or lib.products.dof(NOTHING) < LEAST_DOF:
+    if noise.variance < lib.rows.exact**2 or lib.products.dof(NOTHING) < LEAST_DOF:
         return Choice(lib, (), noise)
     if fits:  # weighed otherwise now
         lib, fits = refined(lib, fits, level, last=True)
@@ -123,9 +120,7 @@ def select(
         if ripple:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
             heard = [one.candidate.term for one in fits if one.candidate.is_line]
-            found = strongest_lines(
-                lib.scene, lib.rows, noise, known, kept=lib.products.kept, heard=heard
-            )
+            found = lib.dictionary.lines(noise, known, lib.products.kept, heard)
             lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
@@ -160,12 +155,12 @@ def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
 def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
     """The library and the effects that were chosen of another, in their order."""
     fits: list[Added] = []
-    known = {c.term.text: c for c in lib.candidates}
+    known = {c.text: c for c in lib.candidates}
     for c in first:
-        mine = known.get(c.term.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
+        mine = known.get(c.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
         if mine is None:
             continue
-        if c.term.text not in known:
+        if c.text not in known:
             lib = replace(lib, candidates=(*lib.candidates, mine))
         fits.append(bench(lib, [one.candidate for one in fits], fits).added(mine))
     return lib, fits
@@ -190,8 +185,7 @@ def without(fits: Sequence[Added], number: int) -> tuple[list[Candidate], list[A
 def repeated(c: Candidate, chosen: Sequence[Candidate]) -> bool:
     """Whether an effect is at a place already; lines of one cause may be several."""
     same = [other for other in chosen if other.key == c.key]
-    several = EFFECTS[c.term.effect].lines and c.term.place != "all"
-    return any(not several or other.term.text == c.term.text for other in same)
+    return any(not c.repeats or other.text == c.text for other in same)
 
 
 def addition(
@@ -243,11 +237,10 @@ def tuned(table: Bench, best: Added) -> Added:
     The candidate returned belongs to no library yet: `adopted` gives it a place.
     """
     for _ in range(TUNINGS):
-        term = best.candidate.term
-        near = EFFECTS[term.effect].finer(table.library.scene, term.choice)
+        near = table.library.dictionary.finer(best.candidate.term)
         if not near:
             break
-        aside = table.library.aside([(replace(term, choice=choice), 1.0) for choice in near])
+        aside = table.library.aside([(term, 1.0) for term in near])
         ranked = table.beside(aside).ranked(aside.candidates)
         if not ranked or ranked[0].evidence <= best.evidence:
             break
@@ -299,10 +292,10 @@ def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
     A law of time or moves with a course that is not quite its own calls for a second one.
     """
     for pair in combinations(fits, 2):
-        drivers = {DRIVEN.get(EFFECTS[one.candidate.term.effect].follows) for one in pair}
+        drivers = {one.candidate.course for one in pair}
         keys = {one.candidate.key for one in pair}
         free = [c for c in lib.candidates if c.key in keys and c.shapes]
-        if len(drivers) > 1 or None in drivers or not free:
+        if len(drivers) > 1 or "" in drivers or not free:
             continue
         others = [one for one in fits if one not in pair]
         chosen = [one.candidate for one in others]
@@ -318,9 +311,9 @@ def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
     return lib, fits
 
 
-def best_variant(scene: Scene, rows: Rows, chosen: Sequence[Term], several: Sequence[Term]) -> Term:
-    """The variant of a law that explains most beside the effects chosen before."""
-    lib = Library.empty(scene, rows)
+def best_variant(dictionary: Dictionary, chosen: Sequence[Any], several: Sequence[Any]) -> Any:
+    """The variant of a law that explains most beside the laws chosen before."""
+    lib = Library.empty(dictionary)
     before = lib.with_terms([(term, 1.0) for term in chosen])
     among = lib.with_terms([(term, 1.0) for term in several])
     if not among:

@@ -7,7 +7,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from minimax_cal.evidence.noise import linearised
 from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
@@ -40,6 +39,7 @@ from minimax_cal.modelling.model import (
 )
 from minimax_cal.modelling.near import nearby
 from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.modelling.rows import linearised
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import minimax
 from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
@@ -373,11 +373,12 @@ def with_effects(task: Task, stage: Stage) -> tuple[Task, Stage]:
     if not asked:
         return task, stage
     from minimax_cal.evidence.selection import best_variant  # slow to import
+    from minimax_cal.modelling.dictionary import ArmLaws
 
     robust = stage.robust
     scene = scene_of(task.robot, task.data, robust.plain, stage.state)
     rows = linearised(robust.model, stage.state, scene.jacobian)
-    found = terms_of(scene, asked, partial(best_variant, scene, rows))
+    found = terms_of(scene, asked, partial(best_variant, ArmLaws(scene, rows)))
     return jointly(task, stage, (*free, *found))
 
 

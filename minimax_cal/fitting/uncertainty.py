@@ -19,11 +19,10 @@ from scipy.special import gammaincinv, stdtrit
 
 from minimax_cal.evidence.noise import (
     Noise,
-    Rows,
+    Problem,
     identified,
     orthonormal,
     restricted,
-    rows_of,
 )
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError, said
@@ -33,6 +32,7 @@ from minimax_cal.modelling.effects.table import names_of
 from minimax_cal.modelling.joint_fit import model_at
 from minimax_cal.modelling.model import NO_MIX, Block, Model, Normal, with_poses
 from minimax_cal.modelling.parameters import Names, State, zero_positions
+from minimax_cal.modelling.rows import rows_of
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
 
@@ -239,7 +239,7 @@ class Poses:
         error, jacobian = self.halves
         return np.asarray(np.einsum("mrp,mr->mp", jacobian, error))
 
-    def rows(self) -> Rows:
+    def rows(self) -> Problem:
         """For the estimate of the noises; a prior is some more rows, as noisy as a typical one."""
         m, r, p = self.jacobian.shape
         parts = (np.moveaxis(a.reshape(m, r // 3, 3, -1), 0, 3) for a in (self.jacobian, self.arm))
@@ -251,12 +251,14 @@ class Poses:
         root = np.sqrt(self.prior[known])
         more = np.zeros((len(known), p))
         more[np.arange(len(known)), known] = root
-        return replace(
-            bare,
+        return Problem(
             error=np.concatenate([bare.error, root * self.off[known]]),
             basis=orthonormal(np.concatenate([bare.of(jacobian), more])),
             variance_ratio=np.concatenate([bare.variance_ratio, np.ones(len(known))]),
-            count=bare.count + len(known),
+            size=bare.size,
+            group=np.concatenate([bare.group, m + np.arange(len(known))]),
+            measured=np.concatenate([bare.measured, np.ones(len(known), dtype=bool)]),
+            exact=bare.exact,
         )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from minimax_cal.diagnosing import next_measurement
 from minimax_cal.diagnosing.next_measurement import PREPARE, Pair, Site
-from minimax_cal.evidence.noise import identified, linearised, restricted
+from minimax_cal.evidence.noise import identified, restricted
 from minimax_cal.evidence.selection import best_variant
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.ground.arrays import Array
@@ -25,11 +25,13 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.dictionary import ArmLaws
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import fields_of, parse
 from minimax_cal.modelling.effects.table import terms as terms_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.rows import linearised
 from minimax_cal.planning.designs.criteria import Trace, size_of
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.robots.robot import Robot
@@ -84,7 +86,7 @@ def question(
     rows = linearised(model, state, scene.jacobian)
     fitted = fit.cell.effects
     noise = restricted(rows, rows.of(fields_of(fitted.terms, scene)))
-    (other,) = terms_of(scene, pair[1:], partial(best_variant, scene, rows))
+    (other,) = terms_of(scene, pair[1:], partial(best_variant, ArmLaws(scene, rows)))
     one, value = fitted.terms[-1], fitted.values[-1]
     if one.text == other.text:
         raise OptionError(f"separate=: {pair[0]} and {pair[1]} are the same effect")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.evidence.noise import Noise, linearised, restricted
+from minimax_cal.evidence.noise import Noise, restricted
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.fitting.same_arm import check_arm, wild
@@ -20,6 +20,7 @@ from minimax_cal.modelling.effects.table import fields_of
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import Names, State, links_of, zero_positions
+from minimax_cal.modelling.rows import linearised
 from minimax_cal.planning.candidates import limits_of
 from minimax_cal.planning.options import PlanOptions
 from minimax_cal.planning.prospect import Instrument, cell_ahead, front, ring

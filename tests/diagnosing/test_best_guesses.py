@@ -15,6 +15,7 @@ from minimax_cal.diagnosing.established import Again, predicted
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.selection import select
 from minimax_cal.fitting.options import silent
+from minimax_cal.modelling.dictionary import ArmLaws
 
 RIPPLE = Cause("gear_ripple", "J2", 2000.0)
 
@@ -72,14 +73,15 @@ def test_a_best_guess_must_help_fifths_that_it_was_sought_without(
 ) -> None:
     (one,) = ripple[1].effects
     pair = [replace(one, terms=(replace(one.term, place=place),)) for place in ("J1", "J2")]
-    assert len(believed(replace(ripple[1], effects=tuple(pair), wary=wary, met=met))) == held
+    both = replace(ripple[1], effects=tuple(pair), wary=wary, met=met)
+    assert len(believed(both, ripple[0].scene)) == held
 
 
 def test_what_is_sought_anew_meets_its_fifth(ripple: tuple[Study, Causes]) -> None:
     """By least squares on the other poses, told here in another way."""
     made, causes = ripple
     part = np.arange(made.data.poses) % 5 == 0
-    library = causes.library.only(~part)
+    library = causes.library.only(made.rows.at(~part))
     choice = select(library)
     assert [c.key for c in choice.chosen] == [("gear_ripple", "J2")]
     rows = library.rows
@@ -103,7 +105,7 @@ def test_rows_that_others_do_not_tell_are_no_test(
     """An error of theirs alone, however large, is not laid at the door of what was named."""
     made, causes = ripple
     part = np.arange(made.data.poses) % 5 == 0
-    choice = select(causes.library.only(~part))
+    choice = select(causes.library.only(made.rows.at(~part)))
     rows = choice.library.rows
     mine = np.repeat(part, len(rows.error) // made.data.poses)
     known = np.concatenate([rows.basis, choice.known, rows.error[:, None]], axis=1)
@@ -117,5 +119,6 @@ def test_rows_that_others_do_not_tell_are_no_test(
     basis = np.concatenate([rows.basis, shown[:, None]], axis=1)
     for off, kept in ((0.0, True), (0.01, True), (1.0, False)):  # [m], and in sigmas 500, 50,000
         spoilt = replace(rows, error=rows.error + off * alone, basis=basis)
-        after = predicted(replace(choice, library=replace(choice.library, rows=spoilt)))
+        laws = ArmLaws(made.scene, spoilt)
+        after = predicted(replace(choice, library=replace(choice.library, dictionary=laws)))
         assert np.allclose(after, predicted(choice), rtol=0.06) == kept

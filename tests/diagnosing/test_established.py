@@ -17,8 +17,9 @@ from minimax_cal.diagnosing.established import (
 )
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.evidence.library import Library, library
+from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import Term
 
 
@@ -68,7 +69,7 @@ def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> No
 @pytest.fixture(scope="module")
 def geared() -> tuple[Study, Library]:
     study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 300.0),), seed=4)))
-    return study, library(study.scene, study.rows)
+    return study, arm_library(study.scene, study.rows)
 
 
 def named(choice: Choice, *key: str) -> Finding:
@@ -84,10 +85,10 @@ def test_an_effect_is_shown_by_poses_that_turn_its_joint(geared: tuple[Study, Li
     effect = named(whole, "gear_error", "J1")
     q = study.data.q[:, 0]
     order = np.argsort(np.argsort(q))
-    some = select(lib.only(order % 5 != 0))
+    some = select(lib.only(study.rows.at(order % 5 != 0)))
     assert shows(effect, some, whole)
     assert is_found(effect, some, whole)
-    few = select(lib.only(np.abs(order - len(q) / 2) < 0.1 * len(q)))
+    few = select(lib.only(study.rows.at(np.abs(order - len(q) / 2) < 0.1 * len(q))))
     assert not shows(effect, few, whole)
 
 
@@ -108,10 +109,10 @@ def test_an_effect_is_found_where_its_rival_is_named(geared: tuple[Study, Librar
 def test_a_part_that_names_nothing_else_is_asked_for_the_effect_by_itself() -> None:
     """To come first of a whole library takes more power than to be there."""
     study = study_of(make(Case("irb2600", "single", (Cause("gear_error", "J1", 60.0),), seed=4)))
-    lib = library(study.scene, study.rows)
+    lib = arm_library(study.scene, study.rows)
     whole = select(lib)
     effect = replace(named(whole, "gear_error", "J1"), alternatives=())
-    rest = lib.only(np.arange(study.data.poses) % 5 != 0)
+    rest = lib.only(study.rows.at(np.arange(study.data.poses) % 5 != 0))
     silent = select(rest, level=1e-15)
     assert not silent.chosen
     assert not is_found(effect, silent, whole)
@@ -128,7 +129,7 @@ def test_a_part_that_names_nothing_else_is_asked_for_the_effect_by_itself() -> N
     assert not is_uncontested(effect, replace(other, library=rest), whole)  # another name is there
     rng = np.random.default_rng(0)
     flipped = study.rows.error * rng.choice([-1.0, 1.0], len(study.rows.error))
-    bare = library(study.scene, replace(study.rows, error=flipped))
+    bare = arm_library(study.scene, replace(study.rows, error=flipped))
     nothing = select(bare, level=1e-15)
     assert not nothing.chosen
     assert not is_uncontested(effect, nothing, whole)  # points tell nothing of it

@@ -23,14 +23,16 @@ from minimax_cal.diagnosing.next_measurement import (
 from minimax_cal.evidence.alternatives import ENOUGH
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.noise import Noise, linearised
+from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.dictionary import ArmLaws
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import scene_of
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.rows import linearised
 from minimax_cal.modelling.simulate import Simulation, simulate
 
 ROUNDING = 1e-6  # relative: the same numbers by other algebra
@@ -137,7 +139,7 @@ def test_power_now_is_what_rivals_say(
     robot: mc.Robot, sim: Simulation, wide: Site, one: Term, value: list[float], other: Term
 ) -> None:
     rows = linearised(wide.model, wide.state, wide.scene.jacobian)
-    lib = Library.empty(wide.scene, rows)
+    lib = Library.empty(ArmLaws(wide.scene, rows))
     both = lib.with_terms([(one, 1.0), (other, 1.0)])
     table = bench(lib, ())
     added = dataclasses.replace(table.added(both[0]), value=np.array(value))

@@ -10,7 +10,7 @@ from problems_fit import study
 from minimax_cal.diagnosing import scatter
 from minimax_cal.diagnosing.scatter import WholePoses, motions, weighed, weighed_anew
 from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.evidence.limits import EXACT, LEAST_DOF
+from minimax_cal.evidence.limits import LEAST_DOF
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
@@ -160,6 +160,6 @@ def test_of_few_poses_or_of_computed_points_nothing_is_said(
     assert weighed_anew(some, columns) is some
     usual = np.sqrt(restricted(made.rows, nothing(made)).variance)
     for size, told in ((1e-2, False), (1e2, True)):
-        error = size * EXACT / usual * made.rows.error
+        error = size * made.rows.exact / usual * made.rows.error
         exact = replace(made, rows=replace(made.rows, error=error))
         assert (weighed_anew(exact, nothing(exact)) is exact) != told

@@ -7,11 +7,12 @@ import pytest
 
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.bench import bench
-from minimax_cal.evidence.library import Library, Stack, library
+from minimax_cal.evidence.library import Library, Stack
 from minimax_cal.evidence.selection import select, tuned
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.dictionary import ArmLaws, arm_library
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.robot import Robot
@@ -38,14 +39,14 @@ def test_motions_that_differ_at_one_pose_are_two(shifted: Study) -> None:
         for target in shifted.data.target_names
         for row in (*range(150, 180), POSES - 4)
     ]
-    found = Library.empty(shifted.scene, shifted.rows).with_terms(terms)
+    found = Library.empty(ArmLaws(shifted.scene, shifted.rows)).with_terms(terms)
     every = np.concatenate([candidate.main for candidate in found])
     assert len(np.unique(every)) == len(every) == 3 * len(terms)
 
 
 def test_equal_motions_are_one(shifted: Study) -> None:
     stack, term = (
-        Stack(shifted.scene, shifted.rows),
+        Stack(ArmLaws(shifted.scene, shifted.rows)),
         Term("frame_drift", "frame", {"constant": 0.5}),
     )
     one, other = stack.add(term), stack.add(term)
@@ -56,7 +57,7 @@ def test_equal_motions_are_one(shifted: Study) -> None:
 
 
 def test_a_nest_moved_at_the_pose_at_which_it_did(shifted: Study) -> None:
-    found = select(library(shifted.scene, shifted.rows), ripple=False).chosen
+    found = select(arm_library(shifted.scene, shifted.rows), ripple=False).chosen
     clock = np.sort(shifted.scene.column("clock"))
     assert [c.term.label for c in found] == ["target_shift:smr1"]
     assert found[0].term.choice["since"] == clock[MOVED]
@@ -66,7 +67,7 @@ def test_a_nest_moved_at_the_pose_at_which_it_did(shifted: Study) -> None:
 def test_a_moment_is_found_from_one_nearby(shifted: Study, off: int) -> None:
     clock = np.sort(shifted.scene.column("clock"))
     term = Term("target_shift", "smr1", {"since": float(clock[MOVED + off])})
-    lib = Library.empty(shifted.scene, shifted.rows)
+    lib = Library.empty(ArmLaws(shifted.scene, shifted.rows))
     near = lib.with_terms([(term, 1.0)])
     table = bench(replace(lib, candidates=tuple(near)), ())
     assert tuned(table, table.added(near[0])).candidate.term.choice["since"] == clock[MOVED]

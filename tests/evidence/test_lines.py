@@ -13,7 +13,14 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.limits import LINES
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import (
+from minimax_cal.evidence.selection import select
+from minimax_cal.fitting.options import silent
+from minimax_cal.fitting.solve import fit_cell
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.periodogram import (
     SEVERAL,
     Line,
     alike,
@@ -22,13 +29,6 @@ from minimax_cal.evidence.periodogram import (
     is_expected,
     strongest_lines,
 )
-from minimax_cal.evidence.selection import select
-from minimax_cal.fitting.options import silent
-from minimax_cal.fitting.solve import fit_cell
-from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.grouping import split
-from minimax_cal.measuring.history import with_history
-from minimax_cal.modelling.effects.table import Term
 
 NODES = np.arange(-3.0, 3.1, 0.12)
 

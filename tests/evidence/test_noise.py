@@ -8,7 +8,7 @@ from problems_fit import study
 import minimax_cal as mc
 from experiments.gap_cases import Case, make
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.evidence.noise import Noise, Rows, inflation, restricted
+from minimax_cal.evidence.noise import Noise, Problem, inflation, restricted
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.grouping import split
@@ -75,8 +75,7 @@ def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None
         basis = np.linalg.qr(rng.normal(size=(n, p)))[0]
         noise = rng.normal(size=n)
         rest = noise - basis @ (basis.T @ noise)
-        rows = Rows(rest, basis, np.ones(n), 1.0, n, np.zeros((0, 0, 0)), np.zeros((0, 0)),
-                    np.zeros(0, dtype=int))  # fmt: skip
+        rows = Problem(rest, basis, np.ones(n), 1.0, np.arange(n), np.ones(n, dtype=bool), 0.0)
         found.append(restricted(rows, np.zeros((n, 0))))
     total = [one.variance * (1.0 + one.ratio) for one in found]  # equal rows: only the sum counts
     assert abs(np.mean(total) - 1.0) < 4.0 * np.sqrt(2.0 / (n - p) / len(found))
@@ -84,9 +83,9 @@ def test_the_variance_counts_what_the_fit_took(rng: np.random.Generator) -> None
 
 def test_a_problem_without_freedom_has_a_noise(quiet: Study) -> None:
     rows = quiet.rows
-    few = Rows(
-        rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, 9, rows.turn, rows.weight,
-        rows.poses,
+    few = Problem(
+        rows.error[:9], np.eye(9), rows.variance_ratio[:9], rows.size, rows.group[:9],
+        rows.measured[:9], rows.exact,
     )  # fmt: skip
     assert restricted(few, np.zeros((9, 0))).variance > 0.0
 

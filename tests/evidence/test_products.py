@@ -12,16 +12,17 @@ from problems_fit import study
 from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.bench import bench
-from minimax_cal.evidence.library import Library, library
-from minimax_cal.evidence.noise import FREE, Rows, orthonormal, remaining, restricted
-from minimax_cal.evidence.periodogram import sums
+from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.noise import FREE, Problem, orthonormal, remaining, restricted
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
 from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.dictionary import ArmLaws, arm_library
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.periodogram import sums
 
 RATIOS = np.array([0.0, 0.013, 0.4, 3.7, 1.0e4])
 ROUNDING = 1e-9  # of products, relative to the largest of their columns
@@ -39,7 +40,7 @@ def rough() -> Study:
 
 @pytest.fixture(scope="module")
 def lib(rough: Study) -> Library:
-    return library(rough.scene, rough.rows)
+    return arm_library(rough.scene, rough.rows)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_products_are_the_sums_over_rows_that_count(
 ) -> None:
     """Of what weighted least squares on the geometry leave of the columns."""
     kept = kept_rows(rough, poses) if some else np.ones(len(rough.rows.error), dtype=bool)
-    products = lib.products.of(kept) if some else library(rough.scene, rough.rows).products
+    products = lib.products.of(kept) if some else arm_library(rough.scene, rough.rows).products
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     clear, raw = products.columns.clear, products.columns.raw
     p = products.columns.fixed - 1
@@ -112,11 +113,11 @@ def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
     lib: Library, rough: Study, poses: Array
 ) -> None:
     rows, kept = rough.rows, kept_rows(rough, poses)
-    alone = Rows(rows.error[kept], orthonormal(rows.basis[kept]), rows.variance_ratio[kept],
-                 rows.size, 3 * int(np.count_nonzero(rough.model.weight[:, poses])),
-                 rows.turn[poses], rows.weight[poses], rows.poses[poses])  # fmt: skip
+    alone = Problem(rows.error[kept], orthonormal(rows.basis[kept]), rows.variance_ratio[kept],
+                    rows.size, rows.group[kept], rows.measured[kept], rows.exact)  # fmt: skip
+    assert alone.count == 3 * int(np.count_nonzero(rough.model.weight[:, poses]))
     index = np.array([4, 9])
-    found = lib.only(poses).products.noise(index)
+    found = lib.only(rough.rows.at(poses)).products.noise(index)
     expected = restricted(alone, lib.columns[kept][:, index])
     assert_allclose(found.ratio, expected.ratio, rtol=1e-6)
     assert_allclose(found.variance, expected.variance, rtol=1e-7)
@@ -154,7 +155,7 @@ def test_few_rows_have_the_noise_of_their_mean_square(lib: Library, rough: Study
 def test_a_candidate_beside_others_is_least_squares_on_the_poses_that_count(
     lib: Library, rough: Study, poses: Array
 ) -> None:
-    some = lib.only(poses)
+    some = lib.only(rough.rows.at(poses))
     first, second = (next(c for c in some.candidates if c.key == key and not len(c.doubt))
                      for key in (("backlash", "J2"), ("gear_error", "J3")))  # fmt: skip
     one = bench(some, [first]).added(second)
@@ -195,11 +196,12 @@ def test_a_selection_from_some_poses_looks_at_no_other(
     lib: Library, rough: Study, poses: Array, rng: np.random.Generator
 ) -> None:
     """Errors of the others, whatever they are, change nothing; they are predicted besides."""
-    choice = select(lib.only(poses))
+    choice = select(lib.only(rough.rows.at(poses)))
     assert {c.key for c in choice.chosen} == {("backlash", "J2"), ("gear_ripple", "J4")}
     kept = kept_rows(rough, poses)
     other = rough.rows.error + np.where(kept, 0.0, 1e-3 * rng.normal(size=len(kept)))
-    spoilt = select(library(rough.scene, replace(rough.rows, error=other)).only(poses))
+    spoilt_lib = arm_library(rough.scene, replace(rough.rows, error=other))
+    spoilt = select(spoilt_lib.only(rough.rows.at(poses)))
     assert [c.term.text for c in spoilt.chosen] == [c.term.text for c in choice.chosen]
     for one, again in zip(choice.fits, spoilt.fits, strict=True):
         assert_allclose(again.value, one.value, rtol=1e-6)
@@ -223,8 +225,8 @@ def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
 def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     """Columns that come later have the same products as those that were there before."""
     quiet = study(6e-6, 1.0, 0)
-    early = library(quiet.scene, quiet.rows)
-    late = Library.empty(quiet.scene, quiet.rows)
+    early = arm_library(quiet.scene, quiet.rows)
+    late = Library.empty(ArmLaws(quiet.scene, quiet.rows))
     terms = [c.term for c in early.candidates][:6]
     for term in terms:  # one by one, products asked for in between
         (found,) = late.with_terms([(term, 1.0)])
@@ -241,17 +243,17 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
 def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None:
     """A nest that moved late, and poses from before: rounding is left of its columns."""
     made = study(jitter=0.0, noise=1.0, seed=3)
-    whole = library(made.scene, made.rows)
+    whole = arm_library(made.scene, made.rows)
     shift = next(c for c in whole.candidates if c.term.effect == "target_shift")
     since = made.scene.data.columns["clock"] < shift.term.choice["since"]
-    part = whole.only(since)
+    part = whole.only(made.rows.at(since))
     assert shift not in part.candidates
     select(part)  # and no warning
 
 
-def test_parts_leave_no_memory_behind(lib: Library, poses: Array) -> None:
+def test_parts_leave_no_memory_behind(lib: Library, rough: Study, poses: Array) -> None:
     """Products are large: they go with the last name for them, not when a collector comes."""
-    part = lib.only(poses)
+    part = lib.only(rough.rows.at(poses))
     choice = select(part)
     assert choice.benches
     held = [weakref.ref(part.products), *map(weakref.ref, part.products.formed.values())]

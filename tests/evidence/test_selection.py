@@ -19,17 +19,18 @@ from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.bench import Added, against_signs, bench, columns_of, credible
-from minimax_cal.evidence.library import Kind, library
+from minimax_cal.evidence.library import Kind
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.periodogram import strongest_lines
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.periodogram import strongest_lines
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.gravity import masses_of
 
@@ -89,7 +90,7 @@ def test_fifths_are_asked_of_what_was_told_before_the_search(
 
     monkeypatch.setattr(causes, "judged_again", again)
     made = opened(Cause("target_shift", "smr2", 1000.0), seed=3)
-    told = {c.term.text for c in library(made.scene, made.rows).candidates}
+    told = {c.term.text for c in arm_library(made.scene, made.rows).candidates}
     _, found = causes.causes_of(made, (), (), silent)
     ((choice, lib),) = asked
     assert {c.term.text for c in choice.chosen} - told  # its moment was tuned
@@ -149,7 +150,7 @@ def test_two_effects_that_are_both_there_are_no_rivals() -> None:
     """Fits as good as one another, of which each is needed beside the other."""
     names = (("encoder_gain", "J2"), ("backlash", "J2"))
     made = opened(*(Cause(*name, 300.0) for name in names), seed=4)
-    lib = library(made.scene, made.rows)
+    lib = arm_library(made.scene, made.rows)
     table = bench(lib, ())
     pair = [next(c for c in lib.candidates if c.key == name) for name in names]
     for one, other in (pair, pair[::-1]):
@@ -165,7 +166,7 @@ def test_a_cause_and_what_resembles_it_stay_rivals() -> None:
     """The one that is not there is of no use beside the truth, ten times of ten."""
     for seed in range(10):
         made = opened(Cause("joint_compliance", "J2", 400.0), seed=seed)
-        lib = library(made.scene, made.rows)
+        lib = arm_library(made.scene, made.rows)
         table = bench(lib, ())
         names = (("joint_compliance", "J2"), ("base_flex", "frame"))
         truth, like = (next(c for c in lib.candidates if c.key == name) for name in names)
@@ -186,7 +187,7 @@ def test_lambda_is_the_one_that_was_asked_for() -> None:
 def test_values_are_those_of_least_squares() -> None:
     """Without jitter the fit beside the geometry is plain least squares on both."""
     made = opened(Cause("encoder_gain", "J2", 500.0), seed=8)
-    lib = library(made.scene, made.rows)
+    lib = arm_library(made.scene, made.rows)
     c = next(c for c in lib.candidates if c.key == ("encoder_gain", "J2"))
     settings = selection.bench(lib, ()).settings
     still = int(np.flatnonzero(settings.ratios == 0.0)[0])
@@ -242,7 +243,7 @@ def test_a_tool_on_the_axis_needs_no_levers() -> None:
 def test_what_signs_cost_is_the_rise_of_the_bounded_square() -> None:
     """Against least squares with bounds on all rows: no compliance below 0."""
     made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), -SOFT)
-    lib = library(made.scene, made.rows)
+    lib = arm_library(made.scene, made.rows)
     terms = ["joint_compliance:all", "backlash:J1", "link_bending:L2"]
     found = {c.term.label: c for c in lib.candidates if not c.term.choice.get("tool")}
     fits, chosen_ = [], []
@@ -311,7 +312,7 @@ def test_a_wrong_sign_keeps_nothing_else_in() -> None:
     """Of a compliance below zero, which no body has, beside effects that are not there."""
     against = SOFT * np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
     made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), against)
-    lib = library(made.scene, made.rows)
+    lib = arm_library(made.scene, made.rows)
     fits: list[Added] = []
     for label in ("joint_compliance:J3", "backlash:J1", "settling:J4"):
         c = next(c for c in lib.candidates if c.term.label == label)

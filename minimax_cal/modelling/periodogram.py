@@ -9,11 +9,12 @@ import numpy as np
 from scipy.special import chdtrc
 
 from minimax_cal.evidence.limits import APART, UNSTEADY
-from minimax_cal.evidence.noise import Noise, Rows, remaining
+from minimax_cal.evidence.noise import Noise, remaining
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import sweeping
 from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.rows import Rows
 
 SLOWEST, FASTEST = 8.0, 260.0  # waves a turn that are looked for; no gear has fewer teeth
 DENSITY = 4.0  # frequencies tried for each one that is independent
