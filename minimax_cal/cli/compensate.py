@@ -118,7 +118,7 @@ def compensate_command(
         if sys.stdout.isatty():
             text = on_terminal(text if isinstance(text, str) else text.decode("latin-1"))
         click.echo(text, nl=False)
-        if AS_JSON.get():
+        if AS_JSON.get() and not to.quiet:
             tell("summary", found.headline())
         elif not to.quiet:
             click.echo(found.summary(WIDTH), err=True)

@@ -55,6 +55,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
@@ -216,6 +217,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     doubts = (*checks.limit_notices(robot, data), *time_notices(data), mislabelled(data))
+    doubts = (*doubts, *(fault.text for fault in noise(data)))
     notices = (*data.notices, *filter(None, doubts), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():

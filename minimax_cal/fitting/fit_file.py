@@ -382,6 +382,8 @@ def assembled(
     parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
     train = data.take(~held)
     k, names = len(cell.target_names), parameter_names(parameters, cell)
+    if missing := set(names.all) - {p.name for p in parameters}:
+        raise ValueError(f"parameters: {min(missing)} is missing, of {len(missing)}")
     return Fit(
         cell=cell,
         nominal=nominal,

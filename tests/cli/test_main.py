@@ -363,3 +363,41 @@ def test_calibrate_starts_without_what_it_does_not_use() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout == "[]\n"
+
+
+def test_the_package_itself_is_the_command() -> None:
+    command = [sys.executable, "-m", "minimax_cal", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()[0]) == (0, "minimax-cal,")
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_u95_in_another_unit_is_reported_by_both(
+    factor: float, tmp_path: Path, noisy: Simulation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Micrometres or metres under the name of millimetres."""
+    csv = tmp_path / "poses.csv"
+    mc.write_measurements(csv, noisy.data)
+    header, *rows = csv.read_text().splitlines()
+    lines = [f"{header},u95_mm", *(f"{row},{0.03 * factor:g}" for row in rows)]
+    csv.write_text("\n".join(lines))
+    for command in (("calibrate", "--objective", "sum"), ("diagnose", "--quick")):
+        run(command[0], "irb2600", csv, *command[1:])
+        err = capsys.readouterr().err
+        assert f"column u95_mm says {0.03 * factor:.3g} mm" in err, command
+        assert "is it in mm?" in err
+
+
+def test_a_result_without_parameters_is_refused(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`compare` would find no difference where nothing is there to differ."""
+    fit, empty = tmp_path / "fit.json", tmp_path / "empty.json"
+    assert run("calibrate", "irb2600", csv, "--objective", "sum", "-o", fit) == 0
+    content = json.loads(fit.read_text())
+    for left in (content["parameters"][:-1], []):
+        empty.write_text(json.dumps({**content, "parameters": left}))
+        capsys.readouterr()
+        for pair in ((fit, empty), (empty, fit)):
+            assert run("compare", *pair) == 2
+            assert "empty.json" in capsys.readouterr().err

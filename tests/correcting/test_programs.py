@@ -14,6 +14,7 @@ from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.programs import krl, rapid
 from minimax_cal.correcting.programs.points import MARK
 from minimax_cal.correcting.programs.program import read_program
+from minimax_cal.ground.errors import DataError
 from minimax_cal.modelling.simulate import Simulation
 
 JOINTS = np.array(
@@ -210,6 +211,57 @@ def test_a_wrong_program_is_one_line(
     err = capsys.readouterr().err
     assert said in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["tGrip.tframe.trans.z:=tGrip.tframe.trans.z+5;", "IF di1=1 wTable.oframe:=PoseVect(x);",
+     "tGrip := tOther;", "wTable.uframe.trans:=[1,2,3];"],
+)  # fmt: skip
+def test_frames_that_the_run_writes_are_refused(
+    change: str, robot: mc.Robot, tmp_path: Path
+) -> None:
+    """Nobody knows where the points are then; a correction would be wrong in silence."""
+    text = module(robot).replace("  PROC main()", f"  PROC main()\r\n    {change}")
+    (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
+    with pytest.raises(DataError, match=r"a\.mod:10: the run writes (tGrip|wTable)"):
+        read_program(tmp_path / "a.mod", robot, "tGrip", "wTable")
+    other = text.replace(change, change.replace("tGrip", "tOther").replace("wTable", "wOther"))
+    (tmp_path / "a.mod").write_bytes(other.encode("latin-1"))
+    assert read_program(tmp_path / "a.mod", robot, "tGrip", "wTable").points
+
+
+def test_coordinates_that_the_run_writes_are_said(robot: mc.Robot, tmp_path: Path) -> None:
+    before = "    MoveL p10,"
+    text = module(robot).replace(before, f"    IF a=1 p10.trans.z:=p10.trans.z+5;\r\n{before}")
+    (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
+    notices = read_program(tmp_path / "a.mod", robot, "tGrip", "wTable").data.notices
+    assert [n.partition(": ")[2] for n in notices] == [
+        "at line 12 the run writes p10.trans.z: what it writes is not corrected"
+    ]
+    (tmp_path / "a.src").write_text(data_list(robot) + "\nXP0.Z = XP0.Z + 5\n")
+    assert "XP0.Z" in " ".join(read_program(tmp_path / "a.src", robot).data.notices)
+
+
+def test_external_axes_are_said(robot: mc.Robot, tmp_path: Path) -> None:
+    """A track carries the arm to where no correction knows it."""
+    none, path = "9E+09,9E+09,9E+09,9E+09,9E+09,9E+09", tmp_path / "a.mod"
+    for values, said in (
+        (("1500,9E+09", "0,9E+09", "2000.5,9E+09", "0,9E+09"), "eax_a stands from 0 to 2000.5;"),
+        (("0,30", "0,30", "0,30", "0,30"), "eax_b stands at 30;"),
+        (("0,9E9", "0,9E9", "0,9E9", "0,9E9"), ""),
+    ):
+        text = module(robot)
+        for value in values:
+            text = text.replace(f"[{none}]", f"[{value},9E9,9E9,9E9,9E9]", 1)
+        path.write_bytes(text.encode("latin-1"))
+        notices = " ".join(read_program(path, robot, "tGrip", "wTable").data.notices)
+        assert ("external axis" in notices) == bool(said)
+        assert said in notices
+    (tmp_path / "a.src").write_text(data_list(robot).replace("E1 0.0", "E1 250.0", 1))
+    assert "axis E1 stands from 0 to 250;" in " ".join(
+        read_program(tmp_path / "a.src", robot).data.notices
+    )
 
 
 def test_the_command_writes_a_program(fit: mc.Fit, robot: mc.Robot, tmp_path: Path) -> None:

@@ -36,6 +36,10 @@ AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
 ENTRIES = {*PLACE, *AXES, "S", "T", *(f"E{i}" for i in range(1, 7))}
 COLON = re.compile(r"[ \t]*:")
 COMMENT = ";"
+OUTER = "E"
+WRITTEN = re.compile(
+    r"^[^\S\r\n]*(\w{1,32})((?:\[[^\]]{0,20}\])?\.(?:[XYZABCST]|[AE][1-6]))\s*=(?!=)", re.I | re.M
+)
 LEVEL = 1e-7  # cosine of B below which A and C turn about one axis
 
 
@@ -64,6 +68,17 @@ def left(program: Text) -> Iterator[int]:
 def displacements(program: Text) -> Iterator[tuple[int, str]]:
     """Lines and names of what displaces every point after it: a base does, which is heeded."""
     yield from ()
+
+
+def changes(program: Text) -> Iterator[tuple[int, str, str, str]]:
+    """What the run writes: line, "point", the point's name, and what of it.
+
+    Changes of $TOOL and $BASE are heeded as those that a program moves with.
+    """
+    names = {name.upper() for kind, name, _ in values(program) if kind} | set(declared(program))
+    for found in WRITTEN.finditer(program.bare):
+        if found[1].upper() in names:
+            yield program.line(found.start(1)), "point", found[1], found[1] + found[2]
 
 
 def values(program: Text) -> Iterator[tuple[str, str, re.Match[str]]]:
@@ -118,19 +133,21 @@ def point(program: Text, kind: str, name: str, found: re.Match[str]) -> Point:
         if entry[1].upper() in values:
             raise DataError(f"{where}: {entry[1]} stands twice")
         values[entry[1].upper()] = number
+    outer = tuple((i, values[f"E{i}"].value) for i in range(1, 7) if f"E{i}" in values)
     if kind in ("E6AXIS", "AXIS"):
         missing = [axis for axis in AXES if axis not in values]
         if missing:
             raise DataError(f"{where}: {missing[0]} is missing")
         place = tuple(values[axis] for axis in AXES)
         checked(place, where)
-        return Point(kind, name, line, place, None, np.radians([n.value for n in place]))
+        joints = np.radians([n.value for n in place])
+        return Point(kind, name, line, place, None, joints, outer=outer)
     place = tuple(values[key] for key in PLACE)
     checked(place, where)
     at = np.array([number.value for number in place])
     turn = Rotation.from_euler("ZYX", at[3:], degrees=True).as_matrix()
     way = (values["T"],) if "T" in values else ()
-    return Point(kind, name, line, place, posed(at[:3], turn), np.zeros(0), way)
+    return Point(kind, name, line, place, posed(at[:3], turn), np.zeros(0), way, outer)
 
 
 def numbers_of(pose: Array, point: Point) -> list[str]:

@@ -74,8 +74,8 @@ def untold(
         )
 
 
-def shown(lines: Sequence[int]) -> str:
-    """The first of many lines."""
+def shown(lines: Sequence[object]) -> str:
+    """The first of many lines or names."""
     once = list(dict.fromkeys(lines))
     return ", ".join(map(str, once[:8])) + (" ..." if len(once) > 8 else "")
 

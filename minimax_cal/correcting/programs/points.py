@@ -39,7 +39,8 @@ class Point:
     kind: as the language calls it.  line: where it stands, from 1.  place: numbers of the position
     and the orientation, or of the joints.  pose: (4, 4) of the tool in the work object [m], None
     for joints.  joints: (n,) [rad], empty for a pose.  way: numbers that say which way the arm
-    stands: RAPID's cf1, cf4, cf6, or KRL's T; empty where it does not say.
+    stands: RAPID's cf1, cf4, cf6, or KRL's T; empty where it does not say.  outer: values of the
+    external axes that are there [mm or deg], by their numbers.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class Point:
     pose: Array | None
     joints: Array
     way: tuple[Number, ...] = ()
+    outer: tuple[tuple[int, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ pose that the nominal arm has at the corrected joints, which bring the calibrate
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.correcting.compensate import Compensation
 from minimax_cal.correcting.programs import krl, rapid
-from minimax_cal.correcting.programs.moved_with import check_used, frame_of, shown, untold
+from minimax_cal.correcting.programs.moved_with import WORDS, check_used, frame_of, shown, untold
 from minimax_cal.correcting.programs.points import (
     Point,
     Text,
@@ -37,6 +37,7 @@ LANGUAGES: dict[str, ModuleType] = {
 LARGEST = 16 << 20  # bytes of a program
 MOST = 20_000  # points
 STARTS, CHUNK = 48, 100  # of the search for all ways; points at a time
+AXES = ".abcdef"  # of RAPID's external axes, from 1
 SAME = 1e-3  # two ways are one [rad]
 
 
@@ -102,16 +103,66 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
             "are; correct programs whose points are not displaced"
         )
     known, given = language.frames(text), {"tool": tool, "wobj": work}
+    check_frames_stay(language, text, points, given)
     check_used(language, text, points, given)
     grip, table = (frame_of(one, known, option) for option, one in given.items())
     q, doubts = joints_of(points, language, robot, grip, table, str(path))
-    notices = (*untold(language, text, points, given), *left_out(language, text), *doubts)
+    notices = (
+        *untold(language, text, points, given),
+        *left_out(language, text),
+        *moved_outside(language, points, str(path)),
+        *written_by_run(language, text),
+        *doubts,
+    )
     lines = np.array([point.line for point in points])
     nowhere = np.zeros((len(q), 0, 3))
     data = Measurements(
         q, nowhere, (), robot.prismatic, lines, {}, notices=notices, source=str(path)
     )
     return Program(text, language, points, grip, table, robot, data)
+
+
+def check_frames_stay(
+    language: ModuleType, text: Text, points: Sequence[Point], given: Mapping[str, str]
+) -> None:
+    """Raise DataError where the run writes a tool or work object that points are told in."""
+    told = [(option, name) for _, option, name in language.used(text, points)]
+    used = {(option, name.partition("{")[0].lower()) for option, name in (*told, *given.items())}
+    for line, kind, name, part in language.changes(text):
+        if (kind, name.lower()) in used:
+            raise DataError(
+                f"{text.source}:{line}: the run writes {part}, so that nobody knows where the "
+                f"points are; correct programs whose {WORDS[kind]} stays"
+            )
+
+
+def written_by_run(language: ModuleType, text: Text) -> Iterator[str]:
+    """A notice of coordinates that the run writes over those that are corrected."""
+    found = [(line, part) for line, kind, _, part in language.changes(text) if kind == "point"]
+    if found:
+        lines, parts = zip(*found, strict=True)
+        yield (
+            f"{text.source}: at line {shown(lines)} the run writes {shown(parts)}: what it writes "
+            "is not corrected"
+        )
+
+
+def moved_outside(language: ModuleType, points: Sequence[Point], source: str) -> Iterator[str]:
+    """A notice of external axes that are not at zero: they may carry the arm or its work."""
+    by_axis: dict[int, list[float]] = {}
+    for point in points:
+        for axis, value in point.outer:
+            by_axis.setdefault(axis, []).append(value)
+    for axis, values in sorted(by_axis.items()):
+        low, high = min(values), max(values)
+        if low or high:
+            name = f"{language.OUTER}{AXES[axis] if language is rapid else axis}"
+            where = f"at {low:g}" if low == high else f"from {low:g} to {high:g}"
+            yield (
+                f"{source}: external axis {name} stands {where}; points are taken as if it carried "
+                "neither the arm nor the work object, so correct no program of a track or a "
+                "positioner"
+            )
 
 
 def left_out(language: ModuleType, text: Text) -> tuple[str, ...]:

@@ -43,6 +43,15 @@ QUARTERED = (0, 3, 5)  # joints whose quarter turns cf1, cf4, cf6 tell
 SIZES = {"robtarget": (3, 4, 4, 6), "jointtarget": (6, 6)}
 ORIGINS = {"tool": "tool0", "wobj": "wobj0"}
 COMMENT = "!"
+NO_AXIS = 8.9e9  # 9E9 says that there is no such external axis [ABB RAPID reference, extjoint]
+OUTER = "eax_"
+KINDS = {"robtarget": "point", "jointtarget": "point", "tooldata": "tool", "wobjdata": "wobj"}
+DATA = re.compile(r"\b(robtarget|jointtarget|tooldata|wobjdata)\s+(\w{1,32})", re.IGNORECASE)
+WRITTEN = re.compile(  # an assignment to a datum, one of an array, or a part of it
+    r"(?<![\w.\\])(\w{1,32})((?:\s*\{[^}]{0,40}\}|\.\w{1,32}){0,4})\s*:=", re.IGNORECASE
+)
+OPENING = re.compile(r"\b(?:robtarget|jointtarget|tooldata|wobjdata)\s+\Z", re.IGNORECASE)
+LOOK = 40  # letters before a name in which its declaration would stand
 
 
 def read(text: str, source: str) -> Text:
@@ -88,6 +97,21 @@ def displacements(program: Text) -> Iterator[tuple[int, str]]:
     return displaced(program)
 
 
+def changes(program: Text) -> Iterator[tuple[int, str, str, str]]:
+    """What the run writes: line, "point", "tool" or "wobj", the datum's name, and what of it.
+
+    A point that is written whole is not among them: its numbers stand there, or are made of points.
+    """
+    kinds = {data[2].lower(): KINDS[data[1].lower()] for data in DATA.finditer(program.bare)}
+    for found in WRITTEN.finditer(program.bare):
+        name, part = found[1], "".join(found[2].split())
+        kind = kinds.get(name.lower(), "")
+        if OPENING.search(program.bare[max(0, found.start() - LOOK) : found.start()]):
+            continue  # its declaration
+        if kind in ("tool", "wobj") or (kind == "point" and "." in part):
+            yield program.line(found.start(1)), kind, name, name + part
+
+
 def rows(program: Text, at: int) -> Iterator[tuple[int, int]]:
     """Where the value of a declaration stands, or those of an array."""
     end = program.bare.find(";", at)
@@ -111,13 +135,14 @@ def point(program: Text, kind: str, name: str, start: int, stop: int) -> Point:
         raise DataError(f"{where}: must hold {want} numbers in its brackets")
     parts = [program.numbers(f.start() + 1, f.end() - 1, f"{kind} {name}".strip()) for f in inner]
     checked([n for part in parts[:2] for n in part if part is not parts[-1]], where)
+    outer = tuple((i + 1, n.value) for i, n in enumerate(parts[-1]) if n.value < NO_AXIS)
     if kind == "jointtarget":
         joints = np.radians([number.value for number in parts[0]])
-        return Point(kind, name, line, tuple(parts[0]), None, joints)
+        return Point(kind, name, line, tuple(parts[0]), None, joints, outer=outer)
     turn = of_quaternion(np.array([n.value for n in parts[1]]), where)
     pose = posed(np.array([n.value for n in parts[0]]), turn)
     place = (*parts[0], *parts[1])
-    return Point(kind, name, line, place, pose, np.zeros(0), tuple(parts[2][:3]))
+    return Point(kind, name, line, place, pose, np.zeros(0), tuple(parts[2][:3]), outer)
 
 
 def numbers_of(pose: Array, point: Point) -> list[str]:

@@ -11,6 +11,10 @@ from minimax_cal.measuring.faults.fault import Amount, Fault
 from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
+ANOTHER = 100.0  # times as much or as little: um or m for mm make a thousand, no noise so much
+OTHER_UNIT = "; is it in mm? u95_m is in metres"
+TINY = 1e-300
+
 
 def noise(data: Measurements) -> tuple[Fault, ...]:
     """A notice if the scatter of the distances, or of revisits, is not what `u95` says.
@@ -35,7 +39,8 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
         Fault(
             "noise",
             "all",
-            f"column u95_mm says {1e3 * declared:.3g} mm, {by} say {1e3 * seen:.3g} mm",
+            f"column u95_mm says {1e3 * declared:.3g} mm, {by} say {1e3 * seen:.3g} mm"
+            + (OTHER_UNIT if max(ratio, 1.0 / max(ratio, TINY)) > ANOTHER else ""),
             parameters=(Amount("u95", seen, "m"), Amount("declared", declared, "m")),
         ),
     )
