@@ -44,7 +44,7 @@ def recorded(per: str, poses: int, seed: int) -> list[Case]:
         seen.append(qp)
         return solve_qp(qp, "daqp", tolerance=1e-9)
 
-    minimax.solve(problem, state, listen)
+    minimax.solve(problem, state, minimax.from_nothing(listen))
     rows = len(seen[0].l)
     return [Case(f"{per} {rows} rows, seed {seed}, QP {i + 1}", p) for i, p in enumerate(seen)]
 

@@ -55,9 +55,10 @@ def solve(
             name,
             worst,
             iterations=raw.iterations,
+            warm=raw.warm,
         )
     others = fallback_order(problem) if fallback is True else tuple(fallback or ())
-    queue = (name, *(other for other in others if other != name))
+    queue = (name, *(other for other in others if other != name.partition(":")[0]))
     job = Job(problem, tolerance, warm_start, start, start + time_limit)
     return _persist(job, queue, raw)
 

@@ -175,6 +175,7 @@ class Solution:
     wrong with it, so that the next one took over or the answer had to be improved.
     certificate: (m,) multipliers that prove INFEASIBLE, (n,) ray that proves UNBOUNDED, else (0,).
     iterations: the backend's own count, 0 where it tells none.
+    warm: whether the backend began at the start that it was given.
     """
 
     x: Array
@@ -186,6 +187,7 @@ class Solution:
     notes: tuple[str, ...] = ()
     certificate: Array = field(default_factory=lambda: EMPTY)
     iterations: int = 0
+    warm: bool = False
 
     @property
     def solved(self) -> bool:

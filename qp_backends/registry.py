@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from . import child
-from .problem import BackendError, Problem, Solution, Status
+from .problem import COLD, BackendError, Problem, Solution, Status
 
 Solver = Callable[..., Solution]
 
 BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
-    "daqp": ("via_daqp", "daqp"),
-    "quadprog": ("via_quadprog", "quadprog"),
+    "daqp": ("via_qpsolvers", "daqp"),
+    "quadprog": ("via_qpsolvers", "quadprog"),
     "piqp": ("via_qpsolvers", "piqp"),
     "clarabel": ("via_qpsolvers", "clarabel"),
     "proxqp": ("via_qpsolvers", "proxqp"),
@@ -41,6 +41,8 @@ BACKENDS: dict[str, tuple[str, str]] = {  # name: (module, method)
     "cvxpy": ("via_cvxpy", ""),  # also "cvxpy:CLARABEL" and its other solvers
     "subgradient": ("subgradient", "restarted"),  # also "subgradient:raw", "subgradient:eliminated"
 }
+DIRECT = {"daqp": "via_daqp", "quadprog": "via_quadprog"}  # "daqp:direct": without qpsolvers
+CHOOSING = ("cvxpy", "subgradient", *DIRECT)  # those that take a choice after a colon
 PACKAGES = {  # where the package is not called like the backend: (module, distribution)
     "proxqp": ("proxsuite", "proxsuite"),
     "highs": ("highspy", "highspy"),
@@ -87,7 +89,7 @@ def backend(name: str) -> Solver:
     if name in _registered:
         return _registered[name]
     family, _, choice = name.partition(":")
-    if family not in BACKENDS or (choice and family not in ("cvxpy", "subgradient")):
+    if family not in BACKENDS or (choice and family not in CHOOSING):
         near = difflib.get_close_matches(name, names(), 1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise BackendError(f"no QP backend {name!r}; {hint}choose one of {', '.join(names())}")
@@ -97,6 +99,10 @@ def backend(name: str) -> Solver:
 @cache
 def _imported(family: str, choice: str) -> Solver:
     module, method = BACKENDS[family]
+    if family in DIRECT and choice:
+        if choice != "direct":
+            raise BackendError(f"no QP backend '{family}:{choice}'; there is {family}:direct")
+        module, choice = DIRECT[family], ""
     if not _installed(family):
         raise BackendError(f"{family!r} needs a package that is not here: {_pip(family)}")
     try:
@@ -175,12 +181,11 @@ def _own(
     else:
         limit = min(seconds, given["time_limit"])
         answer = child.call(solver.__module__, solver.__qualname__, problem, known, limit)
+    warm = bool((known.get("warm_start") or COLD).x.size)
     if isinstance(answer, Solution):
         if not isinstance(answer.status, Status):
             raise TypeError(f"the status is {answer.status!r}, which is no qp_backends.Status")
-        return replace(
-            answer, x=np.asarray(answer.x, np.float64), y=np.asarray(answer.y, np.float64)
-        )
-    x, y = answer
-    seconds = time.perf_counter() - start
-    return Solution(np.asarray(x, np.float64), np.asarray(y, np.float64), Status.SOLVED, seconds)
+        x, y = np.asarray(answer.x, np.float64), np.asarray(answer.y, np.float64)
+        return replace(answer, x=x, y=y, warm=warm)
+    x, y = (np.asarray(part, np.float64) for part in answer)
+    return Solution(x, y, Status.SOLVED, time.perf_counter() - start, warm=warm)

@@ -69,9 +69,11 @@ def solve(
             continue
         break
     seconds = time.perf_counter() - start
+    fits = warm_start.x.shape == problem.q.shape and warm_start.y.shape == problem.l.shape
     return Solution(
-        answer.x, answer.y, status, seconds, "subgradient", iterations=answer.iterations
-    )
+        answer.x, answer.y, status, seconds, "subgradient", iterations=answer.iterations,
+        warm=fits and method == "restarted",
+    )  # fmt: skip
 
 
 def iterate(

@@ -23,7 +23,9 @@ class Trait:
     clock: its setting for a time limit [s]; empty when it has none.
     pace: what a solve takes at most, per (variables + rows)³, where there is no clock [s].
     sparse_pace: the same for sparse data [s].
-    warm: how it takes a warm start: "x", "dual" or "all"; empty when it does not.
+    warm: what of a warm start it takes, through qpsolvers' `initvals` and its own settings: "x",
+    "dual" (x too, where multipliers are not at hand) or "all"; empty when it takes none.
+    shortest: rows of A that are shorter are scaled to length 1 first.
     definite: whether it refuses a P that is only semi-definite.
     fixed: settings of the first run.
     rescue: settings that are changed for a second run when the first finds nothing.
@@ -37,6 +39,7 @@ class Trait:
     pace: float = 1e-9
     sparse_pace: float = 1e-9
     warm: Literal["x", "dual", "all", ""] = ""
+    shortest: float = 0.0
     definite: bool = False
     fixed: Mapping[str, Any] = field(default_factory=dict)
     rescue: Mapping[str, Any] = field(default_factory=dict)
@@ -49,6 +52,7 @@ TRAITS = {
         tolerances=("eta_prox",),
         clock="time_limit",
         warm="dual",
+        shortest=1e-3,  # it takes very short rows for empty ones
         # its rows are scaled by the square root of P, which makes 1e-6 there 1e-2 in Ax
         fixed={"primal_tol": 1e-11},
     ),

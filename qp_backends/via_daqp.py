@@ -1,8 +1,8 @@
 """DAQP without qpsolvers in between.
 
-DAQP takes l ≤ Ax ≤ u as it is, says why it failed and has a clock; qpsolvers hides the first two
-and doubles the two-sided rows, which costs half as much as the whole solve at the size of an SQP
-step.  Sparse problems, most of whose rows are bounds, do go through qpsolvers.
+"daqp:direct".  DAQP takes l ≤ Ax ≤ u as it is, says why it failed and has a clock; qpsolvers hides
+the first two and doubles the two-sided rows, which costs half as much as the whole solve at the
+size of an SQP step.  Sparse problems, most of whose rows are bounds, do go through qpsolvers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import daqp
 import numpy as np
 
 from .problem import COLD, Problem, Solution, Status
-from .traits import settings
+from .traits import TRAITS, settings
 
 FLAGS = {
     -1: Status.INFEASIBLE,
@@ -45,10 +45,11 @@ def solve(
         )
     start = time.perf_counter()
     chosen = settings("daqp", tolerance, time_limit)
-    if warm_start.y.size == problem.l.size > 0 and np.isfinite(warm_start.y).all():
+    warm = warm_start.y.size == problem.l.size > 0 and bool(np.isfinite(warm_start.y).all())
+    if warm:
         chosen["dual_start"] = warm_start.y
     A, l, u, row = problem.A, problem.l, problem.u, problem.row_norm  # noqa: E741
-    scaled = row.min(initial=1.0) < 1e-3  # DAQP takes very short rows for empty ones
+    scaled = row.min(initial=1.0) < TRAITS["daqp"].shortest
     if scaled:
         A, l, u = A / row[:, None], l / row, u / row  # noqa: E741
     x, _, flag, info = daqp.solve(problem.P, problem.q, A, u, l, **chosen)
@@ -59,4 +60,5 @@ def solve(
         status,
         time.perf_counter() - start,
         iterations=info["iterations"],
+        warm=warm,
     )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,10 +40,14 @@ def solve(
     watched = trait.clock and trait.storage != "dense"  # what DAQP does first has no clock
     if not watched and time_limit < pace * sum(problem.A.shape) ** 3:
         return child.run(__name__, problem, method, tolerance, time_limit, warm_start)
+    if trait.shortest and problem.row_norm.min(initial=1.0) < trait.shortest:
+        run = partial(solve, method=method, tolerance=tolerance, time_limit=time_limit)
+        return _lengthened(problem, run, warm_start)
     rows = split(problem, trait.box)
     chosen = settings(method, tolerance, time_limit)
-    if trait.warm and warm_start.x.size == problem.q.size and np.isfinite(warm_start.x).all():
-        chosen |= _warm(trait, rows, warm_start, problem.q.size)
+    given = warm_start.x.size == problem.q.size and bool(np.isfinite(warm_start.x).all())
+    if warm := bool(trait.warm) and given:
+        chosen |= _warm(trait, rows, warm_start, problem)
     qp = _model(problem, rows, trait)
     if trait.definite:
         raw = _definite(qp, method, chosen, tolerance, start + time_limit)
@@ -50,7 +56,19 @@ def solve(
         left = start + time_limit - time.perf_counter()
         if not raw.found and trait.rescue and left > 0:
             raw = _run(qp, method, settings(method, tolerance, left) | dict(trait.rescue))
-    return _answer(problem, rows, raw, method, time.perf_counter() - start)
+    answer = _answer(problem, rows, raw, method, time.perf_counter() - start)
+    return replace(answer, warm=warm)
+
+
+def _lengthened(problem: Problem, run: Callable[..., Solution], guess: Solution) -> Solution:
+    """The answer by way of the problem with rows of length 1."""
+    row = problem.row_norm
+    A = sparse.diags_array(1.0 / row) @ problem.A
+    long = replace(problem, A=A, l=problem.l / row, u=problem.u / row)
+    if guess.y.shape == row.shape:
+        guess = replace(guess, y=guess.y * row)
+    answer = run(long, warm_start=guess)
+    return replace(answer, y=answer.y / row)
 
 
 def _model(problem: Problem, rows: Rows, trait: Trait) -> qpsolvers.Problem:
@@ -69,13 +87,15 @@ def _model(problem: Problem, rows: Rows, trait: Trait) -> qpsolvers.Problem:
     return qpsolvers.Problem(stored(problem.P), problem.q, G, h, E, b, lower, upper)
 
 
-def _warm(trait: Trait, rows: Rows, guess: Solution, size: int) -> dict[str, Any]:
-    """The settings that hand over a warm start."""
-    if trait.warm == "x" or not np.isfinite(guess.y).all():
+def _warm(trait: Trait, rows: Rows, guess: Solution, problem: Problem) -> dict[str, Any]:
+    """The settings that hand over a warm start: x as `initvals`, and what more a solver takes."""
+    size = problem.q.size
+    if trait.warm == "x" or guess.y.size != problem.l.size or not np.isfinite(guess.y).all():
         return {"initvals": guess.x}
     z, y, bounds = parts(rows, guess.y, size)
     if trait.warm == "dual":
-        return {"dual_start": np.concatenate([bounds[: size * len(rows.box)], z, y])}
+        dual = np.concatenate([bounds[: size * len(rows.box)], z, y])
+        return {"initvals": guess.x, "dual_start": dual}
     return {"initvals": guess.x, "y": y, "z": np.concatenate([z, bounds[: size * len(rows.box)]])}
 
 

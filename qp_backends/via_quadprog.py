@@ -1,4 +1,4 @@
-"""quadprog without qpsolvers in between, where that is simple.
+"""quadprog without qpsolvers in between, where that is simple: "quadprog:direct".
 
 At the size of an SQP step qpsolvers' bookkeeping costs as much as the solve.  What quadprog does
 not take directly (sparse matrices, equalities, rows open above, P without curvature, a tight

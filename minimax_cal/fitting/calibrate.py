@@ -29,6 +29,7 @@ from minimax_cal.fitting.fit import (
     KeptDistance,
     Parameters,
     Provenance,
+    Work,
     WorstCase,
     link_by_link,
 )
@@ -36,7 +37,7 @@ from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
     Progress,
-    Solver,
+    QpFunction,
     check_options,
     listed,
     objective_of,
@@ -65,7 +66,7 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.solvers.least_squares import AUTO
+from minimax_cal.solvers.least_squares import AUTO, name_of
 from minimax_cal.solvers.status import Status
 
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
@@ -91,7 +92,7 @@ def calibrate(
     robot: Robot | str | Path,
     data: Measurements | str | Path | tuple[ArrayLike, ArrayLike],
     objective: str = "minimax",
-    qp: str | Solver = "daqp",
+    qp: str | QpFunction = "daqp",
     *,
     holdout: float = 0.2,
     seed: int = 0,
@@ -176,11 +177,6 @@ def measured(data: Measurements | str | Path | tuple[ArrayLike, ArrayLike]) -> M
     if isinstance(data, tuple):
         return measurements(*(np.asarray(part, dtype=float) for part in data))
     return data if isinstance(data, Measurements) else read_measurements(data)
-
-
-def ran(qp: str | Solver) -> str:
-    """Name of the QP solver that ran."""
-    return usable(qp)[0] if isinstance(qp, str) else qp_name(qp)
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -280,7 +276,7 @@ def judged(
         cell=cell,
         nominal=nominal,
         objective=options.objective,
-        qp=ran(options.qp),
+        qp=qp_name(options.qp),
         status=Status.FAILED if wrong else solved.status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
@@ -295,7 +291,7 @@ def judged(
         uncertainty=solved.uncertainty,
         minimax=worst_case(options.objective, solved, poses.train, after[:, ~held]),
         certificate=solved.certificate,
-        trace=solved.trace,
+        trace=tuple(float(value) for value in solved.squares.trace[:, 0]),
         data=data,
         held=held,
         error_nominal=before,
@@ -310,8 +306,19 @@ def judged(
         provenance=Provenance.of(robot, data, options.settings()),
         claim=partial(beyond_of, robot, options, data, held, solved, suspects),
         error_crossed=crossed,
+        answered=solved.optimum.answered if solved.optimum else {},
+        work=work_of(solved),
     )
     return fit, alarming
+
+
+def work_of(solved: Solved) -> Work:
+    """What the solvers did."""
+    method, best = name_of(solved.squares.method), solved.optimum
+    steps = int(solved.squares.iterations[0])
+    return (
+        Work(method, steps, sum(best.answered.values()), best.warm) if best else Work(method, steps)
+    )
 
 
 def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:

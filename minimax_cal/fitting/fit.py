@@ -278,6 +278,20 @@ class WorstCase:
         return Table(title, header, rows, ("", ".4f", ".4f", ""))
 
 
+@dataclass(frozen=True)
+class Work:
+    """What the solvers did.
+
+    least_squares: the method that led to the start of the minimax.  steps: of it.
+    qps: quadratic programs.  warm_starts: those of them that began at the answer to the last one.
+    """
+
+    least_squares: str = ""
+    steps: int = 0
+    qps: int = 0
+    warm_starts: int = 0
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """A calibrated robot and everything that is known about its fit.
@@ -297,6 +311,7 @@ class Fit:
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
     error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated.
+    answered: quadratic programs by the backend that answered.  work: what the solvers did.
     """
 
     cell: Cell
@@ -328,6 +343,8 @@ class Fit:
     claim: Callable[[], Beyond]
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
+    answered: Mapping[str, int] = field(default_factory=dict)
+    work: Work = Work()
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
@@ -567,9 +584,21 @@ class Fit:
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {beyond}"
             f"{identified} of {len(self.parameters)} parameters identified "
             f"(condition {self.identification.condition:.3g}); {self.status} after "
-            f"{self.iterations} iterations, {self.seconds:.2f} s."
+            f"{self.iterations} iterations, {self.seconds:.2f} s.{self.solved_by()}"
         )
         return text + (f" {self.status.advice}." if self.status.advice else "")
+
+    def solved_by(self) -> str:
+        """Who answered the quadratic programs, after a space; empty where there were none."""
+        if not self.answered:
+            return ""
+        most_first = sorted(self.answered.items(), key=lambda item: -item[1])
+        who = ", ".join(f"{count} by {name}" for name, count in most_first)
+        work = self.work
+        return (
+            f" QPs: {who} ({work.warm_starts} warm-started), after {work.steps} steps of least "
+            f"squares ({work.least_squares})."
+        )
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""

@@ -19,7 +19,15 @@ from pydantic import Field
 from minimax_cal.fitting.beyond import Beyond, Fold, Trusted
 from minimax_cal.fitting.certificate import Certificate
 from minimax_cal.fitting.crossed import NOT_CROSSED
-from minimax_cal.fitting.fit import Fit, KeptDistance, Parameter, Parameters, Provenance, WorstCase
+from minimax_cal.fitting.fit import (
+    Fit,
+    KeptDistance,
+    Parameter,
+    Parameters,
+    Provenance,
+    Work,
+    WorstCase,
+)
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.suspects import Suspect
@@ -188,6 +196,8 @@ class FitPart(Part):
 
     objective: str
     qp: str = ""
+    answered: dict[str, int] = Field(default_factory=dict)
+    work: Work = Work()
     status: Status
     iterations: int = 0
     seconds: Number = math.nan
@@ -221,6 +231,8 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         "loss": fit.loss,
         "suspects": [suspect.to_dict() for suspect in fit.suspects],
         "qp": fit.qp,
+        "answered": dict(fit.answered),
+        "work": vars(fit.work),
         "status": str(fit.status),
         "advice": fit.status.advice,
         "iterations": fit.iterations,
@@ -414,6 +426,8 @@ def assembled(
         claim=part.accuracy.beyond.beyond,
         stated=intervals_of(part, arrays),
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
+        answered=part.answered,
+        work=part.work,
     )
 
 

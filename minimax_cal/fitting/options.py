@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -21,7 +21,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.kinematics import MDH_NAMES
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.least_squares import AUTO, METHODS
+from minimax_cal.solvers.least_squares import AUTO, JOINT, METHODS
+from minimax_cal.solvers.minimax import Solver, from_nothing
 from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 from qp_backends.registry import backend
@@ -33,8 +34,8 @@ UNITS = {"mm": 1e-3, "um": 1e-6, "m": 1.0, "mrad": 1e-3, "rad": 1.0, "deg": 0.01
 LENGTHS = ("mm", "um", "m")
 
 
-Solver = Callable[[Problem], Solution]
-QpSolver = str | Solver
+QpFunction = Callable[[Problem], Solution]
+QpSolver = str | QpFunction
 T = TypeVar("T")
 
 
@@ -92,7 +93,8 @@ class Options:
     )
     qp: QpSolver = option(  # noqa: RUF009
         "daqp",
-        "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them.",
+        "The backend of the quadratic programs of the minimax; `minimax-cal backends` lists them, "
+        "and daqp:direct is the fastest.",
         group="How it is solved",
     )
     holdout: float = option(
@@ -161,7 +163,8 @@ class Options:
     )
     method: str = option(
         AUTO,
-        f"The method of least squares: {', '.join((AUTO, *METHODS))}.",
+        "The method of least squares: auto (variable projection, damped where a start is far), "
+        f"joint (all parameters at once, the fastest), {', '.join(METHODS)}.",
         group="How it is solved",
     )
     loss: str = option(
@@ -232,7 +235,7 @@ def objective_of(objective: str, data: Measurements) -> int:
 def check_options(options: Options) -> None:
     """Raise an error for a choice that does not exist, before any work."""
     for name, value, choices in (
-        ("method", options.method, (AUTO, *METHODS)),
+        ("method", options.method, (AUTO, JOINT, *METHODS)),
         ("hessian", options.hessian, minimax.HESSIANS),
         ("distance form", options.distance, DISTANCE_FORMS),
     ):
@@ -257,17 +260,27 @@ def check_options(options: Options) -> None:
             raise OptionError(f"prior {pattern}: sigma {sigma:g} says nothing of an arm; {mend}")
 
 
-def qp_name(qp: str | Solver) -> str:
+def qp_name(qp: QpSolver) -> str:
     """What a QP solver is called in results."""
     return qp if isinstance(qp, str) else f"{FUNCTION}{getattr(qp, '__name__', 'unnamed')}"
 
 
-def solver_of(qp: str | Solver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
+def solver_of(qp: QpSolver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
     """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
     if not isinstance(qp, str):
-        return qp, ()
+        return from_nothing(named_answers(qp)), ()
     name, notices = usable(qp)
     return partial(solve_qp, name=name, tolerance=tolerance), notices
+
+
+def named_answers(qp: QpFunction) -> QpFunction:
+    """A user's solver whose answers say whose they are."""
+
+    def run(problem: Problem) -> Solution:
+        answer = qp(problem)
+        return answer if answer.backend else replace(answer, backend=qp_name(qp))
+
+    return run
 
 
 def usable(qp: str) -> tuple[str, tuple[str, ...]]:

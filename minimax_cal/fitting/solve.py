@@ -70,7 +70,7 @@ class Solved:
     nominal: the nominal geometry with its best base and targets.  state: the calibrated one.
     estimator: how the poses were weighed.  group: (m,) rows with one number are one pose.
     optimum: the minimax answer, where there was one to find.  certificate: of the worst point.
-    trace: cost at each iterate of the least squares [m^2].
+    squares: the least squares, from whose end the minimax starts.
     effects: those asked for, with their values; units: of each value.
     robust: the weights of the points, and which stand out.
     start, frames: of the sessions, where there are several, for the nominal and for this robot.
@@ -86,7 +86,7 @@ class Solved:
     optimum: Optimum[State] | None
     certificate: Certificate | None
     distances: Distances
-    trace: tuple[float, ...]
+    squares: LeastSquares[State]
     notices: tuple[str, ...]
     effects: Fitted
     units: tuple[str, ...]
@@ -262,7 +262,7 @@ def fit_cell(
         optimum=optimum,
         certificate=certificate,
         distances=distances,
-        trace=tuple(float(value) for value in stage.squares.trace[:, 0]),
+        squares=stage.squares,
         notices=(*stage.notices, *stage.robust.notices, *said),
         effects=effects,
         units=units,

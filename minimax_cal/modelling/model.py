@@ -302,19 +302,16 @@ class Model:
             axis, _ = block.screws
             base = np.broadcast_to(np.eye(3)[..., None], (*batch, 3, 3, c))
             axis = np.concatenate([axis, base], axis=-3)  # theta, alpha, beta, base rotation
+            own = kinematics.cross(error[..., None, :, :], axis[..., None, :, :, :])
+            flat = np.swapaxes(own.reshape(*batch, k, 3 * n + 3, 3 * c), -1, -2)
             fields = self.fields[..., block.rows].reshape(len(self.fields), k, 3 * c)
             part = np.zeros((*batch, 2 * n + 3 + 3 * k + len(fields), 3 * n + 3))
-            pull = kinematics.cross(error.sum(-3)[..., None, :, :], axis)
-            flat = np.swapaxes(pull.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
-            lengths = np.concatenate([links.x, links.z], axis=-3)
-            part[..., : 2 * n, :] = lengths.reshape(*batch, 2 * n, 3 * c) @ flat
-            turned = links.axes.reshape(*batch, 3, 3 * c)
-            for i in range(k):
-                own = kinematics.cross(error[..., i, None, :, :], axis)
-                flat = np.swapaxes(own.reshape(*batch, 3 * n + 3, 3 * c), -1, -2)
-                part[..., 2 * n + 3 + 3 * i : 2 * n + 6 + 3 * i, :] = turned @ flat
-                if len(fields):
-                    part[..., 2 * n + 3 + 3 * k :, :] += fields[:, i] @ flat
+            lengths = np.concatenate([links.x, links.z], axis=-3).reshape(*batch, 2 * n, 3 * c)
+            part[..., : 2 * n, :] = lengths @ flat.sum(axis=-3)
+            spots = links.axes.reshape(*batch, 1, 3, 3 * c) @ flat
+            part[..., 2 * n + 3 : 2 * n + 3 + 3 * k, :] = spots.reshape(*batch, 3 * k, 3 * n + 3)
+            for i in range(k if len(fields) else 0):
+                part[..., 2 * n + 3 + 3 * k :, :] += fields[:, i] @ flat[..., i, :, :]
             total = total + part
         coupled = total * precedes(n, k, len(self.fields))
         return np.asarray(coupled[..., active[linear], :][..., active[~linear]])

@@ -14,7 +14,15 @@ from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.bounded import bounded
-from minimax_cal.solvers.least_squares import AUTO, NEAR, LeastSquares, method_of
+from minimax_cal.solvers.least_squares import (
+    AUTO,
+    JOINT,
+    METHODS,
+    NEAR,
+    LeastSquares,
+    method_of,
+    solve_normal,
+)
 from minimax_cal.solvers.status import Status
 
 ROUNDING = 1e-13  # of the cost: a decrease by less is none
@@ -22,13 +30,14 @@ HALVINGS = 10  # of a step that leads up
 MOST = 15  # plain steps; a start from which these do not suffice is not near
 
 
-def nearby(model: Model, begin: State, method: str = AUTO) -> LeastSquares[State]:
+def nearby(model: Model, begin: State, method: str = JOINT) -> LeastSquares[State]:
     """The least-squares fit of a model's free parameters from a start nearby, a batch of one.
 
     Parameters of effects stay between the model's bounds.
 
-    method: auto takes plain Gauss-Newton steps, and those of snllm where they do not lead straight
-    down; or one of `least_squares.METHODS`, from the first step.
+    method: auto takes steps of variable projection, joint those in all parameters at once, and
+    both those of snllm where they do not lead straight down; or one of `least_squares.METHODS`,
+    from the first step.
     """
     found = unbounded(model, begin, method)
     return found if is_kept(found.x.take(np.array(0)), model.room) else between(model, found)
@@ -36,17 +45,73 @@ def nearby(model: Model, begin: State, method: str = AUTO) -> LeastSquares[State
 
 def unbounded(model: Model, begin: State, method: str) -> LeastSquares[State]:
     """The same wherever the parameters then are."""
-    if method == AUTO and not len(model.mix) and model.active.any():
-        which = np.flatnonzero(model.active)
-        prior = model.prior.mean[which], model.prior.weight[which]
-        at, trace, well = sums.descend(
-            kernels(), arrays_of(begin), model.sight, which, prior, NEAR.step, MOST
-        )
-        if well:
-            steps = np.array([len(trace) - 1])
-            return LeastSquares(State(*at), trace[-1:], steps, (Status.CONVERGED,), trace[:, None])
+    straight = {AUTO: separated, JOINT: jointly}.get(method)
+    if straight and not len(model.mix) and model.active.any():
+        found = straight(model, begin)
+        if found is not None:
+            return found
     problem, points = SumOfSquares(model), float(model.counts.sum())
     return least_squares.solve(problem, begin.batch(), 1, points, method_of(method), NEAR)
+
+
+def jointly(model: Model, begin: State) -> LeastSquares[State] | None:
+    """Gauss-Newton steps in all parameters at once; None where they do not lead straight down."""
+    which = np.flatnonzero(model.active)
+    prior = model.prior.mean[which], model.prior.weight[which]
+    at, trace, well = sums.descend(
+        kernels(), arrays_of(begin), model.sight, which, prior, NEAR.step, MOST
+    )
+    return straight_down(State(*at), trace, "nlgn") if well else None
+
+
+def separated(model: Model, begin: State) -> LeastSquares[State] | None:
+    """Gauss-Newton steps of variable projection; None where they do not lead straight down.
+
+    The angles step by the Jacobian of Golub and Pereyra, the lengths are the best ones for every
+    angle [paper S, eq. 18-24 and Algorithm 1 with (k+1)omega in c_2].
+    """
+    own, at, points = kernels(), arrays_of(begin), float(model.counts.sum())
+    which = np.flatnonzero(model.active)
+    linear = model.names.linear[which]
+    lengths, mean, hold = which[linear], model.prior.mean[which], model.prior.weight[which]
+    every, few = sums.Columns.of(at, which), sums.Columns.of(at, lengths)
+    trace = [np.inf]
+    for _ in range(MOST + 1):
+        off = (mean - sums.values(at, which))[linear] if hold.any() else np.zeros(len(lengths))
+        dr, *_, told = own.solved(*few.normal(own, at, model.sight), off, hold[linear])
+        if not told:
+            return None
+        at = own.stepped(*at, lengths, dr)  # r = G(omega)^+ Y, in which G is affine
+        cost, gradient, gram = (part[0].sum(axis=0) for part in every.normal(own, at, model.sight))
+        if hold.any():
+            off = mean - sums.values(at, which)
+            cost, gradient = cost + hold @ off**2, gradient + hold * off
+            gram = gram + np.diag(hold)
+        if not cost <= trace[-1] * (1.0 + sums.RISE) or not np.isfinite(cost):
+            return None
+        trace.append(float(cost))
+        state = State(*(part[0] for part in at))
+        mixed = gram[np.ix_(linear, ~linear)]
+        coupled = model.coupling_on(state, model.blocks(state))
+        shares = solve_normal(gram[np.ix_(linear, linear)], np.hstack([mixed, coupled]))
+        projected, second = np.hsplit(shares, 2)
+        matrix = gram[np.ix_(~linear, ~linear)] - mixed.T @ projected + coupled.T @ second
+        step = np.zeros(len(which))
+        step[~linear] = solve_normal(matrix, gradient[~linear, None])[:, 0]
+        step[linear] = -projected @ step[~linear]
+        if step @ gram @ step <= points * NEAR.step**2:
+            return straight_down(State(*at), np.array(trace[1:]), "snlgn")
+        at = own.stepped(*at, which, step)
+    return None
+
+
+def straight_down(x: State, trace: Array, method: str) -> LeastSquares[State]:
+    """A batch of one that took plain steps, each of which led down.
+
+    x: a batch.  trace: (steps + 1,) costs.
+    """
+    steps = np.array([len(trace) - 1])
+    return LeastSquares(x, trace[-1:], steps, (Status.CONVERGED,), trace[:, None], METHODS[method])
 
 
 def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
@@ -82,7 +147,7 @@ def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
             break
     state = replace(state, effects=settled(state.effects, room))
     count, trace = free.iterations + len(costs) - 1, np.array(costs)
-    return LeastSquares(state.batch(), trace[-1:], count, (status,), trace[:, None])
+    return LeastSquares(state.batch(), trace[-1:], count, (status,), trace[:, None], free.method)
 
 
 def is_kept(state: State, room: Array) -> bool:

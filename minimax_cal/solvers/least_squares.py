@@ -71,12 +71,20 @@ METHODS = {
     "snllm-kaufman": Method(separable=True, damped=True, full=False),
 }
 
-AUTO = "auto"  # plain Gauss-Newton steps where they lead straight down, else the usual method
+# For starts that are mostly near: plain Gauss-Newton steps where they lead straight down, else the
+# damped method.  AUTO's are those of snlgn; JOINT's are in all parameters at once, and cheaper.
+AUTO, JOINT = "auto", "joint"
+DAMPED = "snllm"
 
 
 def method_of(name: str) -> Method:
-    """The method called name; of auto that for a start that may be far."""
-    return METHODS["snllm" if name == AUTO else name]
+    """The method called name; of auto and joint that for a start that may be far."""
+    return METHODS[DAMPED if name in (AUTO, JOINT) else name]
+
+
+def name_of(method: Method) -> str:
+    """What a method is called."""
+    return next(name for name, known in METHODS.items() if known == method)
 
 
 @dataclass(frozen=True)
@@ -102,6 +110,7 @@ class LeastSquares(Generic[X]):
     """x: the batch of solutions.  cost, iterations: (B,).  status: B of them.
 
     trace: (iterations + 1, B) cost at each iterate, constant after a member has ended.
+    method: which took the steps.
     """
 
     x: X
@@ -109,6 +118,7 @@ class LeastSquares(Generic[X]):
     iterations: Array
     status: tuple[Status, ...]
     trace: Array
+    method: Method
 
 
 @np.errstate(over="ignore", invalid="ignore")  # an undamped step may diverge: a status says so
@@ -163,7 +173,7 @@ def solve(
     if len(alive):
         x = x.put(alive, at.x)
     costs = costs if trace else [*costs, cost]
-    return LeastSquares(x, cost, iterations, tuple(status), np.stack(costs))
+    return LeastSquares(x, cost, iterations, tuple(status), np.stack(costs), method)
 
 
 def tried(

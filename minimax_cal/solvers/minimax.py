@@ -12,7 +12,8 @@ The solver knows no robot; problem and iterate are the caller's.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Generic, Protocol, TypeVar
@@ -22,9 +23,10 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
+from qp_backends.problem import COLD
 
 X = TypeVar("X")
-Solver = Callable[[Problem], Solution]
+Ask = Callable[[Problem], Solution]
 
 HESSIANS = ("gauss-newton", "bfgs")
 
@@ -42,6 +44,45 @@ NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
 # P_vv of the epigraph variable: makes P definite for solvers that ask for it.  v is the decrease
 # that is still to be had, so the term vanishes at the solution and does not move it.
 EPIGRAPH = 1e-8
+
+
+class Solver(Protocol):
+    """A QP solver whose answers are verified already, as `qp_backends.solve` with a name."""
+
+    def __call__(self, problem: Problem, /, *, warm_start: Solution = COLD) -> Solution:
+        """The answer.  warm_start: that of a similar problem of the same size, or COLD."""
+
+
+def from_nothing(qp: Ask) -> Solver:
+    """A solver that takes nothing but the problem, as one of ours."""
+
+    def run(problem: Problem, /, *, warm_start: Solution = COLD) -> Solution:
+        return qp(problem)
+
+    return run
+
+
+@dataclass
+class Asking:
+    """Puts QPs to a solver, each from the answer to the last one of its size, and keeps count.
+
+    answered: QPs by the backend that answered.  warm: those that a backend began at that answer.
+    """
+
+    qp: Solver
+    last: Solution = COLD
+    answered: Counter[str] = field(default_factory=Counter)
+    warm: int = 0
+
+    def __call__(self, problem: Problem) -> Solution:
+        """The answer to a problem."""
+        start = self.last if self.last.x.shape == problem.q.shape else COLD
+        answer = self.qp(problem, warm_start=start)
+        self.answered[answer.backend or "unnamed"] += 1
+        self.warm += answer.warm
+        if answer.solved:
+            self.last = answer
+        return answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +179,7 @@ class Optimum(Generic[X]):
     """x with its f (k,), c (l,), multipliers mu (k,) that sum to one and lambda (l,).
 
     lambda is > 0 at an upper bound and < 0 at a lower one.
+    answered, warm: as in `Asking`.
     """
 
     x: X
@@ -150,6 +192,8 @@ class Optimum(Generic[X]):
     status: Status
     trace: tuple[Step, ...] = ()
     notes: tuple[str, ...] = field(default=())
+    answered: Mapping[str, int] = field(default_factory=dict)
+    warm: int = 0
 
     @property
     def value(self) -> float:
@@ -165,11 +209,11 @@ def solve(
     progress: Callable[[Step], None] = lambda step: None,
     mu: Array = EVEN,
 ) -> Optimum[X]:
-    """Minimise max f from x.  qp: a QP solver whose answers are already verified.
+    """Minimise max f from x.  qp: a QP solver; it is given each answer as the next one's start.
 
     mu: (k,) multipliers of a similar problem, to begin with.
     """
-    at = Iterate.begin(problem, x, settings, mu)
+    at, ask = Iterate.begin(problem, x, settings, mu), Asking(qp)
     status, tolerance = Status.ITERATION_LIMIT, settings.tolerance
     trace: list[Step] = []
     notes: list[str] = []
@@ -178,7 +222,7 @@ def solve(
             status = Status.FAILED
             break
         hessian = at.hessian(settings.floor)
-        plan = at.subproblem(hessian, qp)
+        plan = at.subproblem(hessian, ask)
         notes += plan.notes
         if not plan.usable:
             status = Status.FAILED
@@ -190,7 +234,7 @@ def solve(
             break
         length, move, end, there = 0.0, np.zeros_like(plan.d), at.x, at.here
         if at.kkt.residual > tolerance:
-            length, move, end, there = search(at, plan, partial(at.subproblem, hessian, qp))
+            length, move, end, there = search(at, plan, partial(at.subproblem, hessian, ask))
         value, kkt = float(at.here.f.max()), at.kkt
         trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, plan.backend))
         progress(trace[-1])
@@ -203,7 +247,7 @@ def solve(
             break
     return Optimum(
         at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
-        told_once(notes),
+        told_once(notes), dict(ask.answered), ask.warm,
     )  # fmt: skip
 
 
@@ -263,7 +307,7 @@ class Iterate(Generic[X]):
         return np.asarray(matrix + self.damping * np.diag(np.maximum(np.diag(matrix), 1e-8)))
 
     def subproblem(
-        self, hessian: Array, qp: Solver, f: Array | None = None, c: Array | None = None
+        self, hessian: Array, qp: Ask, f: Array | None = None, c: Array | None = None
     ) -> Plan:
         """The answer of the epigraph QP here, or with other values f, c.
 

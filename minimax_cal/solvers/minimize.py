@@ -19,7 +19,7 @@ from scipy.optimize import (
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.solvers import minimax
-from minimax_cal.solvers.minimax import Linear, Optimum, Sqp, Step
+from minimax_cal.solvers.minimax import Linear, Optimum, Solver, Sqp, Step, from_nothing
 from minimax_cal.solvers.status import Status
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
@@ -92,7 +92,11 @@ def minimize_max(
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
     problem = MaxOfFunctions.at(x, function, derivative(function, jac, args, count), rows)
-    solver = partial(solve_qp, name=qp, tolerance=QP_TOLERANCE) if isinstance(qp, str) else qp
+    solver: Solver = (
+        from_nothing(qp)
+        if not isinstance(qp, str)
+        else partial(solve_qp, name=qp, tolerance=QP_TOLERANCE)
+    )
 
     def tell(step: Step) -> None:
         if callback is not None:

@@ -56,7 +56,8 @@ def test_a_backend_that_is_not_installed(robot: mc.Robot, noisy: Simulation) -> 
     fit = mc.calibrate(robot, noisy.data, "minimax", qp=missing[0])
     assert fit.status == "converged"
     assert any(missing[0] in note and "daqp is used" in note for note in fit.notices)
-    assert fit.qp == "daqp"  # the one that ran
+    assert fit.qp == missing[0]  # what was asked
+    assert set(fit.answered) == {"daqp"}  # the one that ran
     assert fit.provenance.settings["qp"] == missing[0]
 
 

@@ -242,7 +242,7 @@ def test_a_qp_solver_that_fails_ends_in_a_status(robot: mc.Robot, noisy: Simulat
     model, x = warm(robot, noisy.data)
     problem = worst_target(model, x, measured_distances(noisy.data), "two-sided")
 
-    def broken(qp):  # type: ignore[no-untyped-def]
+    def broken(qp, warm_start=None):  # type: ignore[no-untyped-def]
         nothing = np.full(len(qp.q), np.nan), np.full(len(qp.l), np.nan)
         return Solution(*nothing, QpStatus.FAILED, 0.0)
 
@@ -261,7 +261,8 @@ def test_qps_of_some_functions_are_those_of_all(
     few = minimax.solve(problem, x, qp)
     asked = []
     monkeypatch.setattr(minimax, "SHARE", len(few.f))
-    whole = minimax.solve(problem, x, lambda one: (asked.append(len(one.l)), qp(one))[1])
+    counted = minimax.from_nothing(lambda one: (asked.append(len(one.l)), qp(one))[1])
+    whole = minimax.solve(problem, x, counted)
     assert len(few.f) > 4 * int(model.active.sum())
     assert min(asked) == len(few.f) + len(few.c)
     assert few.iterations == whole.iterations

@@ -22,6 +22,7 @@ from minimax_cal.solvers.minimax import (
     epigraph,
     excess,
     forgotten,
+    from_nothing,
     hopeless,
     optimality,
     priced,
@@ -275,7 +276,7 @@ class Plane:
 )
 def test_what_is_no_number_ends_in_a_status(problem: Plane) -> None:
     asked: list[Problem] = []
-    found = solve(problem, np.zeros(1), lambda one: asked.append(one))  # type: ignore[arg-type, func-returns-value]
+    found = solve(problem, np.zeros(1), from_nothing(asked.append))  # type: ignore[arg-type]
     assert found.status is Status.FAILED
     assert asked == []
 
@@ -289,7 +290,8 @@ def test_the_notes_of_backends_are_told_once() -> None:
 
     told = []
     hill = Curve(lambda x: x**4, lambda x: 4.0 * x**3)
-    found = solve(hill, np.array([1.0]), qp, Sqp(hessian="bfgs", iterations=4), told.append)
+    settings = Sqp(hessian="bfgs", iterations=4)
+    found = solve(hill, np.array([1.0]), from_nothing(qp), settings, told.append)
     assert found.notes == ("slow (the first of 2 alike)", "lost (the first of 2 alike)")
     assert found.status is Status.ITERATION_LIMIT
     assert found.iterations == len(found.trace) == len(told) == 4
