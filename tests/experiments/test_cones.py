@@ -1,5 +1,6 @@
 import warnings
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cvxpy as cp
 import numpy as np
@@ -227,7 +228,7 @@ def test_curved_problems_end_where_the_sqp_does(bounds: tuple[np.ndarray, np.nda
     problem = Curved(spots(), *bounds)
     x = np.array([0.3, 0.2])
     found = cones.solve(problem, x)
-    qp = minimax.solve(Squared(problem), x, lambda p: solve_qp(p, "daqp", tolerance=1e-10))
+    qp = minimax.solve(Squared(problem), x, partial(solve_qp, name="daqp", tolerance=1e-10))
     assert found.status is Status.CONVERGED
     assert_allclose(found.value**2, qp.value, rtol=1e-8)
     assert found.gap < 1e-8

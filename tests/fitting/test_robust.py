@@ -1,6 +1,7 @@
 """Robust fits: against scipy's losses, against fits that know the wrong points, in closed form."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -378,7 +379,7 @@ def test_minimax_on_the_trimmed_model_is_that_without_the_points(robot: mc.Robot
     ):
         assert_allclose(model.counts, (found.weights > 0.0).sum(axis=1))
         problem = minimax_problem(model, state, measured_distances(case.data.with_y(y)), "off", per)
-        best = solvers.minimax.solve(problem, state, lambda qp: solve_qp(qp, "daqp"), Sqp())
+        best = solvers.minimax.solve(problem, state, partial(solve_qp, name="daqp"), Sqp())
         assert best.status == "converged"
         worst.append(best.f.max() * problem.size)
     assert worst[0] == pytest.approx(worst[1], rel=1e-6)
