@@ -18,7 +18,8 @@ from minimax_cal.cli.running import cli
 
 PACKAGE = ROOT / "minimax_cal"
 FLAG = re.compile(r"(?:^|[\s(`'\"])(?:--[a-z]|-[oq]\b)")
-THEIRS = {"pdf.py", "parallel.py"}  # whose strings are options of a browser, and of Dask
+# whose strings are options of a browser, of Dask, and of the command that a result proposes
+THEIRS = {"pdf.py", "parallel.py", "spans.py"}
 
 
 def strings(tree: ast.AST) -> Iterator[ast.Constant]:

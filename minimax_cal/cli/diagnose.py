@@ -45,7 +45,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
         group="What is sought",
     ),
     quick=Option(
-        "Leave no parts of the poses out in turn: no claim beyond the measured poses.",
+        "Leave no parts of the poses out in turn: no claim outside the measured poses.",
         group="What is sought",
     ),
 )

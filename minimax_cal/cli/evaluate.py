@@ -15,6 +15,7 @@ from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import read_measurements
+from minimax_cal.measuring.spans import narrow, outside, spans_in_words
 from minimax_cal.modelling.cell import strangers
 
 
@@ -40,6 +41,12 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
             "the same robot, measurement frame, units and order of targets"
         )
+    away = outside(opened.spans, measured.q)
+    if away.any():
+        doubts.append(
+            f"{data}: {away.sum()} of {measured.poses} poses are outside what the joints of the "
+            f"fit spanned ({spans_in_words(narrow(opened.spans))}): no claim was made for them"
+        )
     to.notice(*measured.notices, *said, *strangers(cell, measured), *mixed, *doubts)
     content = {
         "schema": 1,
@@ -49,6 +56,10 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
         "data": str(data),
         "data_sha256": measured.digest,
         "training_poses": count,
+        "outside_spans": {
+            "poses": int(away.sum()),
+            "joints": [span.joint for span in narrow(opened.spans)],
+        },
         "accuracy": found.to_dict(),
     }
     if to.deliver(lambda: json_text(content)):

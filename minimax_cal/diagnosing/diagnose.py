@@ -99,7 +99,7 @@ def diagnose(
     their share; holdout_by: a column (session, group ...) or region, whose poses are held out
     together.  instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
     exclude: effects that are not to be considered.  quick: leave no parts of the poses
-    out in turn, so that there is no claim beyond the measured poses.  progress: called with a
+    out in turn, so that there is no claim outside the measured poses.  progress: called with a
     word on each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
     CalibrationError for wrong input.
 

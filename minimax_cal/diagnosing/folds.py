@@ -11,7 +11,7 @@ from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.limits import MOST
 from minimax_cal.evidence.selection import select
-from minimax_cal.fitting.beyond import Beyond, Errors, without
+from minimax_cal.fitting.beyond import Beyond, Errors, not_claimed, without
 from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.uncertainty import Estimator
@@ -45,6 +45,9 @@ def beyond_of(
     by: whose groups are the parts, as in `grouping.parts`.
     """
     data = judges.everyone
+    known = not_claimed(study.robot, study.data)
+    if known.narrow:
+        return known
     found = parts(data, by)
     masks = [np.isin(study.data.line, data.line[part.rows]) for part in found]
     estimator = Estimator(
@@ -61,5 +64,5 @@ def beyond_of(
         rows = data.take(part.rows)
         errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
     if not found:
-        return Beyond(reason="the poses are too few or too much alike")
-    return errors.beyond(sought=True)
+        return replace(known, reason="the poses are too few or too much alike")
+    return replace(errors.beyond(sought=True), spans=known.spans)

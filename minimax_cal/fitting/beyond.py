@@ -21,9 +21,12 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.grouping import Region
+from minimax_cal.measuring.grouping import Region, groups
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
 from minimax_cal.modelling.near import is_kept, nearby
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.status import Status
 
@@ -63,7 +66,9 @@ class Beyond:
     max_high: upper 95 % limits, of the worst part and of the part with the largest distance [mm].
     missed: parts that could not be judged, None where an earlier version did not tell.  sought:
     whether effects were sought anew without each part; None without effects.  trusted: where
-    held-out points stand out, which judge as well.
+    held-out points stand out, which judge as well.  spans: of every joint in the poses of the fit,
+    none where a file does not tell.  plan: the command that proposes poses over the whole range,
+    where a joint went too little for a claim.
     """
 
     folds: tuple[Fold, ...] = ()
@@ -75,6 +80,13 @@ class Beyond:
     missed: tuple[str, ...] | None = ()
     sought: bool | None = None
     trusted: Trusted | None = None
+    spans: tuple[Span, ...] = ()
+    plan: str = ""
+
+    @property
+    def narrow(self) -> tuple[Span, ...]:
+        """The joints that went too little for a claim."""
+        return narrow(self.spans)
 
     @property
     def judged(self) -> str:
@@ -103,9 +115,13 @@ class Beyond:
         return max((fold.geometric_mm for fold in self.folds), default=math.nan)
 
     def sentence(self) -> str:
-        """For the headline, empty where there is no claim."""
+        """For the headline, empty where there is no claim and no joint that is the cause."""
         if not self.worst:
-            return ""
+            return (
+                f"Outside the measured poses nothing is claimed: {self.reason}."
+                if self.narrow
+                else ""
+            )
         parts = "each part left out in turn"
         if self.missed:
             parts = f"{self.judged} left out in turn (the fit cannot do without the others)"
@@ -114,7 +130,7 @@ class Beyond:
             worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
             less = f"; without the points that stand out at worst {worst}"
         return (
-            f"Beyond the measured poses, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
+            f"Outside the measured poses, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
             f"at worst {self.worst_mm:.3f} mm ({self.worst.where}){less}."
         )
 
@@ -134,7 +150,7 @@ class Beyond:
             rows.append((f"{whole}, without suspects", count, typical, math.nan, math.nan))
         how = f"each part judged by a fit without it{self.kept}"
         return Table(
-            f"beyond the measured poses: {how}, the worst ones",
+            f"outside the measured poses: {how}, the worst ones",
             ("left out", "poses", "RMS mm", "max mm", "geometry alone RMS mm"),
             tuple(rows),
             ("", "d", ".4f", ".4f", ".4f"),
@@ -152,12 +168,29 @@ class Beyond:
             "not_judged": None if self.missed is None else list(self.missed),
             "effects_sought_anew": self.sought,
             "without_suspects": vars(self.trusted) if self.trusted else None,
+            "spans": [vars(span) for span in self.spans],
+            "narrow": [span.joint for span in self.narrow],
+            "plan": self.plan or None,
             "geometric": {
                 "typical_mm": finite(self.geometric_typical_mm),
                 "worst_mm": finite(self.geometric_worst_mm),
             },
         }
         return out | ({"reason": self.reason} if self.reason else {})
+
+
+def not_claimed(robot: Robot, data: Measurements) -> Beyond:
+    """The joints' spans before any part is left out, and why there is no claim if one is narrow.
+
+    data: the poses of the fit.
+    """
+    spans = spans_of(robot, data)
+    few = narrow(spans)
+    if not few:
+        return Beyond(spans=spans)
+    plan = plan_that_mends(len(np.unique(groups(data))))
+    reason = f"{spans_in_words(few)}; measure over the whole range ({plan})"
+    return Beyond(reason=reason, spans=spans, plan=plan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.beyond import Beyond, left_out
+from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
 from minimax_cal.fitting.crossed import FEW, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
@@ -57,7 +58,7 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
         more = f" and {len(held) - LISTED} more" if len(held) > LISTED else ""
         yield (
             f"{source}: held-out points that stand out: {named}{more}; they stay in the held-out "
-            "accuracy and beyond the measured poses, which also stand there without them"
+            "accuracy and outside the measured poses, which also stand there without them"
         )
 
 
@@ -169,6 +170,9 @@ def beyond_of(
     held: (m,) not of the fit.  Points that stand out judge it, those of the fit too where they are
     left out; beside they are set aside.
     """
+    known = not_claimed(robot, data.take(~held))
+    if known.narrow:
+        return known
     points = np.moveaxis(data.y, 1, 0)
     doubted = np.isnan(aside(points, data, suspects)).any(axis=-1) & data.seen.T
     every, free = solved.effects.terms, of_sessions(data.frames)
@@ -179,7 +183,7 @@ def beyond_of(
         model, state = refitted(robot, train, solved.state, active)
         geometric = Estimator(model, np.ones(len(names))), state
     found, error_of = parts(data, options.holdout_by), errors_of(robot, data, solved)
-    return left_out(
+    claim = left_out(
         solved.estimator,
         solved.state,
         ~held,
@@ -189,3 +193,4 @@ def beyond_of(
         geometric,
         steps_of(data.frames),
     )
+    return replace(claim, spans=known.spans)

@@ -36,6 +36,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
@@ -374,6 +375,12 @@ class Fit:
         return self.claim()
 
     @property
+    def spans(self) -> tuple[Span, ...]:
+        """How far each joint went in the training poses; none where a file does not tell."""
+        train = self.train
+        return spans_of(self.robot, train) if train.poses else self.beyond.spans
+
+    @property
     def errors(self) -> Mapping[str, Array]:
         """Errors (k, m, 3) by the keys of `accuracy` [m]."""
         return {
@@ -578,7 +585,7 @@ class Fit:
         """The result in a sentence or two."""
         before, after, where = self.within.before, self.within.after, self.within.where
         identified = sum(p.identifiable for p in self.parameters)
-        beyond = f"{self.beyond.sentence()} " if self.beyond.worst else ""
+        beyond = f"{said} " if (said := self.beyond.sentence()) else ""
         text = (
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {beyond}"

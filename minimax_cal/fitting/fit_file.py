@@ -56,6 +56,7 @@ from minimax_cal.ground.records import (
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.measuring.pose_rows import pose_rows, read_poses
+from minimax_cal.measuring.spans import Span
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.kinematics import rotation
@@ -105,6 +106,8 @@ class BeyondPart(Part):
     not_judged: tuple[str, ...] | None = None
     effects_sought_anew: bool | None = None
     without_suspects: Recorded[Trusted] | None = None
+    spans: tuple[Recorded[Span], ...] = ()
+    plan: str | None = None
 
     def beyond(self) -> Beyond:
         """As the code has it."""
@@ -119,6 +122,8 @@ class BeyondPart(Part):
             missed=self.not_judged,
             sought=self.effects_sought_anew,
             trusted=self.without_suspects,
+            spans=self.spans,
+            plan=self.plan or "",
         )
 
 

@@ -21,6 +21,7 @@ from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.records import reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.model import model_of
@@ -62,7 +63,8 @@ class Opened:
 
     number: of the rung.  placed: whether base and targets are known; lengths tell neither.
     data: its poses, none where it holds none; held: (m,) True where held out.  digest: SHA-256 of
-    the measurements.  uncertainty: of the last rung of a calibration.
+    the measurements.  uncertainty: of the last rung of a calibration.  spans: how far each joint
+    went in the training poses, none where the file does not tell.
     """
 
     source: str
@@ -74,6 +76,7 @@ class Opened:
     uncertainty: Uncertainty | None = None
     placed: bool = True
     status: Status | None = None
+    spans: tuple[Span, ...] = ()
 
     @property
     def cell(self) -> Cell:
@@ -161,7 +164,10 @@ def of_fit(fit: Fit, source: str) -> Opened:
     """A calibration: nominal and calibrated."""
     rungs = (Rung(NOMINAL, fit.nominal, fit.error_nominal), Rung(CALIBRATED, fit.cell, fit.error))
     digest = fit.provenance.data_sha256
-    return Opened(source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty, status=fit.status)
+    return Opened(
+        source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty,
+        status=fit.status, spans=fit.spans,
+    )  # fmt: skip
 
 
 def of_relative(content: Mapping[str, Any], source: str) -> Opened:
@@ -186,7 +192,8 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     rungs = tuple(Rung(r.name, r.cell, told.get(r.name)) for r in rungs)
     digest = str(content["provenance"]["data_sha256"])
     status = Status(content["status"]) if "status" in content else None
-    return Opened(source, rungs, len(rungs) - 1, data, held, digest, status=status)
+    spans = spans_of(first.robot, data.take(~held)) if first and data.poses else ()
+    return Opened(source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans)
 
 
 def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:

@@ -7,7 +7,7 @@ collisions and the floor are not known.  Numbers only: `map_picture` draws them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -24,6 +24,13 @@ from minimax_cal.ground.seeds import check_seed
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.saved import AFTER, Saved
+from minimax_cal.measuring.spans import (
+    Span,
+    narrow,
+    outside,
+    plan_that_mends,
+    spans_in_words,
+)
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.robot import Robot
 
@@ -96,7 +103,9 @@ class Section:
 
     axes: labels of its coordinates.  x, y: (a + 1,), (b + 1,) edges of the bins [m].
     count: (a, b) samples.  median, worst: (a, b) radius that holds 95 % [m].  reached: (a, b) share
-    of the samples among the training poses.  The last three are NaN in an empty bin.
+    of the samples among the training poses.  outside: (a, b) share of them where a joint is outside
+    its span, having gone too little for a claim.  The last four are NaN in an empty bin; median and
+    worst are of the other samples.
     """
 
     name: str
@@ -107,6 +116,7 @@ class Section:
     median: Array
     worst: Array
     reached: Array
+    outside: Array
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: mm, null in an empty bin; rows along the first coordinate."""
@@ -118,6 +128,7 @@ class Section:
             "radius95_median_mm": plain(1e3 * self.median),
             "radius95_worst_mm": plain(1e3 * self.worst),
             "reached": plain(self.reached),
+            "outside_spans": plain(self.outside),
         }
 
 
@@ -146,16 +157,19 @@ class Seen:
 class Sampled:
     """Joints at random, and the training poses.  place: (N, 3) in the base frame [m].
 
-    radius: (N,) that holds 95 % [m].  reached: (N,) True among the training poses.
+    radius: (N,) that holds 95 %, NaN where none is known [m].  reached: (N,) True among the
+    training poses.  outside: (N,) True where a joint that went too little is outside its span, of
+    which no radius is predicted.
     """
 
     place: Array
     radius: Array
     reached: Array
+    outside: Array
 
     def take(self, mask: Array) -> Sampled:
         """Some of the samples."""
-        return Sampled(self.place[mask], self.radius[mask], self.reached[mask])
+        return Sampled(self.place[mask], self.radius[mask], self.reached[mask], self.outside[mask])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +197,12 @@ class WorkspaceMap:
     def table(self) -> Table:
         """Predicted radius where the data reach and beyond; observed errors."""
         rows: list[tuple[TableCell, ...]] = []
-        reached = self.sampled.reached
-        for title, mask in (("where the data reach", reached), ("beyond", ~reached)):
+        reached, outside = self.sampled.reached, self.sampled.outside
+        for title, mask in (
+            ("where the data reach", reached),
+            ("beyond", ~reached & ~outside),
+            ("outside the spans of joints that hardly moved: none", outside),
+        ):
             share = 100.0 * float(mask.mean())
             what = f"predicted, {title} ({share:.0f} % of the samples)"
             rows.append((what, int(mask.sum()), *spread(self.sampled.radius[mask])))
@@ -276,14 +294,21 @@ def reached_by(train: Array, q: Array) -> Array:
     return np.asarray(inside & (away <= np.quantile(own[:, 1], NEAR)))
 
 
-def sample(cell: Cell, predict: Predict, train: Array, grid: Grid) -> Sampled:
-    """Joints at random over their range, and the training poses; what is predicted there."""
+def sample(
+    cell: Cell, predict: Predict, train: Array, grid: Grid, spans: Sequence[Span] = ()
+) -> Sampled:
+    """Joints at random over their range, and the training poses; what is predicted there.
+
+    Nothing is where a joint that went too little is outside its span.
+    """
     low, high = joint_range(cell.robot, train)
     rng = np.random.default_rng(grid.seed)
     q = np.concatenate([train, rng.uniform(low, high, (grid.samples, cell.robot.joints))])
     parts = np.array_split(q, max(1, len(q) // CHUNK))
     radius = np.concatenate([predict(part) for part in parts])
-    return Sampled(tcp_place(cell, q), radius, reached_by(train, q))
+    away = outside(spans, q)
+    radius = np.where(away, np.nan, radius)
+    return Sampled(tcp_place(cell, q), radius, reached_by(train, q) & ~away, away)
 
 
 def section(
@@ -295,16 +320,22 @@ def section(
         for part in at
     ]
 
-    def binned(values: Array, statistic: Literal["count", "mean", "median", "max"]) -> Array:
-        found = binned_statistic_2d(at[0], at[1], values, statistic=statistic, bins=edges)
+    every = np.ones(len(some.radius), dtype=bool)
+
+    def binned(
+        values: Array, statistic: Literal["count", "mean", "median", "max"], mask: Array = every
+    ) -> Array:
+        x, y = (part[mask] for part in at)
+        found = binned_statistic_2d(x, y, values[mask], statistic=statistic, bins=edges)
         return np.asarray(found.statistic, dtype=float)
 
     count = binned(some.radius, "count")
-    reached = binned(some.reached.astype(float), "mean")
+    reached, away = (binned(mask.astype(float), "mean") for mask in (some.reached, some.outside))
     median = worst = np.full_like(count, np.nan)
-    if np.isfinite(some.radius).all():
-        median, worst = binned(some.radius, "median"), binned(some.radius, "max")
-    return Section(name, axes, edges[0], edges[1], count, median, worst, reached)
+    known = np.isfinite(some.radius)
+    if known.any():
+        median, worst = binned(some.radius, "median", known), binned(some.radius, "max", known)
+    return Section(name, axes, edges[0], edges[1], count, median, worst, reached, away)
 
 
 def workspace_map(
@@ -319,13 +350,19 @@ def workspace_map(
     check_grid(grid)
     cell, data, held = saved.cells[AFTER], saved.data, saved.held
     train = data.q[~held]
-    some = sample(cell, predict, train if len(train) else data.q, grid)
+    some = sample(cell, predict, train if len(train) else data.q, grid, saved.spans)
     sections, height, slab = sections_of(some, grid, cell.robot.reach())
     seen = seen_of(saved)
     radius, error = measured(data.q[held]), seen.error[AFTER][held]
     known = np.isfinite(radius) & np.isfinite(error)
     inside = int((error[known] <= radius[known]).sum()), int(known.sum())
     notices = tuple(remarks(cell.robot, train, inside))
+    if few := narrow(saved.spans):
+        share = 100.0 * float(some.outside.mean())
+        notices += (
+            f"nothing is predicted for {share:.0f} % of the samples, outside what joints spanned "
+            f"in the fit: {spans_in_words(few)}; {plan_that_mends(len(train))}",
+        )
     return WorkspaceMap(cell.robot.name, sections, some, seen, height, slab, inside, notices)
 
 

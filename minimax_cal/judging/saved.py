@@ -18,6 +18,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import REPEAT
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.measuring.spans import Span
 from minimax_cal.modelling.cell import Cell, strangers
 from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import load_robot
@@ -32,6 +33,7 @@ class Saved:
     """Cells before (nominal) and after (calibrated), and poses to judge them by.
 
     held: (m,) True where the fit has not seen the pose.  uncertainty: of the fit, where it tells.
+    spans: how far each joint went in its poses.
     """
 
     cells: Mapping[str, Cell]
@@ -39,6 +41,7 @@ class Saved:
     held: Array
     uncertainty: Uncertainty | None
     notices: tuple[str, ...]
+    spans: tuple[Span, ...] = ()
 
 
 def evaluate(source: Result, data: Measurements | Path | str, rung: int | None = None) -> Accuracy:
@@ -92,7 +95,8 @@ def open_saved(
             f"{measured.source}: the fit misses by {1e3 * miss:.3g} mm: check that data and fit "
             "belong to the same robot, measurement frame, units and order of targets"
         )
-    return Saved({BEFORE: before, AFTER: cell}, measured, held, known.uncertainty, tuple(notices))
+    cells = {BEFORE: before, AFTER: cell}
+    return Saved(cells, measured, held, known.uncertainty, tuple(notices), known.spans)
 
 
 def known_targets(data: Measurements, cell: Cell) -> tuple[Measurements, tuple[str, ...]]:

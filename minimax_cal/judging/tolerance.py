@@ -12,7 +12,8 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.accuracy import Accuracy
 
 PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"
-CLAIMS = ("within", "beyond")
+CLAIMS = ("inside", "outside")  # the measured poses
+OTHER_SPELLINGS = {"within": "inside", "beyond": "outside"}  # accepted, and not offered
 KINDS = {"rms": "RMS", "max": "largest"}  # as people write it, and as they read it
 CHANCE = 0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
 FEWEST = math.ceil(1.0 / CHANCE - 1.0)  # poses: `chance_of_larger` is then small enough
@@ -40,7 +41,7 @@ class Bound:
 class Claim:
     """What is claimed of poses that no fit has seen.
 
-    name: within or beyond.  before: of the nominal arm [mm], by kind.  poses: that count by
+    name: inside or outside.  before: of the nominal arm [mm], by kind.  poses: that count by
     themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
     could not be judged, so that nothing is passed by the rest; empty where all was.  sets:
     the poses of RMS and of the largest in two words, for a table.
@@ -98,6 +99,14 @@ def limits_of(text: str) -> tuple[Limit, ...]:
     return tuple(out)
 
 
+def claim_called(name: str) -> str:
+    """Which of `CLAIMS` people mean.  Raises OptionError."""
+    found = OTHER_SPELLINGS.get(name, name)
+    if found not in CLAIMS:
+        raise OptionError(f"tolerance for {name!r}: choose {' or '.join(CLAIMS)}")
+    return found
+
+
 def within(
     name: str,
     before: Accuracy,
@@ -114,7 +123,7 @@ def within(
     """
     rms, largest = intervals
     return Claim(
-        "within",
+        "inside",
         Bound(after.rms_mm, 1e3 * rms.high),
         Bound(after.max_mm, 1e3 * largest.high),
         after.poses if poses is None else poses,
@@ -131,16 +140,16 @@ def beyond(found: Beyond) -> Claim:
     worst = found.worst
     if worst is None:
         nothing = Bound(math.nan, math.nan)
-        return Claim("beyond", nothing, nothing, 0, "", reason=found.reason)
+        return Claim("outside", nothing, nothing, 0, "", reason=found.reason)
     far = max(found.folds, key=lambda fold: fold.max_mm)
     of = f"; {found.judged} could be judged" if found.judged else ""
     kept = "; effects not sought anew" if found.sought is False else ""
     return Claim(
-        "beyond",
+        "outside",
         Bound(worst.rms_mm, found.rms_high_mm),
         Bound(far.max_mm, found.max_high_mm),
         worst.poses,
-        f"beyond the measured poses, in the worst part that was left out ({worst.where}, "
+        f"outside the measured poses, in the worst part that was left out ({worst.where}, "
         f"{worst.poses} poses{of}{kept})",
         open=open_of(found),
         sets=(f"{worst.poses} left out", f"{far.poses} left out"),
@@ -148,7 +157,7 @@ def beyond(found: Beyond) -> Claim:
 
 
 def open_of(found: Beyond) -> str:
-    """What could not be judged beyond the measured poses."""
+    """What could not be judged outside the measured poses."""
     if found.missed is None:
         return "an earlier version wrote this file and does not tell which parts were not judged"
     if not found.missed:

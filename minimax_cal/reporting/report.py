@@ -12,7 +12,7 @@ from pathlib import Path
 
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
-from minimax_cal.judging.tolerance import CLAIMS, limits_of
+from minimax_cal.judging.tolerance import claim_called, limits_of
 from minimax_cal.reporting.html import (
     Wording,
     compose,
@@ -40,7 +40,7 @@ def report(
     author: str = "",
     date: str = "",
     tolerance: str = "",
-    tolerance_for: str = "within",
+    tolerance_for: str = "inside",
     facts: Path | str | None = None,
     rung: int | None = None,
     pdf: Path | str | None = None,
@@ -53,7 +53,7 @@ def report(
     alone.  path: of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
     title: that of the robot unless given.  customer, author: who accepts, who measured.  date:
     YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  tolerance: what is required in mm, as
-    ``rms 0.2, max 0.5``; tolerance_for: within or beyond the measured poses. facts: a TOML file
+    ``rms 0.2, max 0.5``; tolerance_for: inside or outside the measured poses. facts: a TOML file
     with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.  pdf:
     printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called with
     what the reader should know of both together, which the page says too.  Lengths on the page are
@@ -75,20 +75,18 @@ class Chosen:
     author: str = ""
     date: str = ""
     tolerance: str = ""
-    tolerance_for: str = "within"
+    tolerance_for: str = "inside"
     facts: Path | str | None = None
     rung: int | None = None
 
     def wording(self) -> Wording:
         """As the page needs it.  Raises OptionError."""
-        if self.tolerance_for not in CLAIMS:
-            raise OptionError(f"tolerance for {self.tolerance_for!r}: choose {' or '.join(CLAIMS)}")
         told = read_facts(self.facts) if self.facts else {}
         title, customer, author, date = (
             getattr(self, name) or told.get(name, "") for name in WORDS
         )
         return Wording(date_of(date), title, customer, author, told, limits_of(self.tolerance),
-                       self.tolerance_for, self.rung)  # fmt: skip
+                       claim_called(self.tolerance_for), self.rung)  # fmt: skip
 
 
 def signed(

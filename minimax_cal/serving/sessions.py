@@ -58,7 +58,7 @@ class Choices(BaseModel):
     quick: bool = False
     rms: Limit = None
     most: Limit = None
-    claim: Literal["within", "beyond"] = "within"
+    claim: Literal["inside", "outside"] = "inside"
     poses: Annotated[int, Field(ge=1, le=1000)] = 20
 
     def files(self) -> set[str]:

@@ -152,9 +152,11 @@ class SimulatorGap:
         typical, worst = (self.beyond.get(key) for key in ("typical_mm", "worst_mm"))
         if typical is not None and worst is not None:
             text += (
-                f". Beyond the measured poses its fit claims {typical:.3f} mm, at worst "
+                f". Outside the measured poses its fit claims {typical:.3f} mm, at worst "
                 f"{worst:.3f} mm ({self.beyond.get('worst_where')})"
             )
+        elif self.beyond.get("narrow"):
+            text += f". Outside the measured poses nothing is claimed: {self.beyond['reason']}"
         return text + "."
 
     def summary(self, width: int = 110) -> str:

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from minimax_cal.fitting.beyond import (
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
-from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 
@@ -196,3 +197,91 @@ def test_no_part_left_out_makes_a_joint_yield_upwards(
     ]
     assert any((step < 0.0).any() for _, step in compliances)
     assert all((one >= 0.0).all() for one, _ in compliances)
+
+
+# ---- joints that hardly moved ------------------------------------------------------------------
+
+
+def with_spans(robot: mc.Robot, joints: Sequence[int], degrees: float) -> Simulation:
+    """60 poses of an arm with geometric errors, of which some joints went so far alone."""
+    ideal = simulate(robot, 60, 3, seed=2, truth=Truth(compliance=0))
+    q, rng = ideal.data.q.copy(), np.random.default_rng(102)
+    for joint in joints:
+        q[:, joint] = np.median(q[:, joint]) + np.radians(degrees) * rng.uniform(-0.5, 0.5, len(q))
+    noise = 2e-5 * rng.normal(size=ideal.data.y.shape)
+    return replace(ideal, data=replace(ideal.data, q=q).with_y(ideal.cell.predict(q) + noise))
+
+
+def rms_mm(arm: mc.Fit, made: Simulation, q: Array) -> float:
+    """Of the targets at joints where the truth is known."""
+    off = arm.predict(q) - made.cell.predict(q)
+    return float(1e3 * np.sqrt((off**2).sum(axis=-1).mean()))
+
+
+@pytest.mark.parametrize(
+    ("joints", "degrees", "narrow"),
+    [
+        ((0, 1, 2), 0.0, ["J1", "J2", "J3"]),
+        (range(6), 2.6, ["J1", "J2", "J3", "J4", "J5", "J6"]),
+    ],
+)
+def test_nothing_is_claimed_outside_what_joints_spanned(
+    robot: mc.Robot, joints: Sequence[int], degrees: float, narrow: list[str]
+) -> None:
+    made = with_spans(robot, joints, degrees)
+    fit = mc.calibrate(robot, made.data, "sum")
+    content = fit.to_dict()["accuracy"]["beyond"]
+    assert (content["typical_mm"], content["worst_mm"], content["worst_where"]) == (None,) * 3
+    assert content["narrow"] == narrow
+    for name in narrow:
+        assert f"joint {name[1:]} spans" in content["reason"]
+    assert content["plan"] in content["reason"]
+    assert content["plan"].startswith("minimax-cal plan ROBOT --poses ")
+    said = "Outside the measured poses nothing is claimed: joint 1 spans"
+    assert said in fit.headline()
+    # the claim inside stays, and is true; fresh poses elsewhere are far worse
+    inside = fit.within.after.rms_mm
+    assert 0.0 < inside < 0.06
+    anywhere = simulate(robot, 200, seed=2).data.q
+    assert rms_mm(fit, made, anywhere) > 5.0 * inside
+    assert rms_mm(fit, made, made.data.q) < inside
+
+
+def test_what_joints_spanned_survives_the_file(robot: mc.Robot) -> None:
+    fit = mc.calibrate(robot, with_spans(robot, (0,), 3.0).data, "sum")
+    again = mc.Fit.from_dict(fit.to_dict())
+    assert again.beyond == fit.beyond
+    assert again.spans == fit.spans == fit.beyond.spans
+    bare = mc.Fit.from_dict(fit.to_dict(poses=False))
+    assert bare.spans == fit.spans
+
+
+def test_joints_that_moved_are_not_named(robot: mc.Robot, noisy: Simulation) -> None:
+    found = mc.calibrate(robot, noisy.data, "sum").beyond
+    assert found.worst is not None
+    assert not found.narrow
+    assert len(found.spans) == 6
+    assert found.to_dict()["plan"] is None
+
+
+def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:
+    found = mc.diagnose(robot, with_spans(robot, (0, 1, 2), 0.0).data)
+    gap = found.to_dict()["gap"]["beyond"]
+    assert gap["worst_mm"] is None
+    assert gap["narrow"] == ["J1", "J2", "J3"]
+    assert "Outside the measured poses nothing is claimed: joint 1 spans" in found.headline()
+    assert mc.Diagnosis.from_dict(found.to_dict()).beyond == found.beyond
+
+
+def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
+    made = with_spans(robot, (0, 1, 2), 0.0)
+    fit = mc.calibrate(robot, made.data, "sum")
+    words = fit.beyond.plan.split()
+    proposed = mc.plan(robot, poses=int(words[words.index("--poses") + 1]), candidates=300)
+    rng = np.random.default_rng(0)
+    y = made.cell.predict(proposed.q)
+    data = measurements(proposed.q, y + 2e-5 * rng.normal(size=y.shape))
+    mended = mc.calibrate(robot, data, "sum")
+    assert mended.beyond.worst is not None
+    anywhere = simulate(robot, 200, seed=2).data.q
+    assert rms_mm(mended, made, anywhere) < mended.beyond.worst_mm

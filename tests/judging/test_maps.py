@@ -114,7 +114,7 @@ def test_the_radius_of_a_measurement_holds_95_percent_of_those_not_fitted(
 def test_bins_hold_the_median_and_the_worst(rng: np.random.Generator) -> None:
     x, y, radius = rng.uniform(-1, 1, (3, 500))
     reached = rng.uniform(size=500) < 0.4
-    some = Sampled(np.stack([x, y, 0 * x], axis=1), 2.0 + radius, reached)
+    some = Sampled(np.stack([x, y, 0 * x], axis=1), 2.0 + radius, reached, ~reached)
     found = section("flat", ("x", "y"), (x, y), some, 0.25)
     assert found.count.sum() == 500
     for i in range(len(found.x) - 1):

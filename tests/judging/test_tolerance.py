@@ -23,7 +23,7 @@ from minimax_cal.judging.tolerance import (
 
 
 def claim(poses: int, value: float = 0.1, high: float = 0.15) -> Claim:
-    return Claim("within", Bound(value, high), Bound(3 * value, 3 * high), poses, "some poses")
+    return Claim("inside", Bound(value, high), Bound(3 * value, 3 * high), poses, "some poses")
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_what_is_passed_does_not_hide_what_is_seen_beyond() -> None:
     passed, failed = (judge(Limit("rms", size), inside) for size in (0.2, 0.12))
     away = beyond(Beyond((Fold("one end", 20, 0.3, 0.9, 0.2),), 0.3, 0.3, "", 0.4, 1.2))
     assert elsewhere(passed, away) == (
-        "Passed within the measured poses alone: beyond them the RMS error is 0.300 mm, more than "
+        "Passed inside the measured poses alone: outside them the RMS error is 0.300 mm, more than "
         "the 0.2 mm required"
     )
     assert elsewhere(failed, away) == ""

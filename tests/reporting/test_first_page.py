@@ -54,7 +54,7 @@ def test_requirement_result_and_verdict(
         assert stdout.splitlines()[0] == verdict
         assert f"written: {out}" in stderr
         seen = Seen(out.read_text())
-        poses, before, after, limit, asked, said = rows(seen)["RMS, within measured poses"]
+        poses, before, after, limit, asked, said = rows(seen)["RMS, inside measured poses"]
         assert poses == f"{fit.within.after.poses} cross-validated"
         assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
                                    f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
@@ -72,11 +72,11 @@ def test_beyond_is_asked_of_the_worst_part(
     told = ("report", whole, "--tolerance", f"rms {size:.6f}", "-o", out, "-q")
     assert run(*told) == 0
     assert capsys.readouterr().out.startswith("passed")
-    assert run(*told, "--tolerance-for", "beyond") == 0
+    assert run(*told, "--tolerance-for", "outside") == 0
     assert capsys.readouterr().out.startswith("not passed")
-    assert rows(Seen(out.read_text()))["RMS, beyond, worst part"][-1] == "not passed"
+    assert rows(Seen(out.read_text()))["RMS, outside, worst part"][-1] == "not passed"
     assert run(*told, "--tolerance-for", "above") == 2
-    assert "choose within or beyond" in capsys.readouterr().err
+    assert "choose inside or outside" in capsys.readouterr().err
 
 
 def test_an_arm_of_half_its_lengths_is_not_signed_unseen(
@@ -118,7 +118,7 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path
     def limiting(verdict: str, share: float) -> str:
         found = tuple(replace(one, share=share) for one in gap.findings)
         told = Sources(fit, replace(gap, verdict=verdict, findings=found))
-        return limits_now(told, signed(told, (), "within", None))
+        return limits_now(told, signed(told, (), "inside", None))
 
     cause = "gearboxes wind up under gravity"
     assert limiting("named", 0.9).startswith(f"{cause} (joint compliance of the whole arm), which")
@@ -151,7 +151,7 @@ def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
-        found = rows(rendered(wording, results / "gap.json"))["RMS, within measured poses"]
+        found = rows(rendered(wording, results / "gap.json"))["RMS, inside measured poses"]
         assert found[0] == f"{step.holdout.poses} held out"
         assert found[2] == f"{step.holdout.rms_mm:.3f}"
     with pytest.raises(mc.OptionError, match="no rung 7"):

@@ -55,7 +55,7 @@ def test_the_lines_are_what_people_would_type(at: Session) -> None:
     ]
     assert lines(at, "judge") == [
         "minimax-cal report fit.json diagnosis.json --tolerance 'rms 0.2, max 0.5' "
-        "--tolerance-for within -o report.html"
+        "--tolerance-for inside -o report.html"
     ]
 
 

@@ -66,7 +66,7 @@ class Wording:
     """What the user says of a report, empty where nothing.
 
     date: of the report, ISO 8601.  facts: by the keys of `facts.FACTS`.  limits: what is required,
-    which: of which claim, within or beyond.  rung: of a diagnosis.
+    which: of which claim, inside or outside.  rung: of a diagnosis.
     """
 
     date: str
@@ -75,7 +75,7 @@ class Wording:
     author: str = ""
     facts: Mapping[str, str] = field(default_factory=dict)
     limits: tuple[Limit, ...] = ()
-    which: str = "within"
+    which: str = "inside"
     rung: int | None = None
 
 

@@ -45,7 +45,7 @@ NO_LIMIT = "No requirement was given: the result is stated, and nothing is passe
 
 @dataclass(frozen=True)
 class Signed:
-    """The judgement of a report.  claims: within, then beyond where there is one.
+    """The judgement of a report.  claims: inside, then outside where there is one.
 
     wild: links that no whole arm changes so much, empty where there are none.
     """
@@ -78,7 +78,7 @@ class Signed:
 def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | None) -> Signed:
     """The claims of a result, and the requirements against the one that is named.
 
-    which: within or beyond.  rung: of a diagnosis.  Raises OptionError.
+    which: inside or outside.  rung: of a diagnosis.  Raises OptionError.
     """
     if rung is not None and not (sources.gap and not sources.fit):
         raise OptionError("rung: only a report of a diagnosis alone has rungs")
@@ -126,7 +126,7 @@ def claims_of(fit: Fit) -> tuple[Claim, ...]:
         "cross-validated" if fit.error_crossed.size else "held out",
     )
     if not held:
-        inside = Claim("within", inside.rms, inside.largest, 0, seen.where, inside.before,
+        inside = Claim("inside", inside.rms, inside.largest, 0, seen.where, inside.before,
                        "no pose was held out, and training errors are too small")  # fmt: skip
     return inside, beyond(fit.beyond)
 
@@ -194,9 +194,9 @@ def result_table(sources: Sources, found: Signed) -> Table:
     named = {(one.bound, one.limit.kind): one for one in found.judged}
     rows: list[tuple[Cell, ...]] = []
     for claim in found.claims:
-        if claim.name == "beyond" and claim.reason:
+        if claim.name == "outside" and claim.reason:
             continue
-        title = "within measured poses" if claim.name == "within" else "beyond, worst part"
+        title = "inside measured poses" if claim.name == "inside" else "outside, worst part"
         for i, kind in enumerate(KINDS):
             bound = claim.bound(kind)
             one = named.get((bound, kind))
@@ -231,12 +231,12 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
 def basis(found: Signed) -> str:
     """What the numbers rest on."""
     inside = found.claims[0]
-    out = f"Within the measured poses: on {inside.where}. "
+    out = f"Inside the measured poses: on {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
-        out += f"Beyond: {away.where.removeprefix('beyond the measured poses, in ')}. "
+        out += f"Outside: {away.where.removeprefix('outside the measured poses, in ')}. "
     elif away:
-        out += f"Beyond them nothing is claimed: {away.reason}. "
+        out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
         "The 95 % limits are upper ends: of the RMS over such poses, and of the largest error of "
         "as many new ones."
