@@ -25,6 +25,7 @@ from minimax_cal.cli.options import (
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import names_of
 from minimax_cal.measuring.columns import rows_in
+from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
 from minimax_cal.measuring.left_out import left_out
 from minimax_cal.measuring.measurements import check_finite, measurements_in
@@ -90,6 +91,8 @@ def import_command(
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
     found = replace(found, data=left_out(found.data, names_of([leave_out])))
     check_finite(found.data)  # what is left of it
+    off = [fault.text for fault in distance_faults(found.data)]
+    found = replace(found, data=replace(found.data, notices=(*found.data.notices, *off)))
     to.write_rows(
         lambda: readable(to.cells(csv_of(found), safe_cells), to.path),
         lambda: json_text(content(found, to.path)),

@@ -37,9 +37,10 @@ from minimax_cal.diagnosing.gap import (
 )
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.remainder import remainder
+from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Step
 from minimax_cal.diagnosing.study import SUM, Study, studied
-from minimax_cal.diagnosing.tails import are_wrong, wrong_rows
+from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
@@ -49,7 +50,7 @@ from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_
 from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import FEW
 from minimax_cal.fitting.fit import Provenance
-from minimax_cal.fitting.options import Progress, silent
+from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
@@ -66,11 +67,13 @@ from minimax_cal.measuring.faults import (
     standing_out,
 )
 from minimax_cal.measuring.faults.fault import listed
-from minimax_cal.measuring.floor import Floor, floor_of, instrument_noise, noise_at_most
+from minimax_cal.measuring.faults.nests import RESEAT
+from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, instrument_noise, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
@@ -78,6 +81,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
 NOT_ASKED = Beyond(reason="not asked for")
+ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
 
 
@@ -305,7 +309,8 @@ def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
 
 def against(robot: Robot, floor: Floor, last: Step) -> str:
     """Why the last rung contradicts the data; empty where it does not."""
-    known = (floor.value, floor.source) if floor.certain else None
+    certain = floor.certain and floor.source != DISTANCES  # which do not hold what the arm does
+    known = (floor.value, floor.source) if certain else None
     scores = {"training": (last.train, last.train), "held-out": (last.holdout, last.trusted)}
     return too_far(robot, known, scores)
 
@@ -352,17 +357,32 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     sound = mended(data, found)
     check_plausible(robot, sound)
     progress("geometry")
+
+    def fitted(some: Measurements, options: Options = SUM) -> Cell:
+        return fit_cell(robot, asked.train(some), options, silent).cell(robot, some)
+
+    found = with_targets(found, data, fitted)
+    sound = mended(data, found)
     fit = fit_cell(robot, asked.train(sound), SUM, progress)
     cell = fit.cell(robot, sound)
+    found = tuple(sized(fault, cell, data) for fault in found)
     error = cell.error(sound)
     more = standing_out(cell.placed(sound), error)
+
+    def robust() -> Array:
+        return fitted(sound, ROBUST).error(sound)
+
+    shifted = any(fault.effect == TARGET_SHIFT.name for fault in found)
+    many = () if more or shifted else unpulled(error, robust, sound)
     wrong = wrong_rows(data, cell.error(data))
     points = (*in_lines(data, found, "outliers"), *in_lines(sound, more, "outliers"))
     faults = (
         *exchanged,
-        *in_lines(data, found, "swapped_rows"),
+        *in_lines(data, found, "swapped_rows", RESEAT),
         *(one for one in points if are_wrong(one, wrong, data.line)),
+        *in_lines(sound, many, "outliers"),
     )
+    more = (*more, *many)
     sound = mended(sound, more)
     sound = sound.take(np.asarray(sound.seen.any(axis=1)))
     jumped = session_jumps(cell.placed(sound), cell.error(sound))

@@ -17,6 +17,7 @@ from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import mended, standing_out
+from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
@@ -33,7 +34,7 @@ SPARED = 10  # groups of training poses that are left out in turn, for the inter
 HELPS = 1e-6  # relative fall of the error by groups that is one
 END = 0.2  # of the poses at an end of what drives an effect
 ALIKE = 0.5  # of a point's error, which geometry alone must see too if the point is wrong
-FAULTS = ("outliers", "swapped_rows")
+FAULTS = ("outliers", "swapped_rows", RESEAT)  # that are mended before anything is fitted
 
 Ends = tuple[float, float]
 
@@ -284,7 +285,8 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
     """
     gap = max(steps[1].trusted.rms_mm ** 2 - floor**2, 1e-12)
     out, at = [], 1
-    mendable = [f for f in findings if f.term.effect in FAULTS]
+    of_data = [f for f in findings if f.rows or f.term.effect not in EFFECTS]
+    mendable = [f for f in of_data if f.term.effect in FAULTS]
     for found in findings:
         fault = found in mendable
         if not fault and found.term.effect == "readback":

@@ -41,6 +41,7 @@ FAULTS = {
     "outliers": "single points that are off",
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
+    "target_reseat": "a reflector that was re-seated, or exchanged for one of another radius",
 }
 FAULTS_OF_TARGETS = ("outliers", "swapped_rows")  # all of their place are the targets
 PEOPLES = {  # how people read a unit of the file
@@ -150,7 +151,9 @@ class Finding:
     def cause(self) -> str:
         """What it is, in a few words."""
         name = self.term.effect
-        return EFFECTS[name].cause if name in EFFECTS else FAULTS.get(name, name)
+        if name in EFFECTS and not self.rows:
+            return EFFECTS[name].cause
+        return FAULTS.get(name, name)
 
     @property
     def at(self) -> str:

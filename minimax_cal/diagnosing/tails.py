@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from minimax_cal.fitting.suspects import Scores, Spread, spread_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.measuring.faults import Fault
+from minimax_cal.measuring.faults import Fault, far_off
 from minimax_cal.measuring.faults.distances import between
+from minimax_cal.measuring.history import visits
 from minimax_cal.measuring.measurements import Measurements
 
+LARGE = 3.5  # times the median error: the largest of 10,000 Gaussian ones in space are 3.2 times it
 HEAVY = 10.0  # degrees of freedom of Student's t, and fewer: single points far off are usual
 
 
@@ -26,6 +30,27 @@ def wrong_rows(data: Measurements, error: Array) -> Array:
         return out
     off = np.abs(between(data).off)
     return np.asarray(far | judged(off, 1)[1] if off.size else far)
+
+
+def unpulled(error: Array, again: Callable[[], Array], data: Measurements) -> tuple[Fault, ...]:
+    """Points that are wrong where so many are that they pull the fit.
+
+    error: (k, m, 3) of a plain fit [m].  again: that of one which wrong points do not pull, asked
+    where an error is larger than those of Gaussian noise are.  Its heavy tails are no wrong points,
+    nor are poses that were visited one after the other.
+    """
+    size = np.linalg.norm(error, axis=-1)
+    if not np.nanmax(size, initial=0.0) > LARGE * np.nanmedian(size):
+        return ()
+    robust = again()
+    spread, far = judged(np.linalg.norm(robust, axis=-1), 3)
+    return far_off(data, robust, far) if spread.dof > HEAVY and scattered(data, far) else ()
+
+
+def scattered(data: Measurements, far: Array) -> bool:
+    """Whether poses (m,) are single ones among the visits: most that follow each other moved."""
+    begins = np.diff(far[visits(data)].astype(int), prepend=0) == 1
+    return 2 * int(begins.sum()) > int(far.sum())
 
 
 def judged(size: Array, directions: int) -> tuple[Spread, Array]:

@@ -213,7 +213,8 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     data = stationed(robot, data, kept)
     train, held = seen_from(train, data.frames), seen_from(held, data.frames)
     doubts = (*checks.limit_notices(robot, data), *time_notices(data), mislabelled(data))
-    doubts = (*doubts, *(fault.text for fault in noise(data)))
+    off = (*faults.distance_faults(data), *noise(data))
+    doubts = (*doubts, *(fault.text for fault in off))
     notices = (*data.notices, *filter(None, doubts), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():

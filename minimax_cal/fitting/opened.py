@@ -253,7 +253,9 @@ def established(content: Mapping[str, Any], source: str) -> list[Term]:
         found = [
             (str(effect["effect"]), str(effect["place"]))
             for effect in content["effects"]
-            if effect.get("established", True) and effect["effect"] in EFFECTS
+            if effect.get("established", True)
+            and effect["effect"] in EFFECTS
+            and not effect.get("lines")  # a fault of the data
         ]
         last = rungs_of(content, source)[-1].cell
         known = last.effects.terms if last else ()

@@ -1,4 +1,7 @@
-"""What no model can take away: how far apart visits to one pose are, or what is declared."""
+"""What no model can take away: how far apart visits to one pose are, or what is declared.
+
+Where neither is known, the distances between targets tell the instrument's noise.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,12 @@ import numpy as np
 from scipy.special import chdtri
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults import noise_between
 from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
 
 REPEATS, DECLARED, AT_MOST = "repeated poses", "declared", "at most"
+DISTANCES = "distances between the targets"
 FEWEST = 5  # repeated visits that tell
 RESAMPLES = 500
 USUAL = float(chdtri(3.0, 0.5)) / 3.0  # median square of a Gaussian over its mean, in space
@@ -63,7 +68,10 @@ class Floor:
 
 
 def floor_of(data: Measurements, error: Array, repeatability: float, most: float) -> Floor:
-    """The floor, by revisits, else by what is declared, else by what a fit leaves at most.
+    """The floor, by revisits, else by what is declared, else by the distances between targets.
+
+    Where there is nothing of these, what a fit leaves at most.  The distances are asked too where
+    one part of what is declared is missing.
 
     error: (k, m, 3) of the best model [m].  repeatability: of the arm by ISO 9283, NaN unknown [m].
     most: RMS distance that noise leaves at most, as the fit tells it [mm].
@@ -71,15 +79,40 @@ def floor_of(data: Measurements, error: Array, repeatability: float, most: float
     again = least_scatter(data, error)
     if again:
         return between(*again)
-    told = declared(data, repeatability)
-    if told is None:
-        return Floor(most, 0.0, most, AT_MOST)
-    instrument, arm = told
-    both = float(np.hypot(instrument, arm))
-    if not both < most:  # one part is not known, or data sheets promise less than the arm does
-        return Floor(most, min(float(np.nan_to_num(instrument)), most), most, AT_MOST)
+    instrument, arm = declared(data, repeatability) or (math.nan, math.nan)
+    both, seen = float(np.hypot(instrument, arm)), noise_between(data)
+    more = seen is not None and of_coordinate(seen[0]) > instrument * wider(seen[1])
+    if more or not both < most:  # a part is not known, or data sheets promise less than is seen
+        return by_distances(seen, instrument, arm, most)
     low = float(np.hypot(instrument, 0.5 * arm))  # a data sheet promises no more than this
     return Floor(both, low, both, DECLARED)
+
+
+def by_distances(
+    seen: tuple[float, float] | None, instrument: float, arm: float, most: float
+) -> Floor:
+    """The floor where what is declared does not tell it.
+
+    seen: as `noise_between`.  instrument, arm: RMS distance of what is declared, NaN unknown [mm].
+    most: as `floor_of`.
+    """
+    known = float(np.nan_to_num(instrument))
+    if seen:
+        value = math.hypot(max(of_coordinate(seen[0]), known), float(np.nan_to_num(arm)))
+        if value < most:
+            grown = wider(seen[1])
+            return Floor(value, max(value / grown, known), min(value * grown, most), DISTANCES)
+    return Floor(most, min(known, most), most, AT_MOST)
+
+
+def of_coordinate(sigma: float) -> float:
+    """RMS distance [mm] of points whose coordinates have a standard deviation [m]."""
+    return 1e3 * math.sqrt(3.0) * sigma
+
+
+def wider(relative: float) -> float:
+    """How far up or down a value may be, 95 times in 100, by its relative standard error."""
+    return math.exp(SIGMAS * relative)
 
 
 def noise_at_most(error: Array, dof: float) -> float:
@@ -98,7 +131,7 @@ def noise_at_most(error: Array, dof: float) -> float:
 
 def declared(data: Measurements, repeatability: float) -> tuple[float, float] | None:
     """RMS distance by the instrument's u95 and by the arm's repeatability, NaN unknown [mm]."""
-    instrument = 1e3 * math.sqrt(3.0) * instrument_noise(data)
+    instrument = of_coordinate(instrument_noise(data))
     arm = 1e3 * RMS_OF_REPEATABILITY * repeatability
     return None if np.isnan(instrument) and np.isnan(arm) else (instrument, arm)
 

@@ -289,3 +289,67 @@ def test_noise_other_than_declared(robot: mc.Robot, targets: int) -> None:
     for declared, count in ((0.04e-3, 0), (0.4e-3, 1)):
         columns = {**twice.columns, "u95": np.full(120, declared)}
         assert len(faults.noise(replace(twice, columns=columns))) == count
+
+
+def untimed(data: Measurements) -> Measurements:
+    return replace(data, columns={k: v for k, v in data.columns.items() if k != "order"})
+
+
+def reseated(sim: Simulation, data: Measurements, row: int, target: int, by: Array) -> Measurements:
+    """From a row on a target sits elsewhere on the flange.  by: (3,) [m]."""
+    spots = sim.cell.target_positions.copy()
+    spots[target] += by
+    y = data.y.copy()
+    moved = replace(sim.cell, target_positions=spots).predict(data.q) - sim.cell.predict(data.q)
+    y[row:, target] += moved[row:, target]
+    return data.with_y(y)
+
+
+@pytest.mark.parametrize("targets", [2, 3])
+def test_a_reseat_shows_in_a_file_that_tells_no_visits(robot: mc.Robot, targets: int) -> None:
+    """From the fifth row on at the earliest; which of two it was no distance tells."""
+    for seed, row in enumerate((4, 9, 30, 51, 56)):
+        sim = simulate(robot, 60, targets, seed=seed, truth=TRUTH)
+        data = untimed(sim.data)
+        assert find_faults(data) == ()
+        (fault,) = find_faults(reseated(sim, data, row, 1, np.array([3e-3, 4e-3, 0.0])))
+        assert fault.effect == "target_reseat"
+        assert fault.place == ("smr2" if targets == 3 else "smr1 or smr2")
+        assert abs(int(fault.rows[0]) - row) <= 1
+        if targets == 3:
+            assert_allclose(fault.parameters[0].value, 5e-3, rtol=0.03)
+
+
+def test_a_reseat_between_sessions_whose_rows_are_mixed(robot: mc.Robot) -> None:
+    sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
+    bad = reseated(sim, untimed(sim.data), 30, 0, np.array([1e-3, 0.0, 0.0]))
+    mixed = halves(bad).take(np.random.default_rng(0).permutation(60))
+    (fault,) = find_faults(mixed)
+    assert fault.effect == "target_reseat"
+    assert len(set(mixed.columns["session"][fault.rows])) == 1
+
+
+def test_outliers_at_an_end_of_the_file_are_no_reseat(robot: mc.Robot) -> None:
+    data = untimed(simulate(robot, 60, 3, seed=1, truth=TRUTH).data)
+    rng = np.random.default_rng(0)
+    for row in (0, 2, 4):
+        data = displaced(data, row, 0, 3e-3 * rng.normal(size=3))
+    assert {fault.effect for fault in find_faults(data)} == {"outliers"}
+
+
+def test_the_longest_part_of_a_reseated_target_stays(robot: mc.Robot) -> None:
+    sim = simulate(robot, 60, 3, seed=1, truth=TRUTH)
+    data = reseated(sim, untimed(sim.data), 12, 1, np.array([3e-3, 4e-3, 0.0]))
+    data = reseated(sim, data, 48, 1, np.array([-2e-3, 1e-3, 0.0]))
+    gone = data.seen & ~mended(data, find_faults(data)).seen
+    assert_array_equal(np.argwhere(gone), [[row, 1] for row in (*range(12), *range(48, 60))])
+
+
+def test_distances_tell_the_noise_beside_a_reseat(robot: mc.Robot) -> None:
+    sim = simulate(robot, 400, 3, seed=1, truth=TRUTH)
+    data = reseated(sim, untimed(sim.data), 200, 1, np.array([3e-3, 4e-3, 0.0]))
+    for some in (sim.data, data):
+        found = faults.noise_between(some)
+        assert found is not None
+        assert_allclose(found[0], TRUTH.noise, rtol=3 * found[1])
+    assert faults.noise_between(simulate(robot, 60, 1, seed=1).data) is None

@@ -27,6 +27,7 @@ from minimax_cal.judging.watching.refit import refit
 from minimax_cal.judging.watching.result import Health, Verdict
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 
@@ -89,7 +90,12 @@ def check(
         noise=math.sqrt(found.after.rows.mean_square),
         poses=watched.data.poses,
         fit=replace(after, notices=(*after.notices, *said)),
-        notices=(*data.notices, *said, *remarks(watched, found)),
+        notices=(
+            *data.notices,
+            *(fault.text for fault in distance_faults(data)),
+            *said,
+            *remarks(watched, found),
+        ),
     )
 
 

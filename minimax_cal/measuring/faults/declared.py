@@ -1,4 +1,4 @@
-"""Whether the noise is what the data declare."""
+"""The noise by the distances between targets, and whether it is what the data declare."""
 
 from __future__ import annotations
 
@@ -8,12 +8,30 @@ from scipy.special import chdtri
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import FEWEST, between
 from minimax_cal.measuring.faults.fault import Amount, Fault
+from minimax_cal.measuring.faults.nests import target_shifts
+from minimax_cal.measuring.faults.outliers import level
 from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
 ANOTHER = 100.0  # times as much or as little: um or m for mm make a thousand, no noise so much
 OTHER_UNIT = "; is it in mm? u95_m is in metres"
 TINY = 1e-300
+OF_MEDIAN = 1.17  # over the root of m: relative standard error of a median deviation of m values
+
+
+def noise_between(data: Measurements) -> tuple[float, float] | None:
+    """Noise of a coordinate [m] by the targets' distances, and its relative standard error.
+
+    None where too few were measured together.  Steps of nests are taken out; a few points that are
+    elsewhere do not count in a median.  What moves all targets alike, as the joints' repeatability,
+    is not in it.
+    """
+    apart = level(between(data), data, target_shifts(data))
+    if not len(apart.pairs):
+        return None
+    many = float(np.isfinite(apart.off).sum(axis=1).max())
+    sigma = np.sqrt(0.5 * np.mean(apart.sigma**2))  # of a distance: root 2 of a coordinate's
+    return float(sigma), OF_MEDIAN / np.sqrt(many)
 
 
 def noise(data: Measurements) -> tuple[Fault, ...]:

@@ -27,8 +27,9 @@ class Amount:
 class Fault:
     """One thing wrong with the data, or a notice.
 
-    effect: outliers, swapped_rows, target_shift or readback; as notices also mixed_units,
-    session_jump and noise.  place: smr1, smr1 or smr2, all, frame.
+    effect: outliers, swapped_rows, target_shift (target_reseat where the visits are not known) or
+    readback; as notices also mixed_units, session_jump and noise.  place: smr1, smr1 or smr2, all,
+    frame.
     rows: (r,) rows of the data; of a shift all rows after it, as visited; of jumps the first after.
     targets: outliers (r,) the target of each row; swapped rows (r, k) in whose columns each
     target stands; shift: which nest it can be; else of length 0.

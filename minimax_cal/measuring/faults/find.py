@@ -11,7 +11,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.faults.fault import NO_ERROR, Fault
 from minimax_cal.measuring.faults.joints import unsettled
-from minimax_cal.measuring.faults.nests import target_shifts
+from minimax_cal.measuring.faults.nests import RESEAT, target_shifts
 from minimax_cal.measuring.faults.outliers import outlying
 from minimax_cal.measuring.faults.sessions import mixed_units, session_jumps
 from minimax_cal.measuring.faults.swaps import swapped_rows
@@ -36,14 +36,28 @@ def find_faults(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ...
     return (*swapped, *shifts, *outliers, *unsettled(data), *notices)
 
 
+def distance_faults(data: Measurements) -> tuple[Fault, ...]:
+    """What the distances between targets show without any robot: re-seated nests, single points."""
+    if len(data.target_names) < 2:
+        return ()
+    good = mended(data, swapped_rows(data))
+    shifts = target_shifts(good)
+    return (*shifts, *outlying(good, shifts=shifts))
+
+
 def standing_out(data: Measurements, error: Array) -> tuple[Fault, ...]:
     """Of everything found, beside a fit of these errors, the points that are elsewhere."""
     return tuple(fault for fault in find_faults(data, error) if fault.effect == "outliers")
 
 
 def mended(data: Measurements, faults: tuple[Fault, ...]) -> Measurements:
-    """Swapped rows put right, outlying points NaN; the rows stay, and so does a shifted nest."""
+    """Swapped rows put right, outlying points NaN; the rows stay, and so does a shifted nest.
+
+    Of a target that was re-seated at rows of a file without visits the longest part stays.
+    """
     y = data.y.copy()
+    for rows, target in spoilt(data, faults):
+        y[rows, target] = np.nan
     for fault in faults:
         if fault.effect == "swapped_rows":
             y[fault.rows] = y[fault.rows[:, None], fault.targets]
@@ -51,6 +65,19 @@ def mended(data: Measurements, faults: tuple[Fault, ...]) -> Measurements:
         if fault.effect == "outliers":
             y[fault.rows, fault.targets] = np.nan
     return data.with_y(y)
+
+
+def spoilt(data: Measurements, faults: Sequence[Fault]) -> list[tuple[Array, int]]:
+    """Rows and target of the points of re-seated targets that are not of their longest part."""
+    reseats = [fault for fault in faults if fault.effect == RESEAT]
+    out = []
+    for target in dict.fromkeys(int(fault.targets[0]) for fault in reseats):
+        part = np.zeros(data.poses, dtype=int)  # how often it was seated before each row
+        for fault in reseats:
+            part[fault.rows] += int(fault.targets[0]) == target
+        count = np.bincount(part[data.seen[:, target]])
+        out.append((np.flatnonzero(data.seen[:, target] & (part != count.argmax())), target))
+    return out
 
 
 def in_lines(data: Measurements, faults: Sequence[Fault], *effects: str) -> list[Fault]:

@@ -1,4 +1,8 @@
-"""Nests that shifted: steps in the distances of one target over the visits."""
+"""Nests that shifted: steps in the distances of one target over the visits, or over the file.
+
+The distances need no robot: their own scatter, as its median absolute deviation tells it, is the
+noise that a step is judged by.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,20 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults.distances import Between, between, scatter
 from minimax_cal.measuring.faults.fault import Amount, Fault
 from minimax_cal.measuring.faults.limits import ALIKE, FALSE_ALARM
-from minimax_cal.measuring.history import is_timed, visits
+from minimax_cal.measuring.history import is_timed, sessions, visits
 from minimax_cal.measuring.measurements import Measurements
 
 NEAR = 8  # visits by which ranks may misplace a step
 SHORTEST = 4  # visits on each side of a step
 MATTERS = 1.5  # steps below so many times the scatter of a distance change nothing
+# A file in no order of visits may be sorted by where its poses are: distances that depend on the
+# pose, as those of a plate that bends, then look like a small step.
+MATTERS_UNTIMED = 4.0
 MOST_STEPS = 5  # shifts of nests in one data set
+WIDER = 2.5 * 1.65  # over the root of m: what a scatter by differences of m values may be wrong
+CLIP = 5.0  # standard scores of a distance count no more than this: one outlier is no step
+TOGETHER = 0.75  # share of the fewer visits that are alike: else they are outliers, no step
+SHIFT, RESEAT = "target_shift", "target_reseat"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,27 +48,28 @@ class Step:
 def target_shifts(data: Measurements) -> tuple[Fault, ...]:
     """Nests that moved during the session, as steps of their distances over the visits.
 
-    None where the file tells no order.
+    Where nothing tells the visits, over the rows of the file: it is then a re-seat, which no effect
+    of time can hold.  Sessions follow each other.
     """
-    if not is_timed(data):
-        return ()
+    timed = is_timed(data)
     apart = between(data)
     order = visits(data)
+    order = order[np.argsort(sessions(data)[order], kind="stable")]
     off = apart.off[:, order]
     faults: list[Fault] = []
-    while len(faults) < MOST_STEPS and (step := find_step(off, apart)):
+    matters = MATTERS if timed else MATTERS_UNTIMED
+    while len(faults) < MOST_STEPS and (step := find_step(off, apart, matters)):
         off = off.copy()
         off[:, step.at :] -= (step.change * apart.of(int(step.targets[0])))[:, None]
-        faults.append(shift_of(data, order, apart, step))
+        faults.append(shift_of(data, order, apart, step, SHIFT if timed else RESEAT))
     return tuple(faults)
 
 
-def find_step(off: Array, apart: Between) -> Step | None:
-    """The clearest step, if one is beyond chance.  off: (p, m) by visit, NaN not measured [m].
+def find_step(off: Array, apart: Between, matters: float) -> Step | None:
+    """The clearest step, if one is unlikely by noise.  off: (p, m) by visit, NaN unknown [m].
 
-    Ranks, so that no outlier counts for more than one visit; each pair's scan over all places is
-    judged by a Bonferroni bound, with the scatter widened where neighbours are alike, and must do
-    better than a steady drift.
+    Each pair's scans over all places are judged by a Bonferroni bound.  matters: times the scatter
+    of a distance that a step is at least.
     """
     pairs, m = off.shape
     best, place = np.zeros(pairs), np.zeros(pairs, dtype=int)
@@ -66,7 +78,7 @@ def find_step(off: Array, apart: Between) -> Step | None:
         if len(known) >= 2 * SHORTEST:
             best[pair], first = scan(off[pair, known])
             place[pair] = known[first]
-    limit = float(scipy.stats.chi2.isf(FALSE_ALARM / max(pairs * m, 1), 1))
+    limit = float(scipy.stats.chi2.isf(FALSE_ALARM / max(2 * pairs * m, 1), 1))
     if not pairs or best.max() < limit:
         return None
     at = int(place[best.argmax()])
@@ -86,7 +98,11 @@ def find_step(off: Array, apart: Between) -> Step | None:
     sigma[told] = 1.2533 * scatter(inside) * np.sqrt(share)  # of a median
     strength = (change / sigma) ** 2
     rest = np.array([strength[~apart.of(i)].sum() for i in range(int(apart.pairs.max()) + 1)])
-    if np.abs(change[told]).max() < MATTERS * float(np.median(scatter(inside))):
+    sides = np.split(np.arange(inside.shape[1]), [at])
+    away = np.abs(inside[:, min(sides, key=len)]) / scatter(inside)[:, None]
+    together = np.nanmean(np.where(np.isfinite(away), away < CLIP, np.nan), axis=1)
+    sure = (together >= TOGETHER) & (np.abs(change[told]) >= matters * np.median(scatter(inside)))
+    if not sure.any():
         return None
     order = np.argsort(rest, kind="stable")
     targets = order[rest[order] <= rest.min() + ALIKE]
@@ -110,18 +126,49 @@ def place_of(off: Array, change: Array, sigma: Array, at: int) -> int:
 def scan(value: Array) -> tuple[float, int]:
     """Largest squared standard score of a step in a series, and the first entry after it.
 
-    value: (m,).  0 where a steady drift explains the series as well.
+    By ranks, so that no outlier counts for more than one visit; and by clipped standard scores,
+    which show a large step of few visits that ranks cannot.  value: (m,).
+    """
+    return max((strength_of(score) for score in (ranked(value), clipped(value))), key=first_of)
+
+
+def first_of(found: tuple[float, int]) -> float:
+    """The strength of a step."""
+    return found[0]
+
+
+def ranked(value: Array) -> Array:
+    """(m,) normal scores of the ranks, of mean 0 and variance 1."""
+    score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / len(value))
+    return np.asarray((score - score.mean()) / max(float(score.std()), 1e-12))
+
+
+def clipped(value: Array) -> Array:
+    """(m,) standard scores about the median, clipped, of mean 0; sigma by neighbours.
+
+    The scatter of neighbours' differences knows no step, however many visits are after it; it is
+    widened by what it may be wrong.
     """
     m = len(value)
-    score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / m)
-    score = (score - score.mean()) / max(float(score.std()), 1e-12)
+    sigma = float(scatter(np.diff(value)[None])[0]) / np.sqrt(2.0)
+    score = (value - np.median(value)) / (sigma * (1.0 + WIDER / np.sqrt(m)))
+    score = np.clip(score, -CLIP, CLIP)
+    return np.asarray(score - score.mean())
+
+
+def strength_of(score: Array) -> tuple[float, int]:
+    """Squared standard score of the best step in scores (m,), and the first entry after it.
+
+    Less where neighbours are alike; 0 where a steady drift explains the series as well.
+    """
+    m = len(score)
     count = np.arange(SHORTEST, m - SHORTEST + 1)
     total = np.cumsum(score)[count - 1]
     gain = total**2 * m / (count * (m - count))
     first = int(count[gain.argmax()])
     inside = score - np.where(np.arange(m) < first, score[:first].mean(), score[first:].mean())
     alike = float(inside[1:] @ inside[:-1] / max(inside @ inside, 1e-12))
-    wider = (1.0 + max(alike, 0.0)) / (1.0 - max(alike, 0.0))
+    wider = (1.0 + max(alike, 0.0)) / max(1.0 - max(alike, 0.0), 1e-3)
     time = np.linspace(-1.0, 1.0, m)
     drift = (score @ time) ** 2 / (time @ time)
     strength = float(gain.max())
@@ -130,7 +177,7 @@ def scan(value: Array) -> tuple[float, int]:
     return strength / wider, first
 
 
-def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fault:
+def shift_of(data: Measurements, order: Array, apart: Between, step: Step, effect: str) -> Fault:
     """The fault that a step stands for."""
     first = int(step.targets[0])
     own = np.flatnonzero(apart.of(first) & np.isfinite(step.sigma))
@@ -141,11 +188,14 @@ def shift_of(data: Measurements, order: Array, apart: Between, step: Step) -> Fa
         a, b = (data.target_names[i] for i in apart.pairs[pair])
         amounts.append(Amount(f"{a}-{b}", float(step.change[pair]), "m", float(step.sigma[pair])))
     place = " or ".join(data.target_names[i] for i in step.targets)
+    where = f"line {data.line[rows[0]]}"
+    if effect == SHIFT:
+        where += f" (visit {step.at + 1} of {len(order)})"
     text = (
-        f"{place} moved by {1e3 * size:.3g} mm or more before line {data.line[rows[0]]} "
-        f"(visit {step.at + 1} of {len(order)})"
+        f"{data.source}: the distances between the reflectors change: {place} was re-seated, or "
+        f"exchanged for one of another radius, by {1e3 * size:.3g} mm or more before {where}"
     )
-    return Fault("target_shift", place, text, rows, step.targets, tuple(amounts))
+    return Fault(effect, place, text, rows, step.targets, tuple(amounts))
 
 
 def in_plane(apart: Between, own: Array, target: int, change: Array) -> float:

@@ -6,6 +6,7 @@ targets, the residual of a fit must stand out grossly.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,10 @@ from minimax_cal.measuring.faults.surprise import heights, unlikely
 from minimax_cal.measuring.measurements import Measurements
 
 GROSS, GROSS_TYPICAL = 7.5, 12.0  # times what 90 % of errors keep to, and the typical one
+PART = 0.9
+# As far by a Gaussian, where up to a quarter of the points may be wrong: of a fit that these do not
+# pull.
+ROBUST_GROSS, ROBUST_PART = 9.2, 0.75
 
 
 def outlying(
@@ -34,6 +39,20 @@ def outlying(
         for row, target in found:
             error[target, row] = np.nan
         found |= dict.fromkeys(off_fit(error), "the fit")
+    return told(data, found)
+
+
+def far_off(data: Measurements, error: Array, rows: Array) -> tuple[Fault, ...]:
+    """Points that are elsewhere by a fit that up to a quarter of wrong points do not pull.
+
+    error: (k, m, 3) of it [m].  rows: (m,) True where points may be named.
+    """
+    found = [at for at in off_fit(error, ROBUST_GROSS, ROBUST_PART) if rows[at[0]]]
+    return told(data, dict.fromkeys(found, "a robust fit"))
+
+
+def told(data: Measurements, found: Mapping[tuple[int, int], str]) -> tuple[Fault, ...]:
+    """The fault of points (row, target), with what showed each; none without any."""
     if not found:
         return ()
     points = sorted(found)
@@ -53,16 +72,17 @@ def outlying(
     )
 
 
-def off_fit(error: Array) -> list[tuple[int, int]]:
+def off_fit(error: Array, gross: float = GROSS, part: float = PART) -> list[tuple[int, int]]:
     """(row, target) of points that a fit misses grossly.  error: (k, m, 3) [m].
 
-    A real arm's errors have tails, but bounded ones: far beyond what 90 % keep to, and the typical.
+    A real arm's errors have tails, but bounded ones: far beyond what a part of them keeps to, and
+    the typical.
     """
     size = np.linalg.norm(error, axis=-1)
     known = size[np.isfinite(size)]
     if len(known) < FEWEST:
         return []
-    limit = max(GROSS * float(np.quantile(known, 0.9)), GROSS_TYPICAL * float(np.median(known)))
+    limit = max(gross * float(np.quantile(known, part)), GROSS_TYPICAL * float(np.median(known)))
     with np.errstate(invalid="ignore"):
         far = np.argwhere(size > max(limit, FAINT))
     return [(int(row), int(target)) for target, row in far]
