@@ -22,6 +22,7 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -41,7 +42,7 @@ FAULTS = {
     "outliers": "single points that are off",
     "swapped_rows": "rows or targets that hold each other's points",
     "readback": "joint values that were read back before the arm had settled",
-    "target_reseat": "a reflector that was re-seated, or exchanged for one of another radius",
+    RESEAT: "a reflector that was re-seated, or exchanged for one of another radius",
 }
 FAULTS_OF_TARGETS = ("outliers", "swapped_rows")  # all of their place are the targets
 PEOPLES = {  # how people read a unit of the file
