@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.correcting.compensate import Compensation, compensate
     from minimax_cal.correcting.export import export
     from minimax_cal.diagnosing.diagnose import diagnose
+    from minimax_cal.diagnosing.many import diagnose_many
     from minimax_cal.diagnosing.result import Diagnosis
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
@@ -77,6 +78,7 @@ __all__ = [
     "compensate",
     "datasets",
     "diagnose",
+    "diagnose_many",
     "evaluate",
     "export",
     "fleet",
@@ -136,6 +138,7 @@ MODULES = {  # name: where it is defined
     "tradeoff": "judging.tradeoff",
     "Diagnosis": "diagnosing.result",
     "diagnose": "diagnosing.diagnose",
+    "diagnose_many": "diagnosing.many",
     "plan": "planning.plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",

@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import closing, contextmanager, suppress
 from importlib import import_module
 from typing import Any
+
+import threadpoolctl
 
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.optional import optional
@@ -17,11 +20,20 @@ from minimax_cal.ground.optional import optional
 PATIENCE = 5.0  # for a scheduler, and for its first worker, to answer [s]
 DESERTED = 30.0  # a cluster without workers, which a nanny may yet start again [s]
 WATCH = 1.0  # how often that is looked at [s]
+TIMED = 2  # calls from which the time of the others is known
+CHUNK = 1.0  # seconds of work sent at once; sending takes some 5 ms
+START = 2.0  # seconds that a process takes to import all and to load the compiled kernels (1.6)
+AHEAD = 2  # chunks of a process, so that it never waits for the next
+CLUSTER_SHARES = 16  # at least so many chunks of a cluster, whose workers come and go
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
 JOBLIB = "minimax-cal[experiments]"
 DISTRIBUTED = "minimax-cal[distributed]"
 
 Numbered = Generator[tuple[int, Any], None, None]
 Work = Sequence[tuple[Callable[..., Any], int, tuple[Any, ...]]]  # what `numbered` takes
+Queue = deque[tuple[Callable[..., Any], int, tuple[Any, ...]]]
 
 
 class WorkersLost(CalibrationError):
@@ -76,6 +88,108 @@ def here(work: Work, processes: int) -> Numbered:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # joblib regrets the jobs that are not finished
                 arriving.close()
+
+
+def share(
+    function: Callable[..., Any],
+    calls: Sequence[tuple[Any, ...]],
+    modules: Iterable[str] = (),
+    *,
+    processes: int = -1,
+    cluster: str = "",
+) -> Numbered:
+    """As `in_parallel`, of calls that may be brief: in chunks, and this process works as well.
+
+    What a call does to its process it may do to this one: no calls that end it.  Calls are timed
+    here; processes start only where all that is left takes longer than their start.
+    """
+    if processes == 0:
+        raise OptionError("0 processes: give their number, or -1 for one a core")
+    waiting = deque((function, number, call) for number, call in enumerate(calls))
+    needed = {__name__, function.__module__, *modules}
+    clock = Clock()
+    if cluster and waiting:
+        look_for(cluster)
+        while waiting and clock.calls < TIMED:
+            yield clock.time(waiting.popleft())
+        chunks = chunked(waiting, clock.seconds, CLUSTER_SHARES)
+        work = [(several, number, (chunk,)) for number, chunk in enumerate(chunks)]
+        if work:
+            for _, found in on_cluster(work, cluster, needed):
+                yield from found
+        return
+    while waiting:
+        yield clock.time(waiting.popleft())
+        if processes != 1 and clock.seconds * len(waiting) > START:
+            joblib = optional("joblib", "work in several processes", JOBLIB)
+            count = min(joblib.effective_n_jobs(processes), len(waiting))
+            if count > 1:
+                yield from beside(waiting, clock, count)
+
+
+class Clock:
+    """Calls that are made here, and how long one takes."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.all = 0.0
+        self.first = 0.0  # which also loads what it needs
+        self.threads = threadpoolctl.ThreadpoolController()
+
+    def time(self, work: tuple[Callable[..., Any], int, tuple[Any, ...]]) -> tuple[int, Any]:
+        """Make a call here, by one thread as everywhere else."""
+        began = time.monotonic()
+        with self.threads.limit(limits=1):
+            out = numbered(*work)
+        seconds = time.monotonic() - began
+        self.calls, self.all = self.calls + 1, self.all + seconds
+        self.first = self.first or seconds
+        return out
+
+    @property
+    def seconds(self) -> float:
+        """Of a call, as far as is known: 0 before the second."""
+        return (self.all - self.first) / max(self.calls - 1, 1)
+
+
+def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
+    """Calls in count - 1 other processes and in this one, until all are done or at work."""
+    loky = import_module("joblib.externals.loky")
+    broken = import_module("joblib.externals.loky.process_executor").BrokenProcessPool
+    pool = loky.get_reusable_executor(max_workers=count - 1, env=ONE_THREAD)
+    flying: set[Future[list[tuple[int, Any]]]] = set()
+    try:
+        while waiting or flying:
+            while waiting and len(flying) < AHEAD * (count - 1):
+                flying.add(pool.submit(several, next(chunked(waiting, clock.seconds, 2 * count))))
+            if waiting:
+                yield clock.time(waiting.popleft())
+            else:
+                wait(flying, return_when=FIRST_COMPLETED)
+            done = {future for future in flying if future.done()}
+            flying -= done
+            for future in done:
+                yield from future.result()
+    except broken as error:
+        raise WorkersLost(
+            "a process died: too little memory, or it was killed; start fewer at once "
+            f"({type(error).__name__})"
+        ) from error
+    finally:
+        for future in flying:
+            future.cancel()
+
+
+def chunked(waiting: Queue, seconds: float, shares: int) -> Iterator[list[Any]]:
+    """Chunks of about `CHUNK` seconds, no larger than a share of what waits; they wait no more."""
+    while waiting:
+        size = min(int(CHUNK / max(seconds, 1e-6)), -(-len(waiting) // shares))
+        yield [waiting.popleft() for _ in range(max(size, 1))]
+
+
+def several(work: Work) -> list[tuple[int, Any]]:
+    """Some calls where they run."""
+    return [numbered(*each) for each in work]
 
 
 def on_cluster(work: Work, cluster: str, modules: set[str]) -> Numbered:

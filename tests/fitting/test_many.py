@@ -29,3 +29,11 @@ def test_a_fit_comes_back_whole_from_another_process() -> None:
 def test_robots_and_data_are_as_many() -> None:
     with pytest.raises(mc.CalibrationError, match="2 robots for 1 data sets"):
         mc.calibrate_many(["irb120", "irb120"], [mc.simulate("irb120", 40, 1, 0).data])
+
+
+def test_a_diagnosis_comes_back_whole_from_another_process() -> None:
+    sheets = [mc.simulate("irb120", 40, 3, seed).data for seed in range(2)]
+    one, other = mc.diagnose_many("irb120", [sheets[0], sheets[1].take(np.arange(2))], jobs=1)
+    assert isinstance(one, mc.Diagnosis)
+    assert isinstance(other, mc.CalibrationError)
+    assert pickle.loads(pickle.dumps(one)).to_dict() == one.to_dict()

@@ -1,0 +1,34 @@
+"""Many diagnoses at once: one process a core, or the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.diagnosing.diagnose import diagnose
+from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.fitting.many import Data, do_many
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.robots.robot import Robot
+
+
+def diagnose_many(
+    robots: Robot | str | Path | Sequence[Robot | str | Path],
+    data: Sequence[Data],
+    *,
+    jobs: int = -1,
+    cluster: str = "",
+    **options: Any,
+) -> tuple[Diagnosis | CalibrationError, ...]:
+    """Diagnose many sets of measurements.
+
+    robots: one for all, or one for each set.  data: as `diagnose` takes each.  jobs: processes, -1
+    for one a core, 1 for this one alone.  cluster: address of a Dask scheduler, as
+    tcp://host:port, whose workers then do it.  options: of `diagnose`, for all.  Returns a
+    diagnosis for each set in its order, or the error that says why there is none.  Raises
+    OptionError.
+
+    >>> found = mc.diagnose_many("irb120", ["cell1.csv", "cell2.csv"], holdout=0.2)
+    """
+    return do_many(diagnose, robots, data, jobs, cluster, options)

@@ -1,0 +1,60 @@
+"""Calls shared between processes: same results, each once; few are not worth a process."""
+
+import os
+import time
+
+import pytest
+
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.parallel import START, WorkersLost, chunked, deque, share
+
+pytest.importorskip("joblib", reason="several processes need pip install minimax-cal[experiments]")
+LONG = 0.1  # seconds of a call
+
+
+def squared(number: int, seconds: float = 0.0) -> tuple[int, int]:
+    """The square, and the process that made it."""
+    time.sleep(seconds)
+    return number**2, os.getpid()
+
+
+def died(parent: int) -> None:
+    """Ends every process but one."""
+    time.sleep(LONG)
+    if os.getpid() != parent:
+        os._exit(1)
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+def test_every_call_is_made_once(processes: int) -> None:
+    count = int(1.5 * START / LONG)
+    found = list(share(squared, [(n, LONG) for n in range(count)], processes=processes))
+    assert sorted((number, each[0]) for number, each in found) == [(n, n**2) for n in range(count)]
+    pids = {pid for _, (_, pid) in found}
+    assert os.getpid() in pids  # this one works, too
+    assert len(pids) <= processes
+
+
+def test_brief_work_starts_no_process() -> None:
+    found = dict(share(squared, [(n,) for n in range(300)], processes=2))
+    assert {pid for _, pid in found.values()} == {os.getpid()}
+
+
+def test_chunks_shrink_towards_the_end() -> None:
+    waiting = deque((squared, n, (n,)) for n in range(100))
+    sizes = [len(chunk) for chunk in chunked(waiting, 0.05, 4)]
+    assert sum(sizes) == 100
+    assert sizes[0] == 20  # a second
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] == 1
+
+
+def test_a_process_that_dies_is_said() -> None:
+    calls = [(os.getpid(),)] * int(3.0 * START / LONG)
+    with pytest.raises(WorkersLost, match="a process died"):
+        list(share(died, calls, processes=2))
+
+
+def test_no_processes_are_refused() -> None:
+    with pytest.raises(OptionError, match="0 processes"):
+        list(share(squared, [(1,)], processes=0))
