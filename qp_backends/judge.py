@@ -15,6 +15,9 @@ from .registry import Solver, backend, fallback_order
 
 NO_ANSWER = (Status.INFEASIBLE, Status.UNBOUNDED, Status.FAILED)
 NEAR = 1e-2  # relative residual up to which an answer is worth polishing; beyond, it is wrong
+# Methods of paper M as printed.  They answer every QP, none to a tolerance that an exact solver is
+# asked for, and are shown as they are: judged, but not replaced unless that is asked for.
+AS_THEY_ARE = ("subgradient:raw", "subgradient:eliminated")
 TIGHTER = 1e-3  # what the tolerance is multiplied by when an answer is asked for again
 
 
@@ -25,7 +28,7 @@ def solve(
     tolerance: float = 1e-8,
     time_limit: float = math.inf,
     warm_start: Solution = COLD,
-    fallback: bool | Sequence[str] = True,
+    fallback: bool | Sequence[str] | None = None,
 ) -> Solution:
     """Solve a QP with the named backend; its answer is judged, and others take over if need be.
 
@@ -33,7 +36,8 @@ def solve(
     time_limit: wall time for everything, fallbacks and checks included [s].
     warm_start: an earlier solution of a similar problem, used by backends that can.
     fallback: True for the installed backends in the order of `registry.fallback_order`, False for
-    none, or the names to try.
+    none, or the names to try.  None: True, but a finite answer of a method that is shown as it is
+    (`AS_THEY_ARE`) stays, INACCURATE, with its residual and `as_is` set.
 
     An answer counts as solved if and only if `accuracy` says so, whatever the backend claims.  One
     that is not accurate enough is polished, then asked for again at a tighter tolerance, then the
@@ -57,7 +61,13 @@ def solve(
             iterations=raw.iterations,
             warm=raw.warm,
         )
-    others = fallback_order(problem) if fallback is True else tuple(fallback or ())
+    if fallback is None and name in AS_THEY_ARE and math.isfinite(worst):
+        return replace(
+            raw, status=Status.INACCURATE, backend=name, residual=worst, as_is=True,
+            seconds=time.perf_counter() - start,
+        )  # fmt: skip
+    given = fallback if fallback is not None else True
+    others = fallback_order(problem) if given is True else tuple(given or ())
     queue = (name, *(other for other in others if other != name.partition(":")[0]))
     job = Job(problem, tolerance, warm_start, start, start + time_limit)
     return _persist(job, queue, raw)

@@ -176,6 +176,7 @@ class Solution:
     certificate: (m,) multipliers that prove INFEASIBLE, (n,) ray that proves UNBOUNDED, else (0,).
     iterations: the backend's own count, 0 where it tells none.
     warm: whether the backend began at the start that it was given.
+    as_is: whether it is to be used though it did not keep the tolerance (`judge.AS_THEY_ARE`).
     """
 
     x: Array
@@ -188,11 +189,17 @@ class Solution:
     certificate: Array = field(default_factory=lambda: EMPTY)
     iterations: int = 0
     warm: bool = False
+    as_is: bool = False
 
     @property
     def solved(self) -> bool:
         """Whether x is an answer that kept the tolerance."""
         return self.status is Status.SOLVED
+
+    @property
+    def usable(self) -> bool:
+        """Whether x kept the tolerance, or comes from a method that is used as it is."""
+        return self.solved or self.as_is
 
 
 COLD = Solution(EMPTY, EMPTY, Status.FAILED, 0.0)  # "no warm start"

@@ -316,10 +316,11 @@ def judged(
 def work_of(solved: Solved) -> Work:
     """What the solvers did."""
     method, best = name_of(solved.squares.method), solved.optimum
-    steps = int(solved.squares.iterations[0])
-    return (
-        Work(method, steps, sum(best.answered.values()), best.warm) if best else Work(method, steps)
-    )
+    plain = Work(method, int(solved.squares.iterations[0]))
+    if best is None:
+        return plain
+    qps = sum(best.answered.values())
+    return replace(plain, qps=qps, warm_starts=best.warm, qp_residual=best.qp_residual)
 
 
 def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:

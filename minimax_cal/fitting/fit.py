@@ -55,6 +55,7 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, calibrated", "train"),
 )
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
+ROUGH = 1e-6  # a QP answered worse than this is told
 NOT_IDENTIFIED = "not identified because"
 
 
@@ -285,12 +286,14 @@ class Work:
 
     least_squares: the method that led to the start of the minimax.  steps: of it.
     qps: quadratic programs.  warm_starts: those of them that began at the answer to the last one.
+    qp_residual: the largest relative residual of an answer that was used.
     """
 
     least_squares: str = ""
     steps: int = 0
     qps: int = 0
     warm_starts: int = 0
+    qp_residual: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -602,10 +605,11 @@ class Fit:
         most_first = sorted(self.answered.items(), key=lambda item: -item[1])
         who = ", ".join(f"{count} by {name}" for name, count in most_first)
         work = self.work
-        return (
-            f" QPs: {who} ({work.warm_starts} warm-started), after {work.steps} steps of least "
-            f"squares ({work.least_squares})."
-        )
+        how = f"{work.warm_starts} warm-started"
+        if work.qp_residual > ROUGH:
+            how = f"used as they are, relative residual up to {work.qp_residual:.1g}"
+        steps = f"{work.steps} steps of least squares ({work.least_squares})"
+        return f" QPs: {who} ({how}), after {steps}."
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""

@@ -37,6 +37,10 @@ NUMBER = re.compile(r"\d[\d.]*(e[+-]?\d+)?")
 ROUNDING = 1e-12
 SHARE = 3  # times the unknowns: of more functions than twice that, so many make a first QP
 PATIENCE = 10  # iterations without progress in value or optimality before giving up
+# With the QP methods of paper M as printed, whose answers are used as they are.  On the nine
+# built-in arms the search ends with a residual of at most 2e-3 (raw) and 3e-4 (eliminated).
+WORTH = 1e-8  # relative: a value that falls by less is no progress
+REACH = 5e-3  # optimal as far as these methods go
 MOST_DAMPING = 1e8  # of the Hessian's diagonal
 RELENTLESS = 1e6  # price of a violation, in slopes of f, beyond which it is there to stay
 NEARLY = 100.0  # times the tolerance: optimal as far as rounding lets one see
@@ -67,12 +71,14 @@ class Asking:
     """Puts QPs to a solver, each from the answer to the last one of its size, and keeps count.
 
     answered: QPs by the backend that answered.  warm: those that a backend began at that answer.
+    residual: the largest relative residual of an answer, as its judge says.
     """
 
     qp: Solver
     last: Solution = COLD
     answered: Counter[str] = field(default_factory=Counter)
     warm: int = 0
+    residual: float = 0.0
 
     def __call__(self, problem: Problem) -> Solution:
         """The answer to a problem."""
@@ -80,7 +86,9 @@ class Asking:
         answer = self.qp(problem, warm_start=start)
         self.answered[answer.backend or "unnamed"] += 1
         self.warm += answer.warm
-        if answer.solved:
+        if np.isfinite(answer.residual):
+            self.residual = max(self.residual, answer.residual)
+        if answer.usable:
             self.last = answer
         return answer
 
@@ -179,7 +187,7 @@ class Optimum(Generic[X]):
     """x with its f (k,), c (l,), multipliers mu (k,) that sum to one and lambda (l,).
 
     lambda is > 0 at an upper bound and < 0 at a lower one.
-    answered, warm: as in `Asking`.
+    answered, warm: as in `Asking`; qp_residual: its residual.
     """
 
     x: X
@@ -194,6 +202,7 @@ class Optimum(Generic[X]):
     notes: tuple[str, ...] = field(default=())
     answered: Mapping[str, int] = field(default_factory=dict)
     warm: int = 0
+    qp_residual: float = 0.0
 
     @property
     def value(self) -> float:
@@ -227,8 +236,11 @@ def solve(
         if not plan.usable:
             status = Status.FAILED
             break
+        if not plan.exact:
+            plan = at.balanced(plan)
         penalty = priced(at, plan, tolerance)
         at = at.after(plan, at.penalty if penalty is None else penalty)
+        enough = tolerance if plan.exact else REACH
         if penalty is None:
             status = Status.INFEASIBLE
             break
@@ -238,16 +250,16 @@ def solve(
         value, kkt = float(at.here.f.max()), at.kkt
         trace.append(Step(iteration, value, kkt.violation, kkt.residual, length, plan.backend))
         progress(trace[-1])
-        ended = at.patience(tolerance)
+        ended = at.patience(tolerance, enough)
         if ended is None:
             at = at.moved(move, end, there) if length else at.damped()
-            ended = at.arrived(tolerance)
+            ended = at.arrived(tolerance, enough)
         if ended is not None:
             status = ended
             break
     return Optimum(
         at.x, at.here.f, at.here.c, at.mu, at.lam, at.kkt, len(trace), status, tuple(trace),
-        told_once(notes), dict(ask.answered), ask.warm,
+        told_once(notes), dict(ask.answered), ask.warm, ask.residual,
     )  # fmt: skip
 
 
@@ -321,7 +333,7 @@ class Iterate(Generic[X]):
             solution = qp(plain)
             missed = forgotten(here, rows, solution)
             rows = np.concatenate([rows, missed])
-        if solution.solved or not len(here.c):
+        if solution.usable or not len(here.c):
             return read(solution, here, rows, relaxed=False, penalty=0.0)
         weight = max(self.penalty, 1e2 * float(np.abs(here.jacobian).max(initial=1.0)))
         relaxed = qp(elastic(plain, len(rows), weight))
@@ -340,19 +352,30 @@ class Iterate(Generic[X]):
         """The same point with the multipliers of a QP, one more iteration counted."""
         kkt = optimality(self.here, plan.mu, plan.lam, self.problem.lower, self.problem.upper)
         value, best, lowest, idle = float(self.here.f.max()), self.best, self.lowest, self.idle + 1
-        if kkt.residual < 0.9 * best or value < lowest - ROUNDING * abs(lowest):
+        worth = ROUNDING if plan.exact else WORTH
+        better = plan.exact and kkt.residual < 0.9 * best
+        if better or value < lowest - worth * abs(lowest):
             best, lowest, idle = min(best, kkt.residual), value, 0
         return replace(
             self, mu=plan.mu, lam=plan.lam, kkt=kkt, penalty=penalty, best=best, lowest=lowest,
             idle=idle, step=self.step + 1,
         )  # fmt: skip
 
-    def patience(self, tolerance: float) -> Status | None:
-        """How it ends here, if it is optimal or nothing has become better for long."""
+    def balanced(self, plan: Plan) -> Plan:
+        """A step with the multipliers that balance the gradients here best, not those of its QP."""
+        lower, upper = self.problem.lower, self.problem.upper
+        mu, lam = multipliers_at(self.here, lower, upper)
+        return replace(plan, mu=mu, lam=lam)
+
+    def patience(self, tolerance: float, enough: float = 0.0) -> Status | None:
+        """How it ends here, if it is optimal or nothing has become better for long.
+
+        enough: for a residual, where the QP solver allows no better.
+        """
         if self.kkt.residual <= tolerance:
             return Status.CONVERGED
-        if self.idle >= PATIENCE and self.kkt.violation <= tolerance:
-            good = self.kkt.residual <= NEARLY * tolerance
+        if self.idle >= PATIENCE and self.kkt.violation <= max(tolerance, enough):
+            good = self.kkt.residual <= max(NEARLY * tolerance, enough)
             return Status.CONVERGED if good else Status.STALLED
         return None
 
@@ -367,12 +390,14 @@ class Iterate(Generic[X]):
         """The same point, more damped, since no step led on."""
         return replace(self, damping=max(10.0 * self.damping, 1e-3))
 
-    def arrived(self, tolerance: float) -> Status | None:
+    def arrived(self, tolerance: float, enough: float = 0.0) -> Status | None:
         """How it ends after a step, if the point is optimal or no damping helps any more."""
         if self.kkt.residual <= tolerance:
             return Status.CONVERGED
         if self.damping > MOST_DAMPING:
-            stuck = self.kkt.violation > tolerance
+            stuck = self.kkt.violation > max(tolerance, enough)
+            if not stuck and enough > tolerance and self.kkt.residual <= enough:
+                return Status.CONVERGED
             return Status.INFEASIBLE if stuck else Status.STALLED
         return None
 
@@ -390,7 +415,10 @@ def priced(at: Iterate[X], plan: Plan, tolerance: float) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """An answer of the QP: step d, multipliers, and which backend gave it."""
+    """An answer of the QP: step d, multipliers, and which backend gave it.
+
+    exact: whether the answer kept the tolerance; else it is one that is used as it is.
+    """
 
     d: Array
     mu: Array
@@ -400,6 +428,7 @@ class Plan:
     notes: tuple[str, ...]
     relaxed: bool
     penalty: float
+    exact: bool = True
 
 
 Resolve = Callable[[Array, Array], Plan]
@@ -413,7 +442,7 @@ def forgotten(here: Linear, rows: Array, solution: Solution) -> Array:
     k, p = here.jacobian.shape
     if len(rows) == k:
         return rows[:0]
-    if not solution.solved:
+    if not solution.usable:
         return np.setdiff1d(np.arange(k), rows)
     over = here.f - here.f.max() + here.jacobian @ solution.x[:p] - solution.x[p]
     over[rows] = -np.inf
@@ -457,7 +486,7 @@ def read(answer: Solution, here: Linear, rows: Array, relaxed: bool, penalty: fl
     rows: the functions that the QP knew.
     """
     k, p = here.jacobian.shape
-    usable, few = answer.solved, len(rows)
+    usable, few = answer.usable, len(rows)
     mu = np.zeros(k) if usable else np.full(k, 1.0 / k)
     if usable:
         mu[rows] = np.maximum(answer.y[:few], 0.0)
@@ -472,6 +501,7 @@ def read(answer: Solution, here: Linear, rows: Array, relaxed: bool, penalty: fl
         notes=answer.notes,
         relaxed=relaxed,
         penalty=penalty,
+        exact=answer.solved or not usable,
     )
 
 
@@ -488,6 +518,31 @@ def optimality(here: Linear, mu: Array, lam: Array, lower: Array, upper: Array) 
         complementarity,
         float(excess(here.c, lower, upper).max(initial=0.0)) if len(lam) else 0.0,
     )
+
+
+def multipliers_at(here: Linear, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """mu and lam that make stationarity and complementarity at a point least, mu of sum one.
+
+    Non-negative least squares, so that nothing of a QP solver is in them.
+    """
+    from scipy.optimize import nnls
+
+    k, (above, below) = (
+        len(here.f),
+        (np.flatnonzero(upper < np.inf), np.flatnonzero(lower > -np.inf)),
+    )
+    columns = np.concatenate([here.jacobian, here.normal[above], -here.normal[below]]).T
+    rooms = (here.f.max() - here.f, (upper - here.c)[above], (here.c - lower)[below])
+    room = np.maximum(np.concatenate(rooms), 0.0)
+    one = 1e3 * (np.arange(len(room)) < k)  # heavy: the sum is then one but for a millionth
+    found, _ = nnls(
+        np.vstack([columns, np.diag(room), one]), np.append(np.zeros(len(columns) + len(room)), 1e3)
+    )
+    found = found / found[:k].sum()
+    lam = np.zeros(len(here.c))
+    lam[above] += found[k : k + len(above)]
+    lam[below] -= found[k + len(above) :]
+    return found[:k], lam
 
 
 def hopeless(here: Linear, plan: Plan, lower: Array, upper: Array, tolerance: float) -> bool:
@@ -534,7 +589,7 @@ def search(at: Iterate[X], plan: Plan, resolve: Resolve) -> tuple[float, Array, 
             if merit(there.f, there.c) <= start - 1e-4 * decrease + slack:
                 return 1.0, bent.d, trial, there
     length = 1.0
-    while length > 1e-8:
+    while length * decrease > slack:  # what falls by less tells nothing
         curved = 2.0 * (value - start + length * decrease)
         fit = length**2 * decrease / curved if np.isfinite(value) and curved > 0 else 0.0
         length = min(max(fit, 0.1 * length), 0.5 * length)

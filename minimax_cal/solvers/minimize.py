@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -31,6 +31,11 @@ QP_TOLERANCE = 1e-9
 ESCAPES = 3  # from points where every gradient vanishes but better ones are near
 FLAT = 1e-6  # gradients below, of problems scaled to about one, count as none
 NEARBY = 1e-3  # how far a better point is looked for, relative to x
+DIRECTIONS = 3  # in which a given gradient is checked
+SLOPE_ERROR = 1e-2  # relative to the function's steepest slope; more is a wrong gradient
+# An answer below this share of what the start had may still be far from zero, relatively: it is
+# sought with a finer tolerance, at most so often, while that pays.
+SMALL, FINER, ROUNDS = 1e-2, 1e-3, 4
 FARTHER = (1.0, 1e2, 1e4, 1e6)  # times the way of a search that found no end
 MESSAGES = {
     "converged": "optimal to the tolerance",
@@ -40,6 +45,7 @@ MESSAGES = {
     "infeasible": "the constraints could not be met and may contradict each other; loosen them",
     "failed": "fun or jac gave no finite numbers near the start; try another x0",
     "unbounded": "the largest function falls without end; add bounds or constraints",
+    "wrong_gradient": "jac is not the derivative of fun{}; mend it, or leave it out",
 }
 
 
@@ -66,8 +72,11 @@ def minimize_max(
     args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
     the largest at x0.  maxiter: QPs at most.  callback: called with fun, nit, kkt after each QP.
 
-    Returns x, fun (the largest), values (m,), success, status (as in `Status`, or unbounded),
-    message, nit, nfev, njev,
+    A jac that is given is checked against differences of fun in a few directions, at x0 and at the
+    answer.
+
+    Returns x, fun (the largest), values (m,), success, status (as in `Status`, or unbounded, or
+    wrong_gradient), message, nit, nfev, njev,
     multipliers (m,) that sum to one, constraint_multipliers (one row a bound or constraint, > 0
     at the upper side and < 0 at the lower), kkt, violation, notes.
     Raises OptionError for arguments that do not fit together.
@@ -87,8 +96,8 @@ def minimize_max(
     listed = [constraints] if isinstance(constraints, Constraint) else list(constraints)
     box = bounds if bounds is None or isinstance(bounds, Bounds) else box_of(bounds, len(x))
     rows = Rows.of(len(x), box, listed)
-    if box is not None:
-        x = np.clip(x, box.lb, box.ub)
+    ends = (-np.inf, np.inf) if box is None else (box.lb, box.ub)
+    x = np.clip(x, *ends)
     count = Count()
     function = counted(lambda z: np.atleast_1d(fun(z, *args)), count)
     problem = MaxOfFunctions.at(x, function, derivative(function, jac, args, count), rows)
@@ -104,14 +113,87 @@ def minimize_max(
             callback(result(fun=value, nit=step.iteration, kkt=step.kkt))
 
     settings = Sqp(tolerance=tol, iterations=maxiter, hessian="bfgs")
+    given = callable(jac) or jac == "cs"
+    if given and (wrong := mistaken(problem, x, *ends)):
+        return without_gradient(problem, x, count, wrong)
     best = minimax.solve(problem, x, solver, settings, tell)
     for _ in range(ESCAPES):
         lower = below(problem, best.x) if best.status is Status.CONVERGED else None
         if lower is None:
             break
         best = minimax.solve(problem, lower, solver, settings, tell)
+    best = sharpened(problem, x, best, solver, settings, tell)
     far = best.status is not Status.CONVERGED and falls_on(problem, x, best.x)
+    if given and not far and (wrong := mistaken(problem, best.x, *ends)):
+        return without_gradient(problem, best.x, count, wrong)
     return answer(best, function(best.x), problem.size, count, endless=far)
+
+
+def sharpened(
+    problem: MaxOfFunctions,
+    start: Array,
+    best: Optimum[Array],
+    solver: Solver,
+    settings: Sqp,
+    tell: Callable[[Step], None],
+) -> Optimum[Array]:
+    """The answer, or a lower one by a finer tolerance where it is small beside the start's."""
+    first = float(np.abs(problem.evaluate(start)[0]).max())
+    for _ in range(ROUNDS):
+        if best.status is not Status.CONVERGED or abs(best.value) > SMALL * first:
+            break
+        settings = replace(settings, tolerance=FINER * settings.tolerance)
+        finer = minimax.solve(problem, best.x, solver, settings, tell)
+        keeps = finer.kkt.violation <= max(best.kkt.violation, settings.tolerance)
+        if not (keeps and finer.value < best.value):
+            break
+        gained = best.value - finer.value
+        status, steps = Status.CONVERGED, best.iterations + finer.iterations
+        best = replace(finer, status=status, iterations=steps)
+        if gained <= settings.tolerance * first:
+            break
+    return best
+
+
+def mistaken(problem: MaxOfFunctions, x: Array, low: Any, high: Any) -> str:
+    """Where the gradient differs from the functions' differences; empty where it does not.
+
+    Along a few directions between the bounds, at x and, against a kink just there, beside it.
+    """
+    rng = np.random.default_rng(0)
+    reach = np.maximum(np.abs(x), 1.0)
+    found: list[set[int]] = []
+    beside = x + NEARBY * reach * rng.uniform(-1.0, 1.0, size=len(x))
+    for place in (x, np.clip(beside, low, high)):
+        slopes, values = problem.jacobian(place) / problem.size, problem.evaluate(place)[0]
+        if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(values))):
+            return ""
+        off = np.zeros(len(values), dtype=bool)
+        for _ in range(DIRECTIONS):
+            way = np.finfo(float).eps ** (1.0 / 3.0) * reach * rng.normal(size=len(x))
+            ends = np.clip(place + way, low, high), np.clip(place - way, low, high)
+            ahead, back = (problem.evaluate(end)[0] for end in ends)
+            seen, said = ahead - back, slopes @ (ends[0] - ends[1])
+            rounding = 1e3 * np.finfo(float).eps * (np.abs(ahead) + np.abs(back))
+            bent = 2.0 * np.abs(ahead + back - 2.0 * values)  # more than differences miss
+            steep = np.linalg.norm(slopes * way, axis=1) + np.abs(seen)
+            error = np.abs(seen - said)
+            off |= np.isfinite(error) & (error > SLOPE_ERROR * steep + rounding + bent)
+        found.append(set(np.flatnonzero(off).tolist()))
+    wrong = sorted(found[0] & found[1])
+    return f" (function {wrong[0]})" if wrong else ""
+
+
+def without_gradient(problem: MaxOfFunctions, x: Array, count: Count, where: str) -> OptimizeResult:
+    """The result where the gradient is wrong: no answer, and where it was found out."""
+    values = problem.function(x)
+    status = "wrong_gradient"
+    return result(
+        x=x, fun=float(values.max()), values=values, success=False, status=status,
+        message=MESSAGES[status].format(where), nit=0, nfev=count.function, njev=count.jacobian,
+        multipliers=np.full(len(values), 1.0 / len(values)),
+        constraint_multipliers=np.zeros(len(problem.lower)), kkt=np.inf, violation=0.0, notes=(),
+    )  # fmt: skip
 
 
 def box_of(pairs: Sequence[tuple[float | None, float | None]], n: int) -> Bounds:

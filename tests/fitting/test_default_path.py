@@ -96,3 +96,21 @@ def test_steps_of_variable_projection_start_from_the_best_lengths(
     assert least is not None
     assert_allclose(apart.trace[0, 0], least.cost[0], rtol=1e-9)
     assert (np.diff(apart.trace[:, 0]) <= 1e-12 * apart.trace[0, 0]).all()
+
+
+@pytest.mark.parametrize(("method", "least"), [("eliminated", 1e-5), ("raw", 1e-3)])
+@pytest.mark.parametrize("arm", ["irb2600", "irb120", "ur5e"])
+def test_the_papers_subgradient_answers_by_itself(arm: str, method: str, least: float) -> None:
+    """RMSE(phi) over the optimum; other arms end alike."""
+    drawn = mc.load_robot(arm)
+    data = mc.simulate(drawn, 60, 3, seed=0).data
+    best, found = (mc.calibrate(drawn, data, qp=qp) for qp in ("daqp", f"subgradient:{method}"))
+    assert found.status == "converged"
+    assert found.answered == {f"subgradient:{method}": found.work.qps}
+    assert found.work.qp_residual > 1e-8
+    assert found.work.warm_starts == 0
+    assert best.minimax is not None
+    assert found.minimax is not None
+    over = np.sqrt(found.minimax.size.max() / best.minimax.size.max()) - 1.0
+    assert over <= least
+    assert f"by subgradient:{method} (used as they are, relative residual up to" in found.headline()

@@ -7,7 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 from problems_qp import epigraph, random_problem
 
-from qp_backends import BackendError, Problem, Status, accuracy, solve, subgradient
+from qp_backends import BackendError, Problem, Status, accuracy, judge, solve, subgradient
+from qp_backends.problem import nothing
+from qp_backends.registry import backend
 from qp_backends.subgradient import iterate, scaled
 
 
@@ -58,15 +60,32 @@ def test_a_warm_start_at_the_solution_is_kept():
 
 
 @pytest.mark.parametrize("method", ["raw", "eliminated"])
-def test_the_printed_method_fails_and_is_not_passed_off_as_solved(method):
+def test_the_printed_method_is_used_as_it_is_and_not_passed_off_as_solved(method):
     problem = epigraph(np.random.default_rng(4))
-    alone = solve(problem, f"subgradient:{method}", fallback=False)
+    name = f"subgradient:{method}"
+    alone = solve(problem, name, fallback=False)
     assert alone.status is Status.ITERATION_LIMIT
     assert alone.residual > 0.1
     assert objective_error(problem, alone) > 0.1
-    helped = solve(problem, f"subgradient:{method}")
+    shown = solve(problem, name)
+    assert (shown.status, shown.backend, shown.as_is) == (Status.INACCURATE, name, True)
+    assert not shown.solved
+    assert shown.usable
+    assert shown.residual == accuracy(problem, shown).worst
+    np.testing.assert_array_equal(shown.x, alone.x)
+    helped = solve(problem, name, fallback=True)
     assert helped.solved
     assert helped.backend == "daqp"
+
+
+@pytest.mark.parametrize("method", ["raw", "eliminated"])
+def test_an_answer_that_is_not_finite_is_replaced(method, monkeypatch):
+    problem = epigraph(np.random.default_rng(4))
+    broken = lambda given, **keywords: nothing(given, Status.FAILED)  # noqa: E731
+    monkeypatch.setattr(judge, "backend", lambda name: broken if ":" in name else backend(name))
+    found = solve(problem, f"subgradient:{method}")
+    assert found.solved
+    assert found.backend == "daqp"
 
 
 def test_the_printed_method_does_what_the_paper_prints():

@@ -294,3 +294,60 @@ def test_the_way_down_from_a_flat_point_is_the_steepest() -> None:
 def test_a_limit_is_the_number_of_programs(most: int) -> None:
     found = mc.minimize_max(CLASSICS["CB2"].fun, (2, 2), jac="cs", maxiter=most)
     assert (found.status, found.nit) == ("iteration_limit", most)
+
+
+def two(x):  # type: ignore[no-untyped-def]
+    return np.array([(x[0] - 1.0) ** 2, (x[0] + 1.0) ** 2 + 1.0])
+
+
+@pytest.mark.parametrize(
+    ("jac", "function"),
+    [
+        (lambda x: np.zeros((2, 1)), 0),
+        (lambda x: -2.0 * np.array([[x[0] - 1.0], [x[0] + 1.0]]), 0),
+        (lambda x: 2.0 * np.array([[x[0] - 1.0], [0.0]]), 1),
+        (lambda x: 2.0 * np.array([[x[0] - 1.0], [x[0] + 1.0]]) * (abs(x[0]) > 0.9), 0),
+    ],
+    ids=["zero", "the other sign", "zero for one", "zero near the answer"],
+)
+def test_a_wrong_gradient_is_no_success(jac, function: int) -> None:  # type: ignore[no-untyped-def]
+    found = mc.minimize_max(two, [3.0], jac=jac)
+    assert not found.success
+    assert found.status == "wrong_gradient"
+    assert f"function {function}" in found.message
+
+
+def test_a_gradient_at_a_kink_is_not_called_wrong() -> None:
+    found = mc.minimize_max(
+        lambda x: np.array([abs(x[0]) + (x[1] - 1.0) ** 2]),
+        [0.0, 3.0],
+        jac=lambda x: np.array([[np.sign(x[0]) or 1.0, 2.0 * (x[1] - 1.0)]]),
+    )
+    assert found.status != "wrong_gradient"
+
+
+def powell_badly_scaled(x):  # type: ignore[no-untyped-def]
+    both = np.array([1e4 * x[0] * x[1] - 1.0, np.exp(-x[0]) + np.exp(-x[1]) - 1.0001])
+    return np.concatenate([both, -both])
+
+
+def powell_singular(x):  # type: ignore[no-untyped-def]
+    every = np.array([
+        x[0] + 10.0 * x[1],
+        np.sqrt(5.0) * (x[2] - x[3]),
+        (x[1] - 2.0 * x[2]) ** 2,
+        np.sqrt(10.0) * (x[0] - x[3]) ** 2,
+    ])  # fmt: skip
+    return np.concatenate([every, -every])
+
+
+@pytest.mark.parametrize(
+    ("fun", "start"),
+    [(powell_badly_scaled, (0.0, 1.0)), (powell_singular, (3.0, -1.0, 0.0, 1.0))],
+)
+@pytest.mark.parametrize("jac", ["cs", "2-point"])
+def test_an_optimum_of_zero_is_found_where_gradients_flatten(fun, start, jac: str) -> None:  # type: ignore[no-untyped-def]
+    """Their least is 0; along a valley the gradient falls to the tolerance long before."""
+    found = mc.minimize_max(fun, start, jac=jac)
+    assert found.success
+    assert found.fun < 1e-6
