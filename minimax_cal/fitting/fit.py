@@ -300,8 +300,9 @@ class Work:
 class Fit:
     """A calibrated robot and everything that is known about its fit.
 
-    cell: the calibrated robot with base and targets.  nominal: the nominal robot with its best
-    base and targets, None where an old file does not tell it.
+    cell: the calibrated robot with base, targets and effects, all fitted together; it predicts.
+    nominal: the nominal robot with its best base and targets, None where an old file does not tell
+    it.
     accuracy: nominal and holdout on the held-out poses, nominal_train and train on the training
     poses.  claim: looks for `beyond`.
     uncertainty: of all parameters, base in its own axes [SI]; None in an old file.
@@ -316,6 +317,7 @@ class Fit:
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
     error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
+    stated_geometric: `geometric` as the file of the fit holds it.
     """
 
     cell: Cell
@@ -349,11 +351,12 @@ class Fit:
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
     answered: Mapping[str, int] = field(default_factory=dict)
     work: Work = Work()
+    stated_geometric: Cell | None = None
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
         return (
-            f"<Fit of {self.robot.name}: {self.objective}, RMS {after.rms_mm:.3f} mm, largest "
+            f"<Fit of {self.cell.robot.name}: {self.objective}, RMS {after.rms_mm:.3f} mm, largest "
             f"{after.max_mm:.3f} mm, {known} of {len(self.parameters)} parameters, {self.status}>"
         )
 
@@ -364,8 +367,25 @@ class Fit:
 
     @property
     def robot(self) -> Robot:
-        """The calibrated robot, usable wherever a robot is."""
-        return self.cell.robot
+        """The calibrated robot of geometry alone, usable wherever a robot is.
+
+        Beside effects it is fitted without them: that of `cell` is right only together with them.
+        """
+        return self.geometric.robot
+
+    @cached_property
+    def geometric(self) -> Cell:
+        """The geometry fitted alone, in its place; `cell` itself where the fit has no effects.
+
+        Fitted when it is first asked for, from the same poses with the same options.
+        """
+        if self.stated_geometric is not None:
+            return self.stated_geometric
+        if not self.cell.effects.causes:
+            return self.cell
+        from minimax_cal.fitting.calibrate import again
+
+        return again(self, effects=()).cell
 
     @property
     def train(self) -> Measurements:
@@ -534,7 +554,7 @@ class Fit:
         ]
         targets = tuple(f"{name} RMS mm" for name in self.cell.target_names)
         return Table(
-            f"{self.robot.name}: position accuracy, objective {self.objective}",
+            f"{self.cell.robot.name}: position accuracy, objective {self.objective}",
             ("poses", "count", "RMS mm", "mean mm", "max mm", *targets),
             tuple(rows),
             ("", "d", *[".4f"] * (3 + len(targets))),

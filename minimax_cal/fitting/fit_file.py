@@ -208,6 +208,7 @@ class FitPart(Part):
     seconds: Number = math.nan
     parameters: tuple[TableParameter, ...]
     accuracy: AccuraciesPart
+    cell: dict[str, Any]
     condition: Number = math.nan
     trace_mm2: tuple[Number, ...] = ()
     minimax: MinimaxPart | None = None
@@ -225,11 +226,12 @@ class FitPart(Part):
 
 def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
     """The JSON of the contract, and more.  poses: whether with what was measured."""
-    out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", "robot": fit.robot.to_dict()}
+    out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", **fit.geometric.whole()}
+    out["cell"] = {"effects": out.pop("effects")}
+    if fit.geometric is not fit.cell:
+        out["cell"] = fit.cell.whole()
     if fit.nominal:
         out["nominal_robot"] = fit.nominal.robot.to_dict()
-    out |= fit.cell.to_dict()
-    if fit.nominal:
         out["nominal_cell"] = fit.nominal.to_dict()
     out |= {
         "objective": fit.objective,
@@ -326,6 +328,7 @@ def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
             [[(i.low, i.high) for i in fit.intervals[key]] for key in ("nominal", "holdout")]
         ),
         **cell_arrays(fit.cell, "cell"),
+        **(cell_arrays(fit.geometric, "geometric") if fit.geometric is not fit.cell else {}),
         **(cell_arrays(fit.nominal, "nominal") if fit.nominal else {}),
     }
     if fit.uncertainty:
@@ -367,7 +370,10 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
         raise CalibrationError(
             f"{source}: its arrays cannot be read ({said(error)}); {AGAIN}"
         ) from error
-    cell = refined(cell, arrays, "cell")
+    cell, geometric = refined(cell, arrays, "cell"), None
+    if cell.effects.causes:
+        alone = cell_from_dict({**content, "cell": {}}, source)
+        geometric = refined(alone, arrays, "geometric")
     for name, scores in part.accuracy.told():
         if not len(scores.sse_mm2) == len(scores.points) == len(cell.target_names):
             raise CalibrationError(
@@ -378,7 +384,8 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     data = replace(data, y=exact, digest=part.provenance.data_sha256)
     nominal = nominal_of(content, source, cell, arrays)
     before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
-    return assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
+    made = assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
+    return replace(made, stated_geometric=geometric)
 
 
 def assembled(

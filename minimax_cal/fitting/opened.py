@@ -127,7 +127,7 @@ def open_result(source: Result | Opened, rung: int | None = None) -> Opened:
     if isinstance(source, Opened):
         found = source
     elif isinstance(source, Fit):
-        found = of_fit(source, source.robot.name)
+        found = of_fit(source, source.cell.robot.name)
     elif isinstance(source, Cell):
         found = Opened(source.robot.name, (Rung(CALIBRATED, source),), 0)
     elif isinstance(source, Path | str):

@@ -297,11 +297,11 @@ def tradeoff(
     curve = curve_of(worst, ends, steps, solver, progress)
     names = ("sum", *["compromise"] * (len(curve) - 2), "point")
     return Tradeoff(
-        robot=first.robot.name,
+        robot=first.cell.robot.name,
         choices=tuple(choice_of(first, *each) for each in zip(names, curve, strict=True)),
         seconds=time.perf_counter() - began,
         notices=tuple(dict.fromkeys((*first.notices, *last.notices))),
-        provenance=Provenance.of(first.robot, first.data, settings),
+        provenance=Provenance.of(first.cell.robot, first.data, settings),
     )
 
 
@@ -311,8 +311,8 @@ def hopeless(fit: Fit, began: float, settings: dict[str, Any]) -> Tradeoff:
         "sum", 1.0, fit.cell, fit.accuracy["train"], fit.accuracy["holdout"], Status.FAILED
     )
     said = (*fit.notices, "the fit is too poor to look for compromises")
-    provenance = Provenance.of(fit.robot, fit.data, settings)
-    return Tradeoff(fit.robot.name, (choice,), time.perf_counter() - began, said, provenance)
+    provenance = Provenance.of(fit.cell.robot, fit.data, settings)
+    return Tradeoff(fit.cell.robot.name, (choice,), time.perf_counter() - began, said, provenance)
 
 
 def problem_of(fit: Fit) -> MinimaxProblem:

@@ -198,13 +198,17 @@ def still(q: Array, targets: tuple[str, ...], robot: Robot) -> Measurements:
 
 
 def cell_from_dict(content: Mapping[str, Any], source: str) -> Cell:
-    """A cell from the JSON of a calibration.  Raises CalibrationError."""
+    """A cell from the JSON of a calibration.  Raises CalibrationError.
+
+    Of a fit with effects it is what stands under `cell`, beside the geometry fitted alone.
+    """
     if content.get("schema", 1) != 1 or content.get("kind", "calibration") != "calibration":
         raise CalibrationError(
             f"{source}: is a {content.get('kind', 'file')} of schema {content.get('schema')}; "
             "expected a calibration of schema 1"
         )
     try:
+        content = {**content, **content.get("cell", {})}
         base, sessions = pose_from_dict(content["base"]), sessions_from(content)
         targets = content["targets_mm"]
         spots = np.array(list(targets.values()), dtype=float).reshape(-1, 3) * 1e-3

@@ -62,6 +62,26 @@ def test_what_was_saved_comes_back_to_the_last_digit(
     assert saved.options.settings() == fit.options.settings()
 
 
+def test_the_robot_is_of_geometry_alone(
+    fit: mc.Fit, saved: mc.Fit, robot: mc.Robot, noisy: Simulation
+) -> None:
+    """`robot` is what a fit without effects finds; `cell` keeps the joint fit; each stands once."""
+    content = fit.to_dict()
+    joint = bool(fit.cell.effects.causes)
+    assert ("robot" in content["cell"]) is joint
+    assert_array_equal(saved.robot.mdh, fit.robot.mdh)
+    assert_array_equal(saved.geometric.base, fit.geometric.base)
+    assert_array_equal(saved.geometric.target_positions, fit.geometric.target_positions)
+    assert_array_equal(saved.cell.robot.mdh, fit.cell.robot.mdh)
+    if joint:
+        plain = mc.calibrate(robot, noisy.data)
+        assert_allclose(fit.robot.mdh, plain.robot.mdh, rtol=0, atol=1e-9)
+        assert np.abs(fit.cell.robot.mdh - plain.robot.mdh).max() > 1e-5
+        assert not fit.geometric.effects.terms
+    else:
+        assert fit.robot is fit.cell.robot
+
+
 def test_the_report_is_the_same(fit: mc.Fit, saved: mc.Fit) -> None:
     one, other = (
         render(compose(read_sources([each]), Wording("2026-01-31"))) for each in (fit, saved)
@@ -109,7 +129,8 @@ def test_a_file_without_poses(fit: mc.Fit, tmp_path: Path) -> None:
 
 def test_a_number_changed_by_hand_counts(fit: mc.Fit) -> None:
     content = fit.to_dict()
-    first = next(iter(content["targets_mm"].values()))
+    joint = content["cell"] if fit.cell.effects.causes else content
+    first = next(iter(joint["targets_mm"].values()))
     first[0] += 1.0
     moved = mc.Fit.from_dict(content).cell.target_positions - fit.cell.target_positions
     assert moved[0, 0] == pytest.approx(1e-3, abs=1e-12)
@@ -145,7 +166,7 @@ def test_a_file_of_an_earlier_version_opens(fit: mc.Fit) -> None:
         (lambda c: c["poses"]["q"].pop(), "its list of poses cannot be read"),
         (lambda c: c.update(status="fine"), "status: Input should be"),
         (
-            lambda c: c.update(effects=[{"effect": "gremlin", "place": "J1"}]),
+            lambda c: c["cell"].update(effects=[{"effect": "gremlin", "place": "J1"}]),
             "effect 'gremlin' is not known here; register it",
         ),
     ],

@@ -271,7 +271,7 @@ def test_a_spoilt_file_is_refused(
     many: Many, tmp_path: Path, change: dict[str, object], message: str
 ) -> None:
     content = json.loads(many[2].json())
-    content["effects"][0] |= change
+    content["cell"]["effects"][0] |= change
     path = tmp_path / "fit.json"
     path.write_text(json.dumps(content))
     with pytest.raises(mc.CalibrationError, match=message):
@@ -282,7 +282,7 @@ def test_predictions_hold_what_is_there_at_rest(many: Many) -> None:
     """Compliance without payload turns joint 2; nothing else acts before the session begins."""
     _, data, fit = many
     cell = replace(fit.cell, effects=Fitted((), ()))
-    links = kinematics.chain(fit.robot.mdh, data.q * ROBOT.sign, ROBOT.prismatic)
+    links = kinematics.chain(cell.robot.mdh, data.q * ROBOT.sign, ROBOT.prismatic)
     centre = links.after + np.einsum("naim,na->nim", axes_of(links), ROBOT.com)
     pull = np.array([0.0, 0.0, -9.80665])
     torque = sum(np.cross((centre[i] - links.before[1]).T, MASSES[i] * pull) for i in range(1, 6))

@@ -48,11 +48,11 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     names = (f"{names[0]} A", f"{names[1]} B") if names[0] == names[1] else names
     check_alike(one, other)
     kept, motion = common_gauge(one, other)
-    n = one.robot.joints
+    n = one.cell.robot.joints
     turn = np.eye(5 * n)
     turn[:, kept] -= motion
     drawn = links_of(one.before.robot.mdh)
-    value = [drawn + turn @ (links_of(fit.robot.mdh) - drawn) for fit in fits]
+    value = [drawn + turn @ (links_of(fit.cell.robot.mdh) - drawn) for fit in fits]
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
     told = [told_by(fit, kept, n) for fit in fits]
     each = tuple(differences(one, value, np.asarray(covariance), kept, told))
@@ -60,7 +60,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     found, same = explained(one, value[1] - value[0], np.asarray(covariance), free)
     return Comparison(
         names=(names[0], names[1]),
-        robot=one.robot.name,
+        robot=one.cell.robot.name,
         differences=tuple(each[i] for i in one.known.names.link_by_link[: 5 * n]),
         changed=found,
         accuracy=tuple(on_common(one, other)),
@@ -73,7 +73,7 @@ def check_alike(one: Fit, other: Fit) -> None:
     """Raise OptionError unless both are of one kind of arm, and tell how sure they are."""
     for fit in (one, other):
         _ = fit.known, fit.before
-    a, b = one.robot, other.robot
+    a, b = one.cell.robot, other.cell.robot
     if a.joints != b.joints or np.any(a.sign != b.sign) or np.any(a.prismatic != b.prismatic):
         raise OptionError(
             f"{a.name} ({a.joints} joints) and {b.name} ({b.joints}) differ in number, signs or "
@@ -97,8 +97,8 @@ def common_gauge(one: Fit, other: Fit) -> tuple[Array, Array]:
 
 def gauge(fit: Fit) -> tuple[Array, Array]:
     """`common_gauge` of one."""
-    state, n = replace(fit.cell.state, effects=np.zeros(0)), 5 * fit.robot.joints
-    model = identify.plenty_of_poses(fit.robot, model_of(fit.robot, fit.data))
+    state, n = replace(fit.cell.state, effects=np.zeros(0)), 5 * fit.cell.robot.joints
+    model = identify.plenty_of_poses(fit.cell.robot, model_of(fit.cell.robot, fit.data))
     gram = identify.gram_of(model, state)
     order = identify.drop_order(fit.before.robot, model.names)
     everything = np.ones(model.names.count, dtype=bool)
@@ -111,7 +111,7 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
 
 def links_covariance(fit: Fit) -> Array:
     """(5n, 5n) of the link parameters; zero where they were kept."""
-    n = 5 * fit.robot.joints
+    n = 5 * fit.cell.robot.joints
     return np.nan_to_num(fit.known.covariance[:n, :n])
 
 
@@ -161,7 +161,7 @@ def explained(
     inverse = np.linalg.pinv(
         covariance[np.ix_(free, free)] / np.outer(sigma, sigma), rcond=SMALLEST, hermitian=True
     )
-    off, is_zero = change[free] / sigma, np.isin(free, zero_positions(fit.robot.prismatic))
+    off, is_zero = change[free] / sigma, np.isin(free, zero_positions(fit.cell.robot.prismatic))
     total = float(off @ inverse @ off)
     same = float(stats.chi2.sf(total, np.linalg.matrix_rank(inverse)))
     chosen: list[int] = []
@@ -222,9 +222,9 @@ def remarks(one: Fit, other: Fit) -> Iterator[str]:
     if effects[0] != effects[1]:
         told = " against ".join(", ".join(labels) or "none" for labels in effects)
         yield f"they hold different effects ({told}): geometry takes over part of what one lacks"
-    change = links_of(other.robot.mdh - one.robot.mdh)
-    change[zero_positions(one.robot.prismatic)] = 0.0  # a service may set them anew
-    if named := wild(one.known.names, change, one.robot.reach()):
+    change = links_of(other.cell.robot.mdh - one.cell.robot.mdh)
+    change[zero_positions(one.cell.robot.prismatic)] = 0.0  # a service may set them anew
+    if named := wild(one.known.names, change, one.cell.robot.reach()):
         yield f"implausibly large changes: {named}; are both of the same arm?"
     if np.abs(one.before.robot.mdh - other.before.robot.mdh).max() > ALIKE:
         yield "they start from different drawings: what neither identifies differs by that alone"

@@ -67,7 +67,7 @@ def check(
     fit = fit if isinstance(fit, Fit) else load_fit(fit)
     data = data if isinstance(data, Measurements) else read_measurements(data)
     watched, said = watched_of(fit, data, known)
-    check_arm(fit.robot, watched.data)
+    check_arm(fit.cell.robot, watched.data)
     links = in_names(fit, watched, fit.identification.active)
     found = search(watched, links, own_poses(fit, watched), seed)
     error, after_it = (left(watched, placed) for placed in (found.before, found.after))
@@ -77,14 +77,14 @@ def check(
     after = refit(fit, watched, found)
     spread, enough, asked = prospects(watched, found)
     return Health(
-        robot=fit.robot.name,
+        robot=fit.cell.robot.name,
         verdicts=verdicts,
         moved=found.named,
         hidden=tuple(hidden(watched, found)),
         accuracy=accuracy(grown(error, found.before.used)),
         refitted=accuracy(grown(after_it, found.after.used)),
         findable=spread,
-        sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.robot.prismatic)),
+        sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.cell.robot.prismatic)),
         enough=enough,
         asked=asked,
         noise=math.sqrt(found.after.rows.mean_square),

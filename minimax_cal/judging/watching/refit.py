@@ -10,15 +10,15 @@ import numpy as np
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit, Parameters, Provenance, link_by_link
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.opened import place
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.judging.watching.moved import Search
 from minimax_cal.judging.watching.opening import in_names
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.model import model_of
 from minimax_cal.solvers.status import Status
 
 
@@ -32,13 +32,13 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         watched.cell.robot, state, names.target_names, watched.cell.effects, watched.cell.sessions
     )
     drawn = fit.before.robot
-    nominal = Cell.of(drawn, fit_base(model_of(drawn, data), drawn.mdh).state, names.target_names)
+    nominal = place(drawn, data)
     axes, blank = nominal.base[:3, :3], np.zeros(names.count - names.geometric)
     drawn_at = replace(nominal.state, effects=blank).along(axes)
     every = link_by_link(names, sure.units, drawn_at, cell.state.along(axes), sure.sigma, known)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
-    links = [names.all[i] for i in range(5 * fit.robot.joints) if not rows.active[i]]
+    links = [names.all[i] for i in range(5 * fit.cell.robot.joints) if not rows.active[i]]
     settings = {
         **fit.options.settings(), "objective": "sum", "holdout": 0.0, "holdout_by": None,
         "fix": links, "free": (), "priors": {}, "loss": "square", "trim": 0.0,
@@ -78,7 +78,14 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
+        stated_geometric=geometric_of(fit, cell, data) if cell.effects.causes else None,
     )
+
+
+def geometric_of(fit: Fit, cell: Cell, data: Measurements) -> Cell:
+    """The geometry alone, with what moved in the joint fit; data: too few to fit it anew."""
+    moved = cell.robot.mdh - fit.cell.robot.mdh
+    return place(fit.robot.with_mdh(fit.robot.mdh + moved), data)
 
 
 def identified(fit: Fit, rows: Rows, sure: Uncertainty) -> Identification:

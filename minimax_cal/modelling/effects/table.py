@@ -246,6 +246,11 @@ class Fitted:
     terms: tuple[Term, ...]
     values: tuple[Array, ...]
 
+    @property
+    def causes(self) -> tuple[Term, ...]:
+        """The terms that say something of the arm: all but the frames of several sessions."""
+        return tuple(term for term in self.terms if not term.frees_frames)
+
     def turn(self, scene: Scene) -> Array:
         """(m, n) by how much the joints turn, signs applied [rad, m]."""
         out = np.zeros((scene.joints, scene.poses))

@@ -82,7 +82,9 @@ def calibrated(job: Job) -> Row:
         seed=told.seed, effects=told.effects, fix=told.fix,
     )  # fmt: skip
     if fit.status is Status.FAILED:
-        return without(job, f"the fit failed: {fit.status.advice}", fit.robot.name, fit.notices)
+        return without(
+            job, f"the fit failed: {fit.status.advice}", fit.cell.robot.name, fit.notices
+        )
     found = fit.within
     ends = found.rms, found.largest
     claim = within(found.where, found.before, found.after, ends, found.poses, found.missed)
@@ -95,7 +97,7 @@ def calibrated(job: Job) -> Row:
         said.append(other.headline())
         notices = (*notices, *other.notices)
     return Row(
-        told.name, fit.robot.name, "calibrated", str(fit.status),
+        told.name, fit.cell.robot.name, "calibrated", str(fit.status),
         overall(judged) if judged else "", found.before.rms_mm, found.after.rms_mm,
         found.after.max_mm, changed, saved(job, fit), " ".join(said), notices,
     )  # fmt: skip

@@ -92,7 +92,7 @@ def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | 
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
     fit, asked = sources.fit, tuple(judge(limit, chosen) for limit in limits)
-    return Signed(model, claims, asked, changed(fit.before.robot, fit.robot) if fit else "")
+    return Signed(model, claims, asked, changed(fit.before.robot, fit.cell.robot) if fit else "")
 
 
 def changed(before: Robot, after: Robot) -> str:

@@ -87,7 +87,7 @@ class Sources:
     def robot(self) -> str:
         """Name of the robot."""
         if self.fit:
-            return self.fit.robot.name
+            return self.fit.cell.robot.name
         if self.relative:
             return self.relative.robot.name
         return self.gap.robot if self.gap else ""
@@ -169,7 +169,7 @@ def simulated(arm: SimulatorGap | None, fit: Fit | None, gap: Diagnosis | None) 
     known = {part.provenance.data_sha256 for part in (fit, gap) if part}
     if arm is None or arm.provenance.data_sha256 in known:
         return ()
-    robots = {name for name in (fit and fit.robot.name, gap and gap.robot) if name}
+    robots = {name for name in (fit and fit.cell.robot.name, gap and gap.robot) if name}
     other = "" if arm.robot in robots else (
         f", and of {arm.robot}, not of {' and '.join(sorted(robots))}: is it the same arm?"
     )  # fmt: skip
@@ -201,8 +201,8 @@ def together(fit: Fit | None, gap: Diagnosis | None, files: Sequence[File]) -> t
         )
     if not one.data_sha256:
         out.append("Neither file tells the SHA-256 of its measurements: they may differ.")
-    if fit.robot.name != gap.robot:
-        out.append(f"The calibration is of {fit.robot.name}, the diagnosis of {gap.robot}.")
+    if fit.cell.robot.name != gap.robot:
+        out.append(f"The calibration is of {fit.cell.robot.name}, the diagnosis of {gap.robot}.")
     lines = [{int(x) for x in result.data.line[result.held]} for result in (fit, gap)]
     if fit.data.poses and gap.data.poses and lines[0] != lines[1]:
         out.append(

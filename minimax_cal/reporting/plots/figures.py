@@ -149,6 +149,6 @@ def errors_figure(fit: Fit) -> Figure:
     figure.legend(*left.get_legend_handles_labels(), frameon=False, loc="outside lower center",
                   ncols=2)  # fmt: skip
     left.xaxis.set_major_locator(MaxNLocator(integer=True))
-    title = textwrap.fill(f"{fit.robot.name}, objective {fit.objective}", 80)
+    title = textwrap.fill(f"{fit.cell.robot.name}, objective {fit.objective}", 80)
     figure.suptitle(title, fontweight="bold")
     return figure
