@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.correcting.compensate import Compensation, compensate
+    from minimax_cal.correcting.deliverable import Delivered, deliver
     from minimax_cal.correcting.export import export
     from minimax_cal.diagnosing.diagnose import diagnose
     from minimax_cal.diagnosing.many import diagnose_many
@@ -59,6 +60,7 @@ __all__ = [
     "Cell",
     "Compensation",
     "DataError",
+    "Delivered",
     "Diagnosis",
     "Fit",
     "Measurements",
@@ -77,6 +79,7 @@ __all__ = [
     "compare",
     "compensate",
     "datasets",
+    "deliver",
     "diagnose",
     "diagnose_many",
     "evaluate",
@@ -142,6 +145,8 @@ MODULES = {  # name: where it is defined
     "plan": "planning.plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",
+    "Delivered": "correcting.deliverable",
+    "deliver": "correcting.deliverable",
     "export": "correcting.export",
     "SimulatorGap": "simulators.result",
     "load_commands": "simulators.commands",

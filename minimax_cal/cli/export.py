@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from minimax_cal.cli.options import (
+    JSON,
     PATH,
     QUIET,
     RUNG,
@@ -20,6 +21,7 @@ from minimax_cal.cli.options import (
 )
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
 
 FORMAT = "The format"
@@ -57,16 +59,24 @@ FORMAT = "The format"
     ),
 )
 @RUNG
+@JSON
 @output("the robot")
 @QUIET
 @with_output
 @can("rows")
 def export_command(fit: str, kind: str, to: Output, **chosen: Any) -> int:
-    """Write the robot of FIT (a saved result or a robot) as a file others can load."""
+    """Write the robot of FIT (a saved result or a robot) as a file others can load.
+
+    The geometry is fitted again for exactly the effects that the format carries.  With --json its
+    own accuracy goes to stdout, and the file to -o alone.
+    """
     made = exported(fit, kind, to.path, **chosen)
-    written(made, to.path)
-    to.notice(*made.notices)
+    if to.path or not to.as_json:
+        written(made.file, to.path)
+    to.notice(*made.file.notices, *([made.delivered.sentence()] if made.delivered else []))
     to.wrote(to.path)
-    if not to.path:
-        click.echo(made.content, nl=False)
+    if to.as_json:
+        click.echo(json_text(made.to_dict()), nl=False)
+    elif not to.path:
+        click.echo(made.file.content, nl=False)
     return 0

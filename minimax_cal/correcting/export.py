@@ -4,16 +4,38 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from minimax_cal.correcting.deliverable import Delivered, block, delivered
 from minimax_cal.correcting.exporters import table
-from minimax_cal.correcting.exporters.job import Export, read_job
+from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_source
 from minimax_cal.fitting.opened import Result
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf_file import read_urdf
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A file in a format, and what it delivers of a result; None of a bare robot."""
+
+    format: str
+    file: Export
+    delivered: Delivered | None = None
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What people should know about the file, its own accuracy last."""
+        own = self.delivered
+        return (*self.file.notices, own.sentence()) if own and own.lacks else self.file.notices
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is delivered, for JSON."""
+        own = self.delivered
+        return {"delivered": own.to_dict() if own else block(self.format)}
 
 
 def export(
@@ -30,6 +52,8 @@ def export(
 ) -> str:
     """The robot of a calibration in a format that other programs load.
 
+    The geometry is fitted again for exactly the effects that the format carries, with the same
+    data and options; `deliver` tells its accuracy, and so does a notice where effects are missing.
     fit: a calibration, its cell, a diagnosis, a relative calibration or a robot, or the file or
     name of one.  to: urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.  path:
     written to as well, where given.  urdf: a file whose joint origins are corrected, all else left
@@ -47,10 +71,10 @@ def export(
     made = exported(
         fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental, rung=rung
     )
-    written(made, place)
+    written(made.file, place)
     for notice in made.notices:
         notify(notice)
-    return made.content.decode("utf-8")
+    return made.file.content.decode("utf-8")
 
 
 def exported(
@@ -63,15 +87,22 @@ def exported(
     tip: str = "",
     experimental: bool = False,
     rung: int | None = None,
-) -> Export:
-    """The bytes of the file and its notices; arguments as of `export`."""
+) -> Exported:
+    """The bytes of the file, its notices, and what it delivers; arguments as of `export`."""
+    table.exporter(to)
+    source, found = read_source(fit, rung), None
+    if isinstance(source, Job):
+        job = source
+    else:
+        found = delivered(source, to)
+        q = source.train.q if source.data.poses else None
+        job = job_of(source.source, found.cell, found.nominal, q)
     originals = () if urdf is None else (read_urdf(urdf),)
     model = None if mjcf is None else Path(mjcf)
     job = replace(
-        read_job(fit, rung), originals=originals, model=model, path=path, tip=tip,
-        experimental=experimental,
-    )  # fmt: skip
-    return table.export(job, to)
+        job, originals=originals, model=model, path=path, tip=tip, experimental=experimental
+    )
+    return Exported(to, table.export(job, to), found)
 
 
 def written(made: Export, path: Path | None) -> None:

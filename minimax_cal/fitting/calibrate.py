@@ -184,12 +184,22 @@ def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
 
     changes: fields of `Options`.  Raises CalibrationError.
     """
-    began = time.perf_counter()
     options = replace(fit.options, **changes)  # type: ignore[arg-type]
-    check(fit.before.robot, fit.data, options)
-    poses = Parts(fit.data, fit.train, fit.data.take(fit.held), fit.data.notices)
-    solved = fit_cell(fit.before.robot, poses.train, options, progress)
-    return judged(fit.before.robot, options, poses, solved, began)[0]
+    return fit_split(fit.before.robot, fit.data, fit.held, options, progress)
+
+
+def fit_split(
+    robot: Robot, data: Measurements, held: Array, options: Options, progress: Progress = silent
+) -> Fit:
+    """A fit of poses that are split already, as a result holds them.
+
+    held: (m,) True where held out.  Raises CalibrationError.
+    """
+    began = time.perf_counter()
+    check(robot, data, options)
+    poses = Parts(data, data.take(~held), data.take(held), data.notices)
+    solved = fit_cell(robot, poses.train, options, progress)
+    return judged(robot, options, poses, solved, began)[0]
 
 
 def check(robot: Robot, data: Measurements, options: Options) -> None:

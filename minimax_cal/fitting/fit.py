@@ -448,6 +448,11 @@ class Fit:
         return Options(**{**settings, "effects": self.cell.effects.terms})  # type: ignore[arg-type]
 
     @property
+    def is_after_check(self) -> bool:
+        """Whether a check placed it on a few poses, which tell its links only where they moved."""
+        return bool(self.provenance.settings.get("after_check"))
+
+    @property
     def group(self) -> Array:
         """(training poses,) rows with one number belong together: a pose, or a cluster of poses."""
         return clusters(self.train)

@@ -6,19 +6,21 @@ write, so that a result and its file say the same.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
-from minimax_cal.ground.records import reading
+from minimax_cal.ground.records import checked, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, spans_of
@@ -65,6 +67,9 @@ class Opened:
     data: its poses, none where it holds none; held: (m,) True where held out.  digest: SHA-256 of
     the measurements.  uncertainty: of the last rung of a calibration.  spans: how far each joint
     went in the training poses, none where the file does not tell.
+    options: how it was fitted, None where its poses do not tell its links.  fit: the calibration.
+    outside: the claim of the last rung.  possible: effects, as texts, that a diagnosis has not
+    confirmed; none where its rung was chosen.
     """
 
     source: str
@@ -77,6 +82,10 @@ class Opened:
     placed: bool = True
     status: Status | None = None
     spans: tuple[Span, ...] = ()
+    options: Options | None = None
+    fit: Fit | None = None
+    outside: Callable[[], Beyond] = Beyond
+    possible: frozenset[str] = frozenset()
 
     @property
     def cell(self) -> Cell:
@@ -144,7 +153,7 @@ def at_rung(found: Opened, number: int) -> Opened:
         names = ", ".join(f"{i} ({rung.name})" for i, rung in enumerate(found.rungs))
         raise OptionError(f"{found.source}: has no rung {number}; it has {names}")
     whole = found.uncertainty if number == len(found.rungs) - 1 else None
-    return replace(found, number=number, uncertainty=whole)
+    return replace(found, number=number, uncertainty=whole, possible=frozenset())
 
 
 def of_content(content: Mapping[str, Any], source: str) -> Opened:
@@ -163,10 +172,11 @@ def of_content(content: Mapping[str, Any], source: str) -> Opened:
 def of_fit(fit: Fit, source: str) -> Opened:
     """A calibration: nominal and calibrated."""
     rungs = (Rung(NOMINAL, fit.nominal, fit.error_nominal), Rung(CALIBRATED, fit.cell, fit.error))
-    digest = fit.provenance.data_sha256
+    fitted = bool(fit.data.poses) and fit.nominal is not None and not fit.is_after_check
+    options = fit.options if fitted else None
     return Opened(
-        source, rungs, 1, fit.data, fit.held, digest, fit.uncertainty,
-        status=fit.status, spans=fit.spans,
+        source, rungs, 1, fit.data, fit.held, fit.provenance.data_sha256, fit.uncertainty,
+        status=fit.status, spans=fit.spans, options=options, fit=fit, outside=lambda: fit.beyond,
     )  # fmt: skip
 
 
@@ -183,7 +193,10 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     """A diagnosis: nominal, geometric, then with each effect."""
-    from minimax_cal.fitting.fit_file import measured_poses  # its schemas take long to build
+    from minimax_cal.fitting.fit_file import (
+        BeyondPart,
+        measured_poses,
+    )  # schemas take long to build
 
     rungs = rungs_of(content, source)
     first = next(rung.cell for rung in rungs if rung.cell)
@@ -193,7 +206,17 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     digest = str(content["provenance"]["data_sha256"])
     status = Status(content["status"]) if "status" in content else None
     spans = spans_of(first.robot, data.take(~held)) if first and data.poses else ()
-    return Opened(source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans)
+    settings = content["provenance"].get("settings", {})
+    kept = {key: settings[key] for key in vars(Options()) if key in settings}
+    last = rungs[-1].cell
+    known = last.effects.causes if last else ()
+    firm = {term.text for term in confirmed(content, known)}
+    return Opened(
+        source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
+        options=Options(**{**kept, "objective": "sum"}) if data.poses else None,
+        outside=checked(BeyondPart, content["gap"].get("beyond", {}), source).beyond,
+        possible=frozenset(term.text for term in known) - firm,
+    )  # fmt: skip
 
 
 def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:
@@ -250,18 +273,15 @@ def established(content: Mapping[str, Any], source: str) -> list[Term]:
     if content.get("kind") != "diagnosis":
         raise OptionError(f"{source}: is no diagnosis, so that it names no effects")
     with reading(source):
-        found = [
-            (str(effect["effect"]), str(effect["place"]))
-            for effect in content["effects"]
-            if effect.get("established", True)
-            and effect["effect"] in EFFECTS
-            and not effect.get("lines")  # a fault of the data
-        ]
         last = rungs_of(content, source)[-1].cell
-        known = last.effects.terms if last else ()
-        return [
-            term
-            for name, where in found
-            for term in [t for t in known if (t.effect, t.place) == (name, where)]
-            or [Term(name, where)]
-        ]
+        return confirmed(content, last.effects.terms if last else ())
+
+
+def confirmed(content: Mapping[str, Any], known: Sequence[Term]) -> list[Term]:
+    """The established effects of a diagnosis' JSON.  known: those fitted, with their variants."""
+    found = [
+        (str(effect["effect"]), str(effect["place"]))
+        for effect in content["effects"]
+        if effect.get("established", True) and effect["effect"] in EFFECTS
+    ]
+    return [term for key in found for term in [t for t in known if t.key == key] or [Term(*key)]]

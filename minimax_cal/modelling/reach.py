@@ -12,7 +12,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
-from minimax_cal.modelling.effects.table import EFFECTS, Fitted
+from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 
@@ -242,16 +242,26 @@ class Reach:
         return tuple(out)
 
 
+def flange_terms(cell: Cell) -> tuple[Term, ...]:
+    """The effects of a cell that move its flange, and not only what is seen of it."""
+    return tuple(
+        term
+        for term in cell.effects.terms
+        if EFFECTS[term.effect].of_flange and term.place not in cell.target_names
+    )
+
+
 def arm_of(cell: Cell) -> Cell:
     """The calibrated arm in its own base, seen by four points about its targets' centre.
 
     They tell the flange's pose.  Of the effects those that move the flange.
     """
     middle = cell.target_positions.mean(axis=0) if len(cell.target_positions) else np.zeros(3)
+    moving = flange_terms(cell)
     kept = [
         (term, value)
         for term, value in zip(cell.effects.terms, cell.effects.values, strict=True)
-        if EFFECTS[term.effect].of_flange and term.place not in cell.target_names
+        if term in moving
     ]
     effects = Fitted(tuple(term for term, _ in kept), tuple(value for _, value in kept))
     return replace(

@@ -229,6 +229,21 @@ def parts_of(cell: Cell, scene: Scene, arm: Arm) -> Parts:
     return parts
 
 
+def held_terms(cell: Cell) -> tuple[Term, ...]:
+    """The effects of a cell that elements hold, or a command map; those of 0 need nothing."""
+    scene = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
+    bare = stiff(cell.robot, masses_of(cell.robot, LEAST_MASS))
+
+    def is_held(term: Term, values: Array) -> bool:
+        parts = Parts(bare)
+        if values.any():
+            ELEMENTS.get(term.effect, without_element)(parts, scene, term, values)
+        return not parts.left_out
+
+    pairs = zip(cell.effects.terms, cell.effects.values, strict=True)
+    return tuple(term for term, values in pairs if is_held(term, values))
+
+
 def unheld(cell: Cell, data: Measurements) -> tuple[Term, ...]:
     """Those effects of a cell that, with its values, only a command map can hold."""
     parts = parts_of(cell, cell.scene(data), stiff(cell.robot, masses_of(cell.robot, LEAST_MASS)))

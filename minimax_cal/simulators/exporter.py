@@ -8,7 +8,8 @@ from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.simulators.arm import arm_of, assumed
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.simulators.arm import arm_of, assumed, held_terms
 from minimax_cal.simulators.chain import chain_of
 from minimax_cal.simulators.given import corrected, moved_to, read_model, told_masses
 from minimax_cal.simulators.mjcf import beside, new_tree, text_of, told
@@ -22,6 +23,11 @@ def write(job: Job) -> Export:
     arm = arm_of(cell, job.q)
     content = text_of(new_tree(arm, cell.target_names))
     return Export(content, (assumptions(job.robot), *told(arm)), beside(cell, arm))
+
+
+def carries(cell: Cell) -> tuple[Term, ...]:
+    """The effects that a simulator has an element for, or that turn joints alone."""
+    return held_terms(cell)
 
 
 def correct(job: Job) -> Export:

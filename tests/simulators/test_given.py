@@ -10,7 +10,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.opened import open_result
 from minimax_cal.modelling.cell import still
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.simulators.given import read_model
@@ -57,7 +56,7 @@ def corrected(path: Path, chain: Chain, cell: mc.Cell, out: Path) -> Any:
     from minimax_cal.correcting.exporters.job import job_of
     from minimax_cal.simulators.exporter import write
 
-    job = replace(job_of(open_result(cell)), nominal=chain.robot, fitted=True, model=path, path=out)
+    job = replace(job_of("cell", cell), nominal=chain.robot, fitted=True, model=path, path=out)
     out.write_bytes(write(job).content)
     return mujoco.MjModel.from_xml_path(str(out))
 

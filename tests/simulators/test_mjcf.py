@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.correcting.export import exported, written
 from minimax_cal.correcting.exporters.job import compliance_of, job_of, origins
-from minimax_cal.fitting.opened import open_result
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import Fitted, terms
 from minimax_cal.robots.gravity import tubes
@@ -77,7 +76,7 @@ def cell_with(robot: mc.Robot, *texts: str, size: float = 2e-6, **values: list[f
 
 
 def model_of(cell: Cell) -> Any:
-    text = write(job_of(open_result(cell))).content.decode()
+    text = write(job_of("cell", cell)).content.decode()
     return mujoco.MjModel.from_xml_string(text)
 
 
@@ -206,7 +205,7 @@ def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
         mc.load_commands(other)
     made = exported(cell, "mjcf")
     with pytest.raises(mc.OptionError, match="beside it"):
-        written(made, None)
+        written(made.file, None)
 
 
 def test_a_joint_that_stiffens_goes_into_the_commands_and_not_into_springs() -> None:
@@ -235,7 +234,7 @@ def test_what_changes_with_time_is_named() -> None:
     data = replace(data, columns={**data.columns, "clock": np.linspace(0.0, 1.0, data.poses)})
     drift = terms(cell.scene(data), ["frame_drift:frame:constant=0.5"])
     cell = replace(cell, effects=Fitted(drift, (np.full(6, 1e-4),)))
-    made = write(job_of(open_result(cell)))
+    made = write(job_of("cell", cell))
     assert any("frame_drift" in text and "time" in text for text in made.notices)
     assert not made.beside
 

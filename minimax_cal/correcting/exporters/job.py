@@ -11,7 +11,6 @@ import numpy as np
 
 from minimax_cal.fitting.opened import Opened, Result, open_result
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell, NotSaved, saved_content, still
 from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE, stiffens
 from minimax_cal.modelling.effects.scene import joint_of
@@ -19,7 +18,6 @@ from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
-from minimax_cal.solvers.status import Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +25,6 @@ class Job:
     """A robot on its way to a file.
 
     robot: calibrated.  nominal: before the calibration, the same where there was none.
-    effects: labels of what the fit holds beyond geometry.
     compliance: (n,) turn per torque that was fitted, NaN where none [rad/(N m)].
     originals: the URDF to correct, or none.  tip: its last link, empty for the only end.
     experimental: whether the user agreed to what no maker documents.
@@ -39,7 +36,6 @@ class Job:
     robot: Robot
     nominal: Robot
     source: str
-    effects: tuple[str, ...]
     compliance: Array
     originals: tuple[Urdf, ...] = ()
     tip: str = ""
@@ -69,35 +65,31 @@ class Export:
         return Export(text.encode("utf-8"), notices)
 
 
-def read_job(source: Result | Robot, rung: int | None = None) -> Job:
-    """A result, its file, or any robot that `load_robot` takes.  Raises CalibrationError."""
+def read_source(source: Result | Robot, rung: int | None = None) -> Opened | Job:
+    """A result, or its file, opened; of any robot that `load_robot` takes the job itself.
+
+    Raises CalibrationError.
+    """
     if isinstance(source, Robot):
-        return Job(source, source, source.name, (), np.full(source.joints, np.nan))
+        return Job(source, source, source.name, np.full(source.joints, np.nan))
     if not isinstance(source, Path | str):
-        return job_of(open_result(source, rung))
+        return open_result(source, rung)
     path = Path(source)
     if path.suffix.lower() == ".json" and path.is_file():
         with suppress(NotSaved):  # load_robot says what is wrong with it
             if {"targets_mm", "kind"} & set(saved_content(path)):
-                return job_of(open_result(path, rung))
+                return open_result(path, rung)
     robot = load_robot(source)
     notices = load_urdf(source).notices if is_urdf(source) else ()
-    nothing = np.full(robot.joints, np.nan)
-    return Job(robot, robot, str(source), (), nothing, notices=notices)
+    return Job(robot, robot, str(source), np.full(robot.joints, np.nan), notices=notices)
 
 
-def job_of(known: Opened) -> Job:
-    """Of a rung of a result; its nominal robot may be unknown.  Raises OptionError."""
-    if known.status is Status.FAILED:
-        raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
-    cell, nominal = known.cell, known.nominal
-    labels = tuple(term.label for term in cell.effects.terms if not term.frees_frames)
+def job_of(source: str, cell: Cell, nominal: Cell | None = None, q: Array | None = None) -> Job:
+    """Of an arm; its nominal robot may be unknown.  q: (m, n) poses of the fit [rad, m]."""
     before = nominal.robot if nominal else cell.robot
-    q = known.train.q if known.data.poses else None
     return Job(
-        cell.robot, before, known.source, labels, compliance_of(cell),
-        fitted=nominal is not None, cell=cell, q=q,
-    )  # fmt: skip
+        cell.robot, before, source, compliance_of(cell), fitted=nominal is not None, cell=cell, q=q
+    )
 
 
 def compliance_of(cell: Cell) -> Array:

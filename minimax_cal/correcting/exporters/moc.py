@@ -14,10 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.correcting.exporters.job import Export, Job, compliance_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import read_raw
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
+from minimax_cal.modelling.effects.scene import joint_of
+from minimax_cal.modelling.effects.table import Term
 from minimax_cal.robots.transforms import inverse, link, to_rpy
 
 HEADER = "MOC:CFG_1.0:6:0::"
@@ -194,6 +198,18 @@ def write(job: Job) -> Export:
         "tool as in the fit; Compl is the turn of the joint per torque [rad/(N m)]."
     )
     return Export.of(text_of(moc, comment), WARNING)
+
+
+def carries(cell: Cell) -> tuple[Term, ...]:
+    """The compliance of joints, where each has one number."""
+    own = compliance_of(cell)
+
+    def is_written(term: Term) -> bool:
+        numbers = own if term.place == "all" else own[[joint_of(term.place)]]
+        return bool(np.isfinite(numbers).any())
+
+    name = JOINT_COMPLIANCE.name
+    return tuple(t for t in cell.effects.terms if t.effect == name and is_written(t))
 
 
 def name_of(i: int) -> tuple[str, str]:

@@ -1,11 +1,11 @@
-"""Every format that a robot can be written in."""
+"""Every format that a robot can be written in, and what of a calibrated arm each carries."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import cast
+from typing import Any
 
 from minimax_cal.correcting.exporters import (
     dh_csv,
@@ -17,52 +17,67 @@ from minimax_cal.correcting.exporters import (
     urdf,
 )
 from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.fitting.options import OFFSETS
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.modelling.effects.compliance import JOINT_COMPLIANCE
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
+
+Carries = Callable[[Cell], tuple[Term, ...]]
 
 
-def mjcf(job: Job) -> Export:
-    """MJCF, by the room of simulators, which stands on this one: imported at its first use."""
-    return cast(Export, import_module("minimax_cal.simulators.exporter").write(job))
+def nothing(cell: Cell) -> tuple[Term, ...]:
+    """No effect: geometry alone."""
+    return ()
 
 
-EXPORTERS: dict[str, Callable[[Job], Export]] = {
-    "urdf": urdf.write,
-    "ur-yaml": ur_yaml.write,
-    "ros-yaml": ros_yaml.write,
-    "ros2-control": ros2_control.write,
-    "dh-csv": dh_csv.write,
-    "json": robot_json.write,
-    "moc": moc.write,
-    "mjcf": mjcf,
+@dataclass(frozen=True)
+class Exporter:
+    """A format.
+
+    write: its file.  carries: the effects of a cell that the file holds.  only: of the geometry it
+    holds no more than a fit with this `only` finds; all of it where empty.
+    """
+
+    write: Callable[[Job], Export]
+    carries: Carries = nothing
+    only: str = ""
+
+
+def later(module: str, verb: str) -> Callable[..., Any]:
+    """A function of a room that stands on this one, imported when it is first called."""
+    return lambda *given: getattr(import_module(module), verb)(*given)
+
+
+MJCF = "minimax_cal.simulators.exporter"
+EXPORTERS: dict[str, Exporter] = {
+    "urdf": Exporter(urdf.write),
+    "ur-yaml": Exporter(ur_yaml.write),
+    "ros-yaml": Exporter(ros_yaml.write),
+    "ros2-control": Exporter(ros2_control.write, only=OFFSETS),
+    "dh-csv": Exporter(dh_csv.write),
+    "json": Exporter(robot_json.write),
+    "moc": Exporter(moc.write, moc.carries),
+    "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries")),
 }
+
+
+def exporter(to: str) -> Exporter:
+    """The format of a name.  Raises OptionError."""
+    if to not in EXPORTERS:
+        raise OptionError(f"{to}: no such format; choose one of {', '.join(EXPORTERS)}")
+    return EXPORTERS[to]
 
 
 def export(job: Job, to: str) -> Export:
     """The file in a format, with notices.  Raises OptionError."""
-    if to not in EXPORTERS:
-        raise OptionError(f"{to}: no such format; choose one of {', '.join(EXPORTERS)}")
+    chosen = exporter(to)
     if job.originals and to != "urdf":
         raise OptionError(f"urdf goes with the format urdf, not with {to}")
     if job.model and to != "mjcf":
         raise OptionError(f"mjcf goes with the format mjcf, not with {to}")
     if job.tip and not (job.originals or job.model):
         raise OptionError("tip names a link of the file given as urdf or mjcf")
-    found = EXPORTERS[to](job)
+    found = chosen.write(job)
     if not job.originals:  # a given URDF keeps its own constants
         found = replace(found, notices=(*job.notices, *found.notices))
-    lost = [label for label in job.effects if not (to == "moc" and is_written(job, label))]
-    if not lost or to == "mjcf":  # which tells itself what it holds
-        return found
-    said = (
-        f"{', '.join(lost)}: effects beyond geometry are not in this file, which then does not "
-        "reach the accuracy of the fit; minimax-cal compensate takes them into account"
-    )
-    return replace(found, notices=(*found.notices, said))
-
-
-def is_written(job: Job, label: str) -> bool:
-    """Whether MOC.cfg holds an effect: the compliance of joints, where each has one number."""
-    name, _, place = label.partition(":")
-    numbers = job.compliance if place == "all" else job.compliance[int(place[1:]) - 1 :][:1]
-    return name == JOINT_COMPLIANCE.name and bool((numbers == numbers).any())
+    return found

@@ -42,6 +42,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     settings = {
         **fit.options.settings(), "objective": "sum", "holdout": 0.0, "holdout_by": None,
         "fix": links, "free": (), "priors": {}, "loss": "square", "trim": 0.0,
+        "after_check": True,
     }  # fmt: skip
     told = ", ".join(m.parameter for m in found.named) or "nothing but frame and targets"
     return replace(

@@ -108,6 +108,11 @@ class Term:
         return "sessions" in self.choice
 
     @property
+    def ends_with_session(self) -> bool:
+        """Whether it holds for the session of the measurements alone: its clock, nests, frames."""
+        return EFFECTS[self.effect].of_session or self.by_clock
+
+    @property
     def by_clock(self) -> bool:
         """Whether it follows the time, and not the temperature or the sessions."""
         told = "temperature" in self.choice or self.frees_frames

@@ -1,0 +1,251 @@
+"""What leaves the house: a file, or corrected targets, with a fit and figures of its own.
+
+A geometry that was fitted together with effects is right only together with them.  What carries
+none of them, or some, is therefore fitted again for exactly what it carries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from minimax_cal.correcting.exporters.table import EXPORTERS
+from minimax_cal.fitting.calibrate import fit_split
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.opened import GEOMETRIC, Opened, Result, open_result
+from minimax_cal.fitting.options import OFFSETS, Progress, silent
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import finite
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.history import with_history
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.reach import flange_terms
+from minimax_cal.solvers.status import Status
+
+COMPENSATED = "compensate"  # targets corrected by `compensate`, which are no file of a robot
+DELIVERABLES: dict[str, Callable[[Cell], tuple[Term, ...]]] = {
+    **{name: exporter.carries for name, exporter in EXPORTERS.items()},
+    COMPENSATED: flange_terms,
+}
+PARTS = {"": "geometry", OFFSETS: "joint offsets"}  # of the links, by `Options.only`
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How well an arm predicts points that no fit saw [mm], NaN where that is not known.
+
+    rms, largest: on held-out poses, inside the measured region.  typical, worst: RMS outside it, of
+    all parts that were left out and of the worst.
+    """
+
+    rms: float = math.nan
+    largest: float = math.nan
+    typical: float = math.nan
+    worst: float = math.nan
+
+    @staticmethod
+    def of(fit: Fit, crossed: bool = True) -> Figures:
+        """Of a calibration.  crossed: where it was cross-validated, by that."""
+        inside, outside = fit.accuracy["holdout"], fit.beyond
+        if crossed and fit.error_crossed.size:
+            inside = fit.within.after
+        rms, largest = (inside.rms_mm, inside.max_mm) if inside.poses else (math.nan, math.nan)
+        return Figures(rms, largest, outside.typical_mm, outside.worst_mm)
+
+    @staticmethod
+    def at_rung(known: Opened) -> Figures:
+        """Of the rung of a result."""
+        last, rung = known.number == len(known.rungs) - 1, known.rungs[known.number]
+        if known.fit and last:
+            return Figures.of(known.fit)
+        away = known.outside()
+        typical, worst = math.nan, math.nan
+        if last:
+            typical, worst = away.typical_mm, away.worst_mm
+        elif rung.name == GEOMETRIC:
+            typical, worst = away.geometric_typical_mm, away.geometric_worst_mm
+        if not known.held.any():
+            return Figures(typical=typical, worst=worst)
+        seen = known.data.take(known.held)
+        error = rung.error[:, known.held] if rung.error is not None else None
+        inside = accuracy(known.cell.error(with_history(seen)) if error is None else error)
+        return Figures(inside.rms_mm, inside.max_mm, typical, worst)
+
+    def sentence(self) -> str:
+        """For people; that nothing is known where that is so."""
+        said = [] if math.isnan(self.rms) else [f"held-out RMS {self.rms:.3f} mm"]
+        if not math.isnan(self.typical):
+            said.append(
+                f"outside the measured poses {self.typical:.3f} mm, at worst {self.worst:.3f} mm"
+            )
+        return ", ".join(said) or "not known"
+
+
+@dataclass(frozen=True, eq=False)
+class Delivered:
+    """What a file, or corrected targets, hold of a result, and how well that does by itself.
+
+    format: of `export`, or compensate.  part: of the geometry that it holds, in words; rest: what
+    it does not hold of the geometry, empty for nothing.  carries, not_carried: effects, as
+    joint_compliance:all.  cell: the arm as fitted for exactly that.
+    nominal: before the calibration, None where the result does not tell it.  figures: its own;
+    whole: those of the full model.  fit: the calibration that `cell` is of, None where there is
+    none.  reason: why it was not fitted again though it does not hold all; else empty.
+    """
+
+    format: str
+    part: str
+    carries: tuple[str, ...]
+    not_carried: tuple[str, ...]
+    cell: Cell
+    nominal: Cell | None
+    figures: Figures
+    whole: Figures
+    fit: Fit | None = None
+    rest: str = ""
+    reason: str = ""
+
+    @property
+    def holds(self) -> str:
+        """What it holds, in words."""
+        return (
+            f"{self.part} and {', '.join(self.carries)}" if self.carries else f"{self.part} alone"
+        )
+
+    @property
+    def lacks(self) -> str:
+        """What of the full model it does not hold, in words; empty where it holds all."""
+        return ", ".join(filter(None, (self.rest, *self.not_carried)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return block(self.format, self.carries, self.not_carried, self.figures)
+
+    def sentence(self) -> str:
+        """What it holds and how well it does, beside the full model."""
+        if self.reason:
+            return (
+                f"{self.format} does not hold {self.lacks}, and how well the rest does without is "
+                f"not known: {self.reason}; give a calibration with its measurements"
+            )
+        own = f"{self.format} holds {self.holds}: {self.figures.sentence()}"
+        if not self.lacks:
+            return own
+        return f"{own} (fitted without {self.lacks}; the full model: {self.whole.sentence()})"
+
+
+def block(
+    to: str,
+    carries: Sequence[str] = (),
+    not_carried: Sequence[str] = (),
+    figures: Figures = Figures(),
+) -> dict[str, Any]:
+    """`delivered` in JSON; of a bare robot nothing is known."""
+    return {
+        "format": to,
+        "carries": list(carries),
+        "not_carried": list(not_carried),
+        "holdout_rms_mm": finite(figures.rms),
+        "outside_typical_mm": finite(figures.typical),
+        "outside_worst_mm": finite(figures.worst),
+    }
+
+
+def deliver(
+    fit: Result,
+    to: str,
+    *,
+    rung: int | None = None,
+    clock: float | None = None,
+    progress: Progress = silent,
+) -> Delivered:
+    """What a format of `export`, or `compensate`, holds of a result, fitted for exactly that.
+
+    fit: a calibration, its cell, a diagnosis (of which the confirmed effects count), a relative
+    calibration, or the file of one.  to: a format of `export`, or compensate.  rung: of a
+    diagnosis, with all effects up to it.  clock: the moment of the measurements' session, 0 to 1,
+    that corrected targets are for; without it what follows that session's time is not corrected.
+    progress: called with a word on each stage.  Data, objective, losses, priors, fixed parameters
+    and held-out poses are those of the result.  Raises CalibrationError for wrong input.
+
+    >>> mc.deliver(fit, "urdf").to_dict()
+    """
+    if to not in DELIVERABLES:
+        raise OptionError(f"{to}: no such format; choose one of {', '.join(DELIVERABLES)}")
+    return delivered(open_result(fit, rung), to, clock, progress)
+
+
+def delivered(
+    known: Opened, to: str, clock: float | None = None, progress: Progress = silent
+) -> Delivered:
+    """As `deliver`, of an opened result."""
+    if known.status is Status.FAILED:
+        raise OptionError(f"{known.source}: {Status.FAILED}: {Status.FAILED.advice}")
+    cell, whole = known.cell, Figures.at_rung(known)
+    only = EXPORTERS[to].only if to in EXPORTERS and known.number else ""
+    held = carried(known, to, clock)
+    lost = tuple(term for term in cell.effects.causes if term not in held)
+    own = known.fit if known.number else None
+    made = Delivered(
+        to, PARTS[only], labels(held), labels(lost), cell, known.nominal, whole, whole, own
+    )
+    if only and not (known.options and known.options.only == only):
+        made = replace(made, rest="the rest of the geometry")
+    if not made.lacks:
+        return made
+    if known.options is None or known.nominal is None:
+        return as_it_is(made, known)
+    options = replace(known.options, effects=held)
+    if only:  # what was freed beside the offsets is fixed now
+        options = replace(options, only=only, free=())
+    fit = fit_split(known.nominal.robot, known.data, known.held, options, progress)
+    if fit.status is Status.FAILED:
+        raise OptionError(
+            f"{known.source}: {to}: without {made.lacks} the fit is {fit.status}; "
+            f"{fit.status.advice}"
+        )
+    # of geometry alone the digits are those that the result's own file holds
+    placed = known.fit.geometric if known.fit and not (held or only) else fit.cell
+    figures = Figures.of(fit, crossed=known.fit is not None)  # as the full model was judged
+    return replace(made, cell=placed, nominal=fit.nominal, figures=figures, fit=fit)
+
+
+def carried(known: Opened, to: str, clock: float | None) -> tuple[Term, ...]:
+    """The effects of a result that a deliverable holds.
+
+    Those of one session end with it: its time, where its nests, its instrument and its frame were.
+    """
+    cell = known.cell
+    held = DELIVERABLES[to](cell)
+    timed = clock is not None and to == COMPENSATED
+    return tuple(
+        term
+        for term in cell.effects.causes
+        if term in held
+        and term.text not in known.possible
+        and (not term.ends_with_session or (timed and term.by_clock))
+    )
+
+
+def as_it_is(made: Delivered, known: Opened) -> Delivered:
+    """What a result holds that cannot be fitted again: its own geometry, or its arm whole."""
+    held = DELIVERABLES[made.format](made.cell)
+    lost = tuple(term for term in made.cell.effects.causes if term not in held)
+    why = f"{known.source} holds no measurements"
+    if known.data.poses:
+        why = f"{known.source} does not tell its nominal robot"
+        if known.nominal:
+            why = f"{known.source} was placed by a check, on poses too few for a fit"
+    alone = known.fit.geometric if known.fit and known.number and not held else made.cell
+    return replace(
+        made, carries=labels(held), not_carried=labels(lost), cell=alone, figures=Figures(),
+        fit=None, reason=why if lost or made.rest else "",
+    )  # fmt: skip
+
+
+def labels(terms: Sequence[Term]) -> tuple[str, ...]:
+    """As joint_compliance:all, each once."""
+    return tuple(dict.fromkeys(term.label for term in terms))

@@ -1,0 +1,262 @@
+"""What leaves the house: files with the geometry fitted for what they carry, and their figures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_allclose, assert_array_equal
+
+import minimax_cal as mc
+from minimax_cal.cli.export import export_command
+from minimax_cal.correcting.deliverable import DELIVERABLES, Delivered
+from minimax_cal.correcting.export import exported
+from minimax_cal.correcting.exporters import EXPORTERS
+from minimax_cal.fitting.opened import place
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.effects.table import Fitted
+from minimax_cal.modelling.simulate import Truth, simulate
+from minimax_cal.robots.gravity import masses_of
+from tests.conftest import shared
+from tests.problems_deliverables import READERS, reached
+
+WORSE = 1.03  # of the plain geometric fit exported alike
+TOLD = 0.15  # between what a deliverable says and what its file reaches on new poses
+EFFECTS = "joint_compliance:all"
+REAL = {  # effects that a diagnosis confirms there, chosen by hand: a full one takes minutes
+    "irb120": f"{EFFECTS},joint_coupling:J6,gear_error:J1,gear_error:J2,gear_error:J3",
+    "meca500_r": f"{EFFECTS},gear_error:J4,gear_error:J5",
+    "ur10_b": f"{EFFECTS},gear_error:J1,thermal_growth:all",
+}
+Split = tuple[mc.Fit, mc.Fit, Measurements]
+
+
+def split_of(robot: mc.Robot, data: Measurements, effects: str, seed: int = 0) -> Split:
+    """Fits with effects and of geometry alone of 60 % of the poses, cross-validated; the others."""
+    data = with_history(data)
+    new = np.random.default_rng(seed).permutation(data.poses) < 0.4 * data.poses
+    train = data.take(~new)
+    joint = mc.calibrate(robot, train, "sum", effects=effects, cv=True)
+    return joint, mc.calibrate(robot, train, "sum", cv=True), data.take(new)
+
+
+@pytest.fixture(scope="module", params=["ur10", "irb120", "irb2600"])
+def simulated(request: pytest.FixtureRequest) -> Split:
+    robot = mc.load_robot(request.param)
+    made = simulate(robot, 150, 3, seed=3, truth=Truth(compliance=3e-6))
+    return split_of(robot, made.data, EFFECTS)
+
+
+@pytest.fixture(scope="module", params=REAL)
+def real(request: pytest.FixtureRequest) -> Split:
+    robot, data = shared(request.param)
+    return split_of(mc.load_robot(robot), mc.read_measurements(data), REAL[request.param])
+
+
+def check_files(split: Split, folder: Path) -> None:
+    """Each file does what the plain fit's does, and what is said of it."""
+    joint, plain, new = split
+    alone = accuracy(place(joint.cell.robot, new).error(new)).rms_mm
+    formats = [to for to in READERS if to != "ur-yaml" or "UR" in joint.cell.robot.name]
+    for to in formats:
+        own = mc.deliver(joint, to)
+        rms = reached(joint, to, new, folder)
+        assert rms <= WORSE * reached(plain, to, new, folder)
+        assert rms == pytest.approx(own.figures.rms, rel=TOLD)
+        assert own.carries == ()
+        assert set(own.not_carried) == {term.label for term in joint.cell.effects.terms}
+    assert rms < 0.97 * alone  # what the geometry of the joint fit would have done
+
+
+def test_files_of_simulated_arms(simulated: Split, tmp_path: Path) -> None:
+    check_files(simulated, tmp_path)
+
+
+def test_files_of_real_arms(real: Split, tmp_path: Path) -> None:
+    check_files(real, tmp_path)
+
+
+# ---- what each format carries ------------------------------------------------------------------
+
+
+def weighed(name: str) -> mc.Robot:
+    """An arm whose masses are known, so that a joint's compliance is one number."""
+    robot = mc.load_robot(name)
+    mass, com = masses_of(robot)
+    return replace(robot, mass=mass, com=com)
+
+
+@pytest.fixture(scope="module")
+def soft() -> mc.Fit:
+    """An arm with a compliance, play, and what ends with its session."""
+    robot = weighed("irb2600")
+    data = with_history(simulate(robot, 80, 3, seed=4, truth=Truth(compliance=2e-6)).data)
+    effects = f"{EFFECTS},backlash:J3,tool_flex:all,frame_drift:frame,thermal_growth:all"
+    return mc.calibrate(robot, data, "sum", effects=effects)
+
+
+CARRIED = {
+    **dict.fromkeys(["urdf", "json", "dh-csv", "ros-yaml", "ros2-control", "ur-yaml"], ()),
+    "moc": (EFFECTS,),
+    "mjcf": (EFFECTS, "backlash:J3", "tool_flex:all"),
+    "compensate": (EFFECTS, "backlash:J3"),
+}
+
+
+@pytest.mark.parametrize("to", DELIVERABLES)
+def test_each_says_what_it_carries(to: str, soft: mc.Fit) -> None:
+    """Drift and growth by the session's clock belong to none."""
+    found = mc.deliver(soft, to)
+    every = {term.label for term in soft.cell.effects.terms}
+    assert found.carries == CARRIED[to]
+    assert set(found.not_carried) == every - set(CARRIED[to])
+    assert {t.label for t in found.cell.effects.terms} == set(found.carries)
+    assert found.to_dict().keys() == {
+        "format", "carries", "not_carried", "holdout_rms_mm", "outside_typical_mm",
+        "outside_worst_mm",
+    }  # fmt: skip
+
+
+def test_it_is_the_fit_of_exactly_that(soft: mc.Fit) -> None:
+    """The same poses, split and options: what `calibrate` finds with those effects."""
+    for to, options in (
+        ("json", {}),
+        ("ros2-control", {"only": "offsets"}),
+        ("moc", {"effects": EFFECTS}),
+    ):
+        split = np.where(soft.held, "holdout", "train")
+        data = replace(soft.data, columns={**soft.data.columns, "split": split})
+        plain = mc.calibrate(soft.before.robot, data, "sum", **options)
+        found = mc.deliver(soft, to)
+        assert_allclose(found.cell.robot.mdh, plain.cell.robot.mdh, rtol=0, atol=1e-8)
+        assert found.figures.rms == pytest.approx(plain.within.after.rms_mm, rel=1e-4)
+        assert found.figures.typical == pytest.approx(plain.beyond.typical_mm, rel=1e-3)
+        assert found.whole.rms == soft.within.after.rms_mm
+
+
+def test_priors_fixed_names_and_the_objective_stay() -> None:
+    made = simulate("ur10", 60, 3, seed=6, truth=Truth(compliance=2e-6))
+    asked: dict[str, Any] = {"objective": "minimax", "fix": "beta*", "priors": {"a*": "0.1mm"}}
+    plain = mc.calibrate("ur10", made.data, **asked)
+    joint = mc.calibrate("ur10", made.data, **asked, effects=EFFECTS)
+    assert_allclose(joint.robot.mdh, plain.robot.mdh, rtol=0, atol=1e-8)
+    assert_array_equal(joint.robot.mdh[:, 4], joint.before.robot.mdh[:, 4])
+    assert mc.deliver(joint, "urdf").figures.rms == pytest.approx(plain.within.after.rms_mm)
+
+
+def test_what_carries_all_is_written_as_it_is() -> None:
+    robot = weighed("irb120")
+    data = simulate(robot, 60, 3, seed=2, truth=Truth(compliance=2e-6)).data
+    joint = mc.calibrate(robot, data, "sum", effects=EFFECTS)
+    plain = mc.calibrate(robot, data, "sum")
+    for fit, to in ((joint, "mjcf"), (joint, "compensate"), (joint, "moc"), (plain, "json")):
+        found = mc.deliver(fit, to)
+        assert found.cell is fit.cell
+        assert found.fit is fit
+        assert not found.not_carried
+        assert found.figures == found.whole
+        assert found.figures.rms == fit.within.after.rms_mm
+    content = json.loads(exported(plain, "json").file.content)
+    assert content == plain.to_dict()["robot"]
+
+
+def test_a_file_delivers_what_the_fit_does(soft: mc.Fit, tmp_path: Path) -> None:
+    """The digits of geometry alone are those of `robot` in the file of the result."""
+    soft.save(tmp_path / "fit.json")
+    for to in ("json", "compensate", "ros2-control"):
+        one, other = mc.deliver(soft, to), mc.deliver(tmp_path / "fit.json", to)
+        assert_allclose(other.cell.robot.mdh, one.cell.robot.mdh, rtol=0, atol=1e-12)
+        assert other.figures.rms == pytest.approx(one.figures.rms, rel=1e-9)
+        assert other.whole.rms == one.whole.rms
+    written = json.loads(exported(tmp_path / "fit.json", "json").file.content)
+    assert written == json.loads((tmp_path / "fit.json").read_text())["robot"]
+
+
+def test_a_result_without_measurements_goes_out_as_it_is(soft: mc.Fit, tmp_path: Path) -> None:
+    soft.save(tmp_path / "fit.json", poses=False)
+    found = exported(tmp_path / "fit.json", "urdf")
+    assert found.delivered
+    assert "fit.json holds no measurements" in found.notices[-1]
+    assert_array_equal(found.delivered.cell.robot.mdh, soft.robot.mdh)
+    assert found.to_dict()["delivered"]["holdout_rms_mm"] is None
+    arm = mc.deliver(soft.cell, "mjcf")
+    assert arm.cell is soft.cell
+    assert arm.carries == CARRIED["mjcf"]
+    assert "holds no measurements" in arm.sentence()
+    assert exported("irb120", "json").to_dict()["delivered"]["holdout_rms_mm"] is None
+
+
+def test_a_fit_after_a_check_is_not_made_again(soft: mc.Fit) -> None:
+    """Its few poses tell what moved, and not the links: what moved goes into both geometries."""
+    rng = np.random.default_rng(0)
+    moved = soft.cell.robot.mdh.copy()
+    moved[1, 2] += 2e-3
+    arm = replace(soft.cell, robot=soft.cell.robot.with_mdh(moved), effects=Fitted((), ()))
+    few = soft.data.take(rng.permutation(soft.data.poses)[:20])
+    few = replace(few.with_y(arm.predict(few.q)), digest="")
+    after = mc.check(soft, few, "rms 0.2").fit
+    change = after.robot.mdh - soft.robot.mdh
+    assert_allclose(change, after.cell.robot.mdh - soft.cell.robot.mdh, rtol=0, atol=1e-12)
+    assert "by a check" in mc.deliver(after, "json").reason
+    assert_array_equal(mc.deliver(after, "json").cell.robot.mdh, after.robot.mdh)
+
+
+# ---- a diagnosis -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def gap() -> mc.Diagnosis:
+    made = simulate("irb120", 80, 3, seed=5, truth=Truth(compliance=5e-6))
+    return mc.diagnose("irb120", made.data, quick=True, seed=3)
+
+
+def test_a_diagnosis_delivers_its_confirmed_effects(gap: mc.Diagnosis, tmp_path: Path) -> None:
+    firm = {f.term.label for f in gap.findings if f.established}
+    assert firm
+    gap.save(tmp_path / "gap.json")
+    for source in (gap, tmp_path / "gap.json"):
+        alone, whole = mc.deliver(source, "json"), mc.deliver(source, "compensate")
+        assert_allclose(alone.cell.robot.mdh, gap.cells[0].robot.mdh, rtol=0, atol=1e-8)
+        assert alone.figures.rms == pytest.approx(gap.ladder[1].holdout.rms_mm, rel=1e-3)
+        assert set(whole.carries) == firm
+        first = mc.deliver(source, "json", rung=1)
+        assert not first.not_carried
+        assert_allclose(first.cell.robot.mdh, gap.cells[0].robot.mdh, rtol=0, atol=1e-12)
+    assert alone.fit
+    assert (alone.fit.held == gap.held).all()
+
+
+# ---- by command --------------------------------------------------------------------------------
+
+
+def test_the_command_tells_figures_and_json(soft: mc.Fit, tmp_path: Path) -> None:
+    soft.save(tmp_path / "fit.json")
+
+    def told(*more: object) -> Any:
+        words = [str(word) for word in (tmp_path / "fit.json", *more)]
+        result = CliRunner().invoke(export_command, words, standalone_mode=False)
+        assert result.exception is None, result.output
+        return result
+
+    asked = told("--to", "urdf", "--json", "-o", tmp_path / "arm.urdf")
+    own = mc.deliver(soft, "urdf")
+    found = json.loads(asked.stdout)["delivered"]
+    assert found["holdout_rms_mm"] == pytest.approx(own.figures.rms, rel=1e-9)
+    assert found["not_carried"] == list(own.not_carried)
+    assert (tmp_path / "arm.urdf").is_file()
+    assert f"held-out RMS {own.figures.rms:.3f} mm" in asked.stderr
+    assert f"the full model: held-out RMS {own.whole.rms:.3f} mm" in asked.stderr
+    assert json.loads(told("--to", "json", "--json").stdout).keys() == {"delivered"}
+    assert "delivered" not in told("--to", "json").stdout
+
+
+def test_an_unknown_format_is_one_line(soft: mc.Fit) -> None:
+    with pytest.raises(mc.OptionError, match="no such format; choose one of urdf"):
+        mc.deliver(soft, "step")
+    assert set(EXPORTERS) < set(DELIVERABLES)
+    assert isinstance(mc.deliver(soft, "json"), Delivered)
