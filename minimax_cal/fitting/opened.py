@@ -193,10 +193,7 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     """A diagnosis: nominal, geometric, then with each effect."""
-    from minimax_cal.fitting.fit_file import (
-        BeyondPart,
-        measured_poses,
-    )  # schemas take long to build
+    from minimax_cal.fitting.fit_file import BeyondPart, measured_poses  # schemas: slow to build
 
     rungs = rungs_of(content, source)
     first = next(rung.cell for rung in rungs if rung.cell)
