@@ -35,7 +35,7 @@ from experiments.blind_gap import (
     verdicts,
 )
 from experiments.gap_cases import Cause
-from experiments.machines import INSIDE, MAKES, OUTSIDE, Asked, Made, make, places
+from experiments.machines import INSIDE, MAKES, MECHANISMS, OUTSIDE, Asked, Made, make, places
 from experiments.sweep import Study, study_options
 from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.ground.arrays import Array
@@ -62,9 +62,10 @@ class Size:
     outside: int = 12
     pair: int = 120
     triple: int = 60
+    mechanism: int = 24
 
 
-QUICK = Size(sound=40, single=3, orders=10, outside=3, pair=16, triple=8)
+QUICK = Size(sound=40, single=3, orders=10, outside=3, pair=16, triple=8, mechanism=4)
 
 
 def plan(seed: int, size: Size) -> list[Asked]:
@@ -81,6 +82,9 @@ def plan(seed: int, size: Size) -> list[Asked]:
             effects = rng.choice(sorted({law.partition("/")[0] for law in INSIDE}), count, False)
             laws = [str(rng.choice([i for i in INSIDE if i.startswith(e)])) for e in effects]
             cases.append(some_cases(rng, condition, laws, CLEAR))
+    for law in MECHANISMS:
+        powers = (*CLEAR, 5000.0)
+        cases += [some_cases(rng, "mechanism", (law,), powers) for _ in range(size.mechanism)]
     return [replace(case, seed=1_000_000 * seed + i) for i, case in enumerate(cases)]
 
 
@@ -210,6 +214,7 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
     sound, plain = of("sound"), [row for row in of("single", "orders") if separable(row)]
     orders = [row for row in of("orders") if separable(row)]
     beyond = [row for row in of("outside") if row["left"] >= SEEN]
+    mechanisms = [row for row in of("mechanism") if row["left"] >= SEEN]
     pairs, triples = ([row for row in of(c) if separable(row)] for c in ("pair", "triple"))
 
     def named(row: Row) -> bool:
@@ -230,6 +235,13 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
                   lambda r: r["verdict"] == "unknown", 0.90),
         Criterion("  named for sure", "outside, but named", beyond,
                   lambda r: r["verdict"] == "named", 0.05, False),
+        Criterion("mechanisms and memories, likewise: unknown or not repeatable",
+                  "not unknown", mechanisms,
+                  lambda r: r["verdict"] in ("unknown", "not_repeatable"), 0.80),
+        Criterion("  none", "mechanism, but none", mechanisms,
+                  lambda r: r["verdict"] == "none", 0.08, False),
+        Criterion("  named for sure", "mechanism, but named", mechanisms,
+                  lambda r: r["verdict"] == "named", 0.08, False),
         Criterion("two causes, separable: right", "pair", pairs, right, 0.95),
         Criterion("three causes, separable: right", "triple", triples, right, 0.80),
         Criterion("of all verdicts named, false", "", [r for r in rows if r["verdict"] == "named"],

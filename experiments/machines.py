@@ -268,6 +268,62 @@ def swaying(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
     return replace(rigid(world), base=base)
 
 
+# ---- mechanisms and memories: directions and pasts that no law of one joint's pose has -----------
+
+
+def loose_plate(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """The target plate rocks as one body on its bolts, and reaches its stops soon."""
+    pose = frames(world.robot, world.q)
+    down = -np.einsum("mji,j->mi", pose[:, -1, :3, :3], world.robot.up)
+    seated = np.tanh(3.0 * down)
+    tool = np.concatenate([seated @ rng.normal(size=(3, 3)),
+                           0.1 * (down * down) @ rng.normal(size=(3, 3))], axis=1)  # fmt: skip
+    return replace(rigid(world), tool=tool)
+
+
+def bearing_clearance(world: World, cause: Cause, _: np.random.Generator) -> Deviation:
+    """A joint's axis tilts with the moment across it until the bearing's clearance is used up."""
+    i = number(cause.place)
+    pose = frames(world.robot, world.q)
+    moment = load(world.robot, pose, i, pose[:, i, :3, 3])[1]
+    across = np.einsum("mji,mj->mi", pose[:, i + 1, :3, :3], moment)
+    axis = np.einsum("mji,mj->mi", pose[:, i + 1, :3, :3], pose[:, i, :3, 2])
+    across = across - np.sum(across * axis, axis=1, keepdims=True) * axis
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    links = np.zeros((*world.q.shape, 6))
+    links[:, i, :3] = across / np.maximum(size, 1e-12) * np.tanh(2.0 * size / max(size.max(), 1e-9))
+    return replace(rigid(world), links=links)
+
+
+def settling_base(world: World, _: Cause, rng: np.random.Generator) -> Deviation:
+    """The foot follows the overturning moments of the last dozen poses."""
+    pose = frames(world.robot, world.q)
+    moment = load(world.robot, pose, 0, np.zeros((len(pose), 3)))[1]
+    past, fade = np.zeros_like(moment), np.zeros(3)
+    keep = rng.uniform(0.8, 0.92)
+    for row, now in enumerate(moment):
+        past[row] = fade = keep * fade + (1.0 - keep) * now
+    base = np.zeros((len(pose), 6))
+    base[:, :3] = past
+    return replace(rigid(world), base=base)
+
+
+def hysteresis(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A gear that winds up in its friction: it remembers where its joint last turned back."""
+    i, wound = number(cause.place), 0.0
+    most = rng.uniform(0.8, 1.6) * float(np.median(np.abs(world.move[:, i])))
+    out = []
+    for move in world.move[:, i]:
+        wound = float(np.clip(wound + move, -most, most))
+        out.append(-wound)
+    return at_joint(world, i, np.array(out))
+
+
+def two_seats(world: World, cause: Cause, rng: np.random.Generator) -> Deviation:
+    """A joint that comes to rest on one of two seats, whichever it happens to be."""
+    return at_joint(world, number(cause.place), rng.choice((-1.0, 1.0), len(world.q)))
+
+
 LAWS: dict[str, Law] = {
     **{name: gap_cases.LAWS[name] for name in (
         "joint_compliance", "link_bending", "gear_error", "encoder_gain", "backlash", "settling",
@@ -289,8 +345,16 @@ LAWS: dict[str, Law] = {
     "outside_cable": cable,
     "outside_sway": swaying,
 }  # fmt: skip
+MECHANISMS: dict[str, Law] = {
+    "outside_plate": loose_plate,
+    "outside_clearance": bearing_clearance,
+    "outside_settling_base": settling_base,
+    "outside_hysteresis": hysteresis,
+    "outside_seats": two_seats,
+}
 OUTSIDE = tuple(law for law in LAWS if "outside" in law)
-INSIDE = tuple(law for law in LAWS if law not in OUTSIDE and law != "joint_compliance/hardening")
+LAWS |= MECHANISMS
+INSIDE = tuple(law for law in LAWS if "outside" not in law and law != "joint_compliance/hardening")
 
 
 def places(law: str, make: str, targets: int) -> tuple[str, ...]:
@@ -315,6 +379,9 @@ def places(law: str, make: str, targets: int) -> tuple[str, ...]:
         "outside_cubic": loaded,
         "outside_field": ("all",),
         "outside_sway": ("all",),
+        "outside_plate": ("all",) if targets > 1 else (),
+        "outside_clearance": loaded,
+        "outside_settling_base": ("frame",) if loaded else (),
     }
     return some.get(effect, joints)
 
