@@ -22,9 +22,10 @@ from minimax_cal.cli.options import (
     result_options,
 )
 from minimax_cal.cli.stderr import AS_JSON, tell
-from minimax_cal.correcting.compensate import cells_of, compensate
+from minimax_cal.correcting.compensate import compensate
 from minimax_cal.correcting.programs.program import LANGUAGES, is_program, read_program
 from minimax_cal.correcting.target_file import read_targets
+from minimax_cal.fitting.opened import open_result
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
@@ -59,7 +60,9 @@ HOW = "How targets are corrected"
     ),
     lever=Option("What a radian counts as [default: the targets' own].", "mm", group=HOW),
     clock=Option(
-        "Take effects of time as at this moment of the calibration's session, 0 to 1.", group=HOW
+        "Correct what follows the session's time too, as at this moment of it, 0 to 1 [default: "
+        "not at all].",
+        group=HOW,
     ),
 )
 @plain_option(
@@ -143,10 +146,10 @@ def check_alike(targets: Path, out: Path | None) -> None:
 
 def nominal_of(fit: Path, rung: int | None) -> Robot:
     """The arm that the controller believes in.  Raises CalibrationError."""
-    _, robot, _ = cells_of(fit, rung)
-    if robot is None:
+    nominal = open_result(fit, rung).nominal
+    if nominal is None:
         raise CalibrationError(f"{fit}: does not tell its nominal robot; give --robot")
-    return robot
+    return nominal.robot
 
 
 def on_terminal(text: str) -> str:

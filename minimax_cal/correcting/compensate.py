@@ -6,6 +6,7 @@ joints bring the calibrated arm, effects included, to that pose [docs/compensate
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, Figures, delivered
 from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -40,7 +42,8 @@ class Compensation:
     q: (m, n) corrected, commanded: (m, n) as given [rad, m].  distance, angle: (m,) what remains
     of the flange pose by the calibrated model [m, rad]; distance_before, angle_before: without
     correction.  outcome: m words.  sliding: (n,).  line: (m,) line of the file.
-    frame: how the nominal arm was placed.  notices: what the reader should know.
+    frame: how the nominal arm was placed.  notices: what the reader should know.  delivered: the
+    arm that was corrected for, and how well it does; None where nobody asked.
     """
 
     q: Array
@@ -55,6 +58,12 @@ class Compensation:
     name: str
     frame: str
     notices: tuple[str, ...]
+    delivered: Delivered | None = None
+
+    @property
+    def expected(self) -> Figures:
+        """What the arm misses by once its targets are corrected: measured, not by the model."""
+        return self.delivered.figures if self.delivered else Figures()
 
     @property
     def failed(self) -> Array:
@@ -64,12 +73,19 @@ class Compensation:
     def tables(self) -> tuple[Table, ...]:
         """What the correction does, how targets ended, and by how much each joint changes."""
         rows: list[tuple[TableCell, ...]] = []
-        for title, distance, angle in (
-            ("as commanded", self.distance_before, self.angle_before),
-            ("corrected", self.distance, self.angle),
-        ):
-            sizes = [f(1e3 * part) for part in (distance, angle) for f in (rms, np.max)]
-            rows.append((title, len(self.q), *map(float, sizes)))
+        missed, expected = self.failed, self.expected
+        for title, which, distance, angle in (
+            ("as commanded", np.ones(len(self.q), dtype=bool), self.distance_before,
+             self.angle_before),
+            ("missed, by the model", missed, self.distance, self.angle),
+        ):  # fmt: skip
+            if which.any():
+                sizes = [f(1e3 * part[which]) for part in (distance, angle) for f in (rms, np.max)]
+                rows.append((title, int(which.sum()), *map(float, sizes)))
+        if not math.isnan(expected.rms):
+            count = int((~missed).sum())
+            mm = (expected.rms, expected.largest)
+            rows.append(("corrected, on the arm", count, *mm, math.nan, math.nan))
         header = ("joints", "targets", "RMS mm", "max mm", "RMS mrad", "max mrad")
         formats = ("", "d", *[".4f"] * 4)
         title = f"{self.name}: error of the flange ({self.frame})"
@@ -89,17 +105,25 @@ class Compensation:
 
     def headline(self) -> str:
         """The result in a sentence."""
-        missed, count = self.failed, len(self.q)
-        sets = [(f"{count - int(missed.sum())} of {count} targets", ~missed),
-                (f"{int(missed.sum())} missed", missed)]  # fmt: skip
-        each = [
-            f"{who}: largest error {1e3 * self.distance_before[which].max():.3f} mm, "
-            f"{1e3 * self.angle_before[which].max():.3f} mrad -> "
-            f"{1e3 * self.distance[which].max():.3f} mm, {1e3 * self.angle[which].max():.3f} mrad"
-            for who, which in sets
-            if which.any()
-        ]
-        return f"{'; '.join(each)}, as the calibrated model sees it."
+        missed, count, said = self.failed, len(self.q), list[str]()
+        if not missed.all():
+            far, turned = (1e3 * part[~missed].max() for part in self.before)
+            said.append(
+                f"{count - int(missed.sum())} of {count} targets corrected, which are off by up to "
+                f"{far:.3f} mm, {turned:.3f} mrad as commanded"
+            )
+        if missed.any():
+            far, turned = (1e3 * part[missed].max() for part in (self.distance, self.angle))
+            said.append(
+                f"{int(missed.sum())} missed, which stay off by up to {far:.3f} mm, "
+                f"{turned:.3f} mrad"
+            )
+        return f"{'; '.join(said)}. Expect on the arm: {self.expected.sentence()}."
+
+    @property
+    def before(self) -> tuple[Array, Array]:
+        """Distance and angle of each target as commanded: (m,) [m] and (m,) [rad]."""
+        return self.distance_before, self.angle_before
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
@@ -125,6 +149,7 @@ class Compensation:
             "robot": self.name,
             "frame": self.frame,
             "missed": int(self.failed.sum()),
+            "delivered": self.delivered.to_dict() if self.delivered else None,
             "targets": [
                 {
                     "line": int(self.line[i]),
@@ -150,7 +175,7 @@ def compensate(
     tolerance: float = 1e-5,
     most_change: float = np.pi / 36.0,
     lever: float = np.nan,
-    clock: float = 0.0,
+    clock: float = np.nan,
     rung: int | None = None,
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
@@ -161,21 +186,27 @@ def compensate(
     that of the fit unless given.  frame: where the nominal arm stands, one of FRAMES.  tolerance:
     of the position, and of the orientation times the lever [m].  most_change: of a joint [rad; half
     as many m for a slide].  lever: what a radian counts as [m], NaN for the targets' own.  clock:
-    moment of the calibration's session, 0 to 1, that effects of time are taken at.  rung: of a
-    diagnosis, the last unless given.  Raises CalibrationError for wrong input.
+    the moment of the calibration's session, 0 to 1, that the arm is in: what follows that session's
+    time is then corrected as it was at that moment, and not at all where NaN.  rung: of a
+    diagnosis, the last unless given, of which the confirmed effects count.  The arm is fitted again
+    for exactly the effects that joints can correct (`deliver`).  Raises CalibrationError for wrong
+    input.
 
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)
     nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
-    cell, robot, drawn = cells_of(fit, rung)
+    known = open_result(fit, rung)
+    made = delivered(known, COMPENSATED, None if np.isnan(clock) else clock)
+    cell, drawn = made.cell, made.nominal if known.placed else None
+    robot = made.nominal.robot if made.nominal else None
     if nominal is not None and not (robot and same(nominal, robot)):
         robot, drawn = nominal, None
     if robot is None:
         source = fit if isinstance(fit, (str, Path)) else "the fit"
         raise CalibrationError(f"{source}: does not tell its nominal robot; give nominal=")
     check_like(robot, cell.robot)
-    arm, data = arm_of(cell), path_of(targets, cell.robot, clock)
+    arm, data = arm_of(cell), path_of(targets, cell.robot, 0.0 if np.isnan(clock) else clock)
     base, tool, said = placed(cell, arm, robot, drawn, frame)
     goal = base @ robot.pose(data.q) @ tool
     lever = lever_of(cell) if np.isnan(lever) else lever
@@ -195,7 +226,13 @@ def compensate(
         line=data.line,
         name=cell.robot.name,
         frame=frame,
-        notices=(*data.notices, *said, *remarks(cell, arm, data)),
+        notices=(
+            *data.notices,
+            *said,
+            *remarks(arm, data),
+            *([made.sentence()] if made.lacks else ()),
+        ),
+        delivered=made,
     )
 
 
@@ -210,16 +247,8 @@ def check_choices(
             raise OptionError(f"{name} {value:g}: must be positive and finite")
     if lever <= 0.0 or lever > FARTHEST:
         raise OptionError(f"lever {lever:g} m: must be positive and finite, at most {FARTHEST:g}")
-    if not 0.0 <= clock <= 1.0:
+    if not (np.isnan(clock) or 0.0 <= clock <= 1.0):
         raise OptionError(f"clock {clock:g}: give 0 (start of the session) to 1 (its end)")
-
-
-def cells_of(source: Result, rung: int | None) -> tuple[Cell, Robot | None, Cell | None]:
-    """The calibrated cell; the nominal robot, and its cell, where the result tells them."""
-    known = open_result(source, rung)
-    nominal = known.nominal
-    robot = nominal.robot if nominal else None
-    return known.cell, robot, nominal if known.placed else None
 
 
 def same(one: Robot, other: Robot) -> bool:
@@ -272,15 +301,9 @@ def path_of(
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
 
 
-def remarks(cell: Cell, arm: Cell, data: Measurements) -> list[str]:
+def remarks(arm: Cell, data: Measurements) -> list[str]:
     """What the reader should know about effects and limits."""
-    out = limit_notices(cell.robot, data)
-    own = arm.effects.terms
-    left = [t.label for t in cell.effects.terms if t not in own and not t.frees_frames]
-    if left:
-        out.append(
-            f"left out: {', '.join(left)}; they move reflectors or instrument, not the flange"
-        )
+    out = limit_notices(arm.robot, data)
     terms = arm.effects.terms
     timed = [term.label for term in terms if {"constant", "fast", "since"} & term.choice.keys()]
     if timed:

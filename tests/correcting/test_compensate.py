@@ -20,6 +20,7 @@ from minimax_cal.correcting.compensate import (
     compensate,
     path_of,
 )
+from minimax_cal.correcting.deliverable import Delivered, Figures
 from minimax_cal.correcting.target_file import ADDED, read_targets
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.table import NOTHING, Fitted, Term
@@ -355,20 +356,27 @@ def test_tables_hold_what_a_hand_reckons() -> None:
         frame="own",
         notices=(),
     )
+    own = Delivered(
+        "compensate", "geometry", (), (), cell_of(mc.load_robot("ur10")), None,
+        Figures(0.07, 0.2, 0.08, 0.1), Figures(),
+    )  # fmt: skip
+    assert [row[0] for row in found.tables()[0].rows] == ["as commanded", "missed, by the model"]
+    found = replace(found, delivered=own)
     pose, ends, joints = found.tables()
     rms = np.sqrt(12.5)
     assert pose.rows[0] == ("as commanded", 2, *map(pytest.approx, (rms, 4.0, 5.0, 7.0)))
-    small = (1e-3 * rms, 4e-3, 1e-3 * np.sqrt(2.0), 2e-3)
-    assert pose.rows[1] == ("corrected", 2, *map(pytest.approx, small))
+    small = (4e-3, 4e-3, 2e-3, 2e-3)
+    assert pose.rows[1] == ("missed, by the model", 1, *map(pytest.approx, small))
+    assert pose.rows[2][:4] == ("corrected, on the arm", 1, 0.07, 0.2)
     assert ends.rows == (("reached", 1, Outcome.REACHED.advice), ("limit", 1, Outcome.LIMIT.advice))
     assert joints.rows == (
         ("J1", "mrad", pytest.approx(np.sqrt(0.5)), pytest.approx(1.0)),
         ("J2", "mm", pytest.approx(np.sqrt(2.0)), pytest.approx(2.0)),
     )
     assert found.headline() == (
-        "1 of 2 targets: largest error 3.000 mm, 1.000 mrad -> 0.003 mm, 0.000 mrad; "
-        "1 missed: largest error 4.000 mm, 7.000 mrad -> 0.004 mm, 0.002 mrad, "
-        "as the calibrated model sees it."
+        "1 of 2 targets corrected, which are off by up to 3.000 mm, 1.000 mrad as commanded; "
+        "1 missed, which stay off by up to 0.004 mm, 0.002 mrad. Expect on the arm: held-out RMS "
+        "0.070 mm, outside the measured poses 0.080 mm, at worst 0.100 mm."
     )
     assert found.complaint().startswith("1 of 2 targets are missed: limit at line 3: ")
     told = found.to_dict()
