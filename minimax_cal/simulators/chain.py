@@ -171,6 +171,23 @@ def drives(model: Any, actuator: int, joint: int) -> bool:
     return kind == 0 and number == joint
 
 
+def carrier(chain: Chain) -> int:
+    """Id of the body that carries the targets: a tool of ours that sags, else the last one."""
+    found = int(mujoco().mj_name2id(chain.model, mujoco().mjtObj.mjOBJ_BODY, "tool"))
+    last = chain.bodies[-1]
+    ours = found >= 0 and way_holds(chain.model, found, last)
+    return found if ours else last
+
+
+def way_holds(model: Any, body: int, other: int) -> bool:
+    """Whether a body hangs on another."""
+    while body > 0:
+        if body == other:
+            return True
+        body = int(model.body_parentid[body])
+    return False
+
+
 def at_zero(model: Any, joints: Sequence[int]) -> Any:
     """The model's data with the arm at joint values 0, all else as the file has it."""
     data = mujoco().MjData(model)

@@ -1,7 +1,9 @@
 """The parts of an MJCF that make it bend, sag and play as an arm does; written into its tree.
 
 Every spring has a damper of TIME times its stiffness: the simulator takes dampers implicitly, so
-that no spring is too stiff for its timestep, however light what hangs on it.
+that no spring is too stiff for its timestep, however light what hangs on it.  Springs feel all of
+gravity, though its bodies are compensated for the actuators: the compensation counts as an
+actuator's force, and joints that are springs let none pass (`actuatorfrcrange`).
 """
 
 from __future__ import annotations
@@ -19,14 +21,23 @@ from minimax_cal.robots.gravity import G
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import head, inverse, level_to, link, shift, tail
 from minimax_cal.simulators.arm import Arm
+from minimax_cal.simulators.servos import (
+    LEVER,
+    NOTHING,
+    SAG,
+    Drives,
+    Servos,
+    carried,
+    choose_servos,
+    loads,
+)
 
 TIME = 0.02  # in which a spring comes to rest [s]
-SAG = 2e-6  # gravity moves the tool of a joint that gives way to nothing by no more [m]
 ROTOR = 0.01  # inertia of a spring itself, of what it carries: parallel hinges need some
-FOOT = 1e-4  # mass of each weight that makes the tool sag [kg]
-LEVER = 0.1  # its distance from the flange [m]
+FOOT = 1e-5  # mass of each weight that makes the tool sag, which no joint is to feel [kg]
 ANCHOR = 0.3  # distance of the balancing spring's anchor from joint 2 [m]
-NOTHING = 1e-12
+LARGEST = 1e9  # of a force where one side alone is limited [N m]
+PASSES = 1e-12  # of an actuator's force through a joint that is a spring [N m]
 GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
 
 
@@ -37,8 +48,7 @@ class Layout:
     root: of the tree.  names: of the n joints.  bodies: that carry them.  joints: their elements.
     seats: (n, 4, 4) frame of joint i (z its axis, at joint value 0) in its body [m].
     anchors, axes: (n, 3) a point on each joint's axis [m] and its direction, in its body.
-    degrees: whether the file counts angles in degrees.  implicit: whether its integrator takes the
-    dampers of servos implicitly, as it does those of joints.
+    degrees: whether the file counts angles in degrees.  drives: the servos that it has.
     """
 
     root: ET.Element
@@ -48,8 +58,8 @@ class Layout:
     seats: Array
     anchors: Array
     axes: Array
+    drives: Drives
     degrees: bool = False
-    implicit: bool = True
 
 
 def numbers(values: ArrayLike) -> str:
@@ -64,6 +74,16 @@ def part(parent: ET.Element, tag: str, **attributes: object) -> ET.Element:
         for key, value in attributes.items()
     }
     return ET.SubElement(parent, tag, text)
+
+
+def known(parent: ET.Element, tag: str, name: str = "", **attributes: object) -> ET.Element:
+    """The element of a name in its parent with other attributes, a new one where there is none."""
+    for element in parent.findall(tag):
+        if element.get("name", "") == name:
+            for key, value in attributes.items():
+                element.set(key, value if isinstance(value, str) else numbers(np.asarray(value)))
+            return element
+    return part(parent, tag, **({"name": name} if name else {}), **attributes)
 
 
 def section(root: ET.Element, tag: str) -> ET.Element:
@@ -81,54 +101,50 @@ def frames(robot: Robot) -> Array:
     return np.array(out)
 
 
-def carried(arm: Arm) -> tuple[Array, Array, Array]:
-    """For each joint: weight beyond it [N], largest lever of that [m], largest inertia [kg m^2]."""
-    robot = arm.robot
-    length = np.abs(robot.mdh[:, :2]).sum(axis=1) + np.linalg.norm(arm.com, axis=1)
-    slide = np.where(robot.prismatic, np.clip(np.abs(robot.upper), 0.0, 2.0), 0.0)
-    reach = np.cumsum((length + slide)[::-1])[::-1] + LEVER
-    mass = np.cumsum(arm.mass[::-1])[::-1]
-    return mass * G, reach, mass * reach**2
-
-
-def gains(arm: Arm) -> Array:
-    """(n,) position gain of each servo: 1/c, or what lets gravity move the tool by SAG at most.
-
-    [N m/rad, N/m]
-    """
-    weight, reach, _ = carried(arm)
-    held = np.where(arm.robot.prismatic, weight, weight * reach**2) / SAG
-    return np.where(arm.turn > NOTHING, 1.0 / np.maximum(arm.turn, NOTHING), held)
-
-
 def damping(stiffness: Array, inertia: Array) -> Array:
     """Dampers that let springs come to rest without swinging [N m s/rad]."""
     return np.asarray(TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia))
 
 
 def equip(layout: Layout, arm: Arm) -> None:
-    """Write the elements of an arm into a tree; its actuators and springs are replaced."""
-    stiffness = gains(arm)
-    servos(layout, arm, stiffness)
-    plays(layout, arm)
+    """Write the elements of an arm into a tree: what bends and plays, and servos that hold it."""
+    servos = choose_servos(arm, layout.drives)
+    compensate_gravity(layout, servos.share)
+    write_servos(layout, arm, servos)
+    flexes(layout, arm, servos)
+    plays(layout, arm, servos.share)
     bends(layout, arm)
     base(layout, arm)
-    balancer(layout, arm, stiffness[1:2])
+    own = np.where(servos.sprung, arm.turn, 0.0)
+    balancer(layout, arm, 1.0 / (1.0 / servos.gain + own)[1:2])
 
 
-def servos(layout: Layout, arm: Arm, stiffness: Array) -> None:
+def compensate_gravity(layout: Layout, share: float) -> None:
+    """Let actuators carry all but a share of the gravity of what the arm moves."""
+    if layout.drives.gravity_free or share < 1.0:
+        for body in layout.bodies[0].iter("body"):
+            body.set("gravcomp", numbers([1.0 - share]))
+    if layout.drives.gravity_free or share == 1.0:
+        return
+    for joint, ends in zip(layout.joints, layout.drives.limits, strict=True):
+        joint.set("actuatorgravcomp", "true")
+        if np.isfinite(ends).any():
+            joint.set("actuatorfrclimited", "true")
+            joint.set("actuatorfrcrange", numbers(np.clip(ends, -LARGEST, LARGEST)))
+
+
+def write_servos(layout: Layout, arm: Arm, servos: Servos) -> None:
     """A position actuator a joint, of its name or of that which drives it now."""
     tendons = ET.Element("tendon")
-    _, _, inertia = carried(arm)
-    damper = damping(stiffness, np.where(arm.robot.prismatic, carried(arm)[0] / G, inertia))
     for i, name in enumerate(layout.names):
         servo = servo_of(layout, name)
         gear = 1.0 / (1.0 + arm.gain[i])
-        if layout.implicit:
-            tune(servo, stiffness[i] / gear**2, damper[i] / gear**2)
-        else:
-            layout.joints[i].set("damping", numbers([damper[i]]))
-            tune(servo, stiffness[i] / gear**2, 0.0)
+        gain, damper = servos.gain[i] / gear**2, servos.damper[i]
+        if not (servos.kept[i] and not arm.gain[i]):
+            if not layout.drives.implicit:
+                layout.joints[i].set("damping", numbers([damper]))
+                damper = 0.0
+            tune(servo, gain, max(damper - layout.drives.own[i], 0.0) / gear**2)
         if arm.gain[i]:
             servo.set("gear", numbers([gear]))
         others = [(j, c) for k, j, c in arm.coupled if k == i]
@@ -166,9 +182,20 @@ def tune(servo: ET.Element, gain: float, damper: float) -> None:
 
 
 def spring(
-    body: ET.Element, name: str, kind: str, at: Array, axis: Array, stiffness: float, inertia: float
+    body: ET.Element,
+    name: str,
+    kind: str,
+    at: Array,
+    axis: Array,
+    stiffness: float,
+    inertia: float,
+    *,
+    loaded: bool = True,
 ) -> ET.Element:
-    """A passive joint with a spring, the last of its body's joints."""
+    """A passive joint with a spring, the last of its body's joints.
+
+    loaded: whether it feels all of gravity, or as much as the actuators do.
+    """
     new = ET.Element(
         "joint",
         {
@@ -178,19 +205,35 @@ def spring(
             "frictionloss": "0", "armature": numbers([ROTOR * inertia]),
         },
     )  # fmt: skip
+    if loaded:
+        new.set("actuatorgravcomp", "true")
+        new.set("actuatorfrclimited", "true")
+        new.set("actuatorfrcrange", numbers([-PASSES, PASSES]))
     places = [i for i, child in enumerate(body) if child.tag == "joint"]
     body.insert(places[-1] + 1 if places else 0, new)
     return new
 
 
-def plays(layout: Layout, arm: Arm) -> None:
+def flexes(layout: Layout, arm: Arm, servos: Servos) -> None:
+    """A spring on the axis of each joint whose servo does not hold its compliance."""
+    _, _, inertia = carried(arm)
+    for i in np.flatnonzero(servos.sprung):
+        spring(
+            layout.bodies[i], f"flex{i + 1}", "slide" if arm.robot.prismatic[i] else "hinge",
+            layout.anchors[i], layout.axes[i], 1.0 / float(arm.turn[i]), float(inertia[i]),
+        )  # fmt: skip
+
+
+def plays(layout: Layout, arm: Arm, share: float) -> None:
     """A hinge with stops half the play away on either side, and a spring that holds it."""
-    weight, reach, inertia = carried(arm)
+    _, reach, inertia = carried(arm)
+    _, torque = loads(arm)
     for i in np.flatnonzero(arm.play):
         half = 0.5 * abs(arm.play[i])
+        held = max(share * float(torque[i] * reach[i]) / SAG, float(inertia[i]) / TIME**2)
         new = spring(
             layout.bodies[i], f"play{i + 1}", "hinge", layout.anchors[i], layout.axes[i],
-            float(weight[i] * reach[i] ** 2 / SAG), float(inertia[i]),
+            held, float(inertia[i]), loaded=False,
         )  # fmt: skip
         new.set("limited", "true")
         ends = np.array([-1.01, 1.01]) * half  # the spring ends inside the stops
@@ -279,16 +322,22 @@ def balancer(layout: Layout, arm: Arm, stiffness: Array) -> None:
 def targets(layout: Layout, arm: Arm, names: Sequence[str]) -> None:
     """The flange, and a site for each target on the tool."""
     end = layout.seats[-1] @ tail(arm.robot.mdh[-1])
-    mark(layout.bodies[-1], "flange", end)
+    mark(layout, layout.bodies[-1], "flange", end)
     soft = bool(np.abs(arm.sag).max() > NOTHING or arm.drawn.max() > 0.0)
     body = sagging(layout.bodies[-1], end, arm) if soft else layout.bodies[-1]
     for name, point in zip(names, arm.spots, strict=True):
-        mark(body, name, shift(*point) if soft else end @ shift(*point))
+        mark(layout, body, name, shift(*point) if soft else end @ shift(*point))
 
 
-def mark(body: ET.Element, name: str, pose: Array) -> None:
-    """A site."""
-    part(body, "site", name=name, pos=pose[:3, 3], quat=quaternion(pose), size=0.005, group="4")
+def mark(layout: Layout, body: ET.Element, name: str, pose: Array) -> None:
+    """A site, moved where its body has one of the name; one on another body gives way."""
+    for other in list(layout.root.iter("body")):
+        for old in [e for e in other if e.tag == "site" and e.get("name") == name]:
+            if other is not body:
+                other.remove(old)
+            for key in ("axisangle", "euler", "xyaxes", "zaxis", "fromto"):
+                old.attrib.pop(key, None)
+    known(body, "site", name, pos=pose[:3, 3], quat=quaternion(pose), size=0.005, group="4")
 
 
 def quaternion(pose: Array) -> Array:

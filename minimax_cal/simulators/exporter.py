@@ -9,9 +9,15 @@ from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
-from minimax_cal.simulators.arm import arm_of, assumed, held_terms
+from minimax_cal.simulators.arm import arm_of, assumed, held_terms, sample
 from minimax_cal.simulators.chain import chain_of
-from minimax_cal.simulators.given import corrected, moved_to, read_model, told_masses
+from minimax_cal.simulators.given import (
+    check_limits,
+    content_for,
+    corrected,
+    read_model,
+    told_masses,
+)
 from minimax_cal.simulators.mjcf import beside, new_tree, text_of, told
 
 
@@ -42,6 +48,7 @@ def correct(job: Job) -> Export:
     )
     own = None if assumed(chain.robot) else told_masses(chain, job.nominal)
     arm = arm_of(job.cell, job.q, own)
-    tree, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
-    content = text_of(moved_to(tree, given.folder, job.path))
+    check_limits(chain, sample(job.robot) if job.q is None else job.q, given.source)
+    document, notices = corrected(given, chain, job.nominal, arm, job.cell.target_names)
+    content = content_for(document, given.folder, job.path)
     return Export(content, (*notices, *told(arm)), beside(job.cell, arm))

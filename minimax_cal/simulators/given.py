@@ -1,6 +1,6 @@
 """A given MJCF with the bodies, gains and springs of the calibrated arm; all else stays.
 
-Includes are written out, because a change may lie in any of them.  Each body keeps its place
+Each body keeps its place
 relative to its own joint axis, so meshes, masses and side branches move with the corrected axis.
 """
 
@@ -23,6 +23,7 @@ from minimax_cal.ground.errors import RobotError
 from minimax_cal.ground.files import read_raw
 from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
 from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import SAME, difference, head, inverse
 from minimax_cal.robots.urdf_file import ASSUMED, parse_xml, walk
 from minimax_cal.simulators.arm import Arm, assumed, stiff
@@ -35,13 +36,13 @@ from minimax_cal.simulators.chain import (
     own_pose,
     shifted,
 )
+from minimax_cal.simulators.document import NESTED, NESTED_TOO_DEEP, Document, read_document
 from minimax_cal.simulators.elements import Layout, equip, numbers, quaternion, targets
-from minimax_cal.simulators.mjcf import weigh
+from minimax_cal.simulators.mjcf import text_of, weigh
+from minimax_cal.simulators.servos import SAMPLES, Drives
 
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 IMPLICIT = (2, 3)  # mjINT_IMPLICIT, mjINT_IMPLICITFAST
-DEEPEST = 20  # includes within includes
-NESTED = 100  # elements within elements
 MOST = {  # what a model of an arm and its cell may hold, and what it is called
     "elements": (10_000.0, "elements, replicated ones too"),
     "body": (1_000.0, "bodies"),
@@ -54,15 +55,20 @@ MOST = {  # what a model of an arm and its cell may hold, and what it is called
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """A model's file.  tree: with its includes written out.  folder: where its assets are.
+    """A model's file.  document: with all that it includes.  folder: where its assets are.
 
     assumed: whether it says itself that its masses are.
     """
 
     source: str
-    tree: ET.Element
+    document: Document
     folder: Path
     assumed: bool = False
+
+    @property
+    def tree(self) -> ET.Element:
+        """The root of its tree."""
+        return self.document.root
 
     def compiled(self, tree: ET.Element | None = None) -> Any:
         """The model as MuJoCo sees it.  Raises RobotError."""
@@ -85,12 +91,13 @@ def read_model(path: Path | str) -> Given:
     top = parse_xml(raw, str(path))
     if top.tag == "robot":
         marked = any(ASSUMED in element.attributes for element in walk(top))
-        return Given(str(path), from_urdf(path), path.parent, marked)
+        tree = from_urdf(path, with_limits=not marked)
+        return Given(str(path), Document(tree), path.parent, marked)
     if top.tag != "mujoco":
         raise RobotError(f"{path}: is neither MJCF nor URDF: its root is <{top.tag}>")
-    tree = written_out(path, path.parent, 0)
-    check_size(tree, str(path))
-    return Given(str(path), tree, path.parent)
+    document = read_document(path)
+    check_size(document.root, str(path))
+    return Given(str(path), document, path.parent)
 
 
 def check_size(tree: ET.Element, source: str) -> None:
@@ -103,7 +110,7 @@ def check_size(tree: ET.Element, source: str) -> None:
         element, times, depth = stack.pop()
         tag = str(element.tag)
         if depth > NESTED:
-            raise RobotError(f"{source}: elements within elements, {NESTED} deep: no arm is so")
+            raise RobotError(f"{source}: {NESTED_TOO_DEEP}")
         times *= product(element.get("count"))
         told = {"elements": times, tag: times}
         if tag == "joint" and element.get("type") == "free":
@@ -132,38 +139,11 @@ def product(text: str | None) -> float:
         return 1.0
 
 
-def parsed(path: Path) -> ET.Element:
-    """An XML file with its comments; document types are refused."""
-    raw = read_raw(path, kind=RobotError)
-    parse_xml(raw, str(path))
-    try:
-        return ET.fromstring(raw, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    except ET.ParseError as error:  # an encoding that is not the declared one
-        raise RobotError(f"{path}: is not XML ({error})") from error
+def from_urdf(path: Path, *, with_limits: bool) -> ET.Element:
+    """A URDF as MJCF, its bodies with all the digits that MuJoCo's own writer leaves out.
 
-
-def written_out(path: Path, folder: Path, depth: int) -> ET.Element:
-    """A file with what it includes in the place of each <include>."""
-    if depth > DEEPEST:
-        raise RobotError(f"{path}: includes itself")
-    root = parsed(path)
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag != "include":
-                continue
-            name = child.get("file", "")
-            found = next((p / name for p in (folder, path.parent) if (p / name).is_file()), None)
-            if found is None:
-                raise RobotError(f"{path}: includes {name!r}, which is not there")
-            at = list(parent).index(child)
-            parent.remove(child)
-            for i, part in enumerate(written_out(found, folder, depth + 1)):
-                parent.insert(at + i, part)
-    return root
-
-
-def from_urdf(path: Path) -> ET.Element:
-    """A URDF as MJCF, its bodies with all the digits that MuJoCo's own writer leaves out."""
+    with_limits: whether its limits of effort are any; beside assumed masses they are not.
+    """
     try:
         spec = mujoco().MjSpec.from_file(str(path))
         model = spec.compile()
@@ -178,12 +158,20 @@ def from_urdf(path: Path) -> ET.Element:
         if element.get("name"):
             joint = model.joint(element.get("name")).id
             element.set("axis", numbers(model.jnt_axis[joint]))
+        if not with_limits:
+            element.attrib.pop("actuatorfrcrange", None)
     return root
 
 
 def assets_from(tree: ET.Element, folder: Path) -> ET.Element:
     """A copy whose assets are looked for where the given file had them."""
     tree = deepcopy(tree)
+    find_assets(tree, folder)
+    return tree
+
+
+def find_assets(tree: ET.Element, folder: Path) -> None:
+    """Tell a tree where its assets are."""
     compilers = [c for c in tree if c.tag == "compiler"]
     if not compilers:
         compilers = [ET.Element("compiler")]
@@ -194,15 +182,21 @@ def assets_from(tree: ET.Element, folder: Path) -> ET.Element:
         place = os.path.join(folder, (told[-1] if told else shared) or "")
         for compiler in compilers:
             compiler.set(name, place)
-    return tree
 
 
-def moved_to(tree: ET.Element, source: Path, path: Path | None) -> ET.Element:
-    """The tree for a file at path: as it is beside the given one, else with its asset folders."""
+def content_for(document: Document, source: Path, path: Path | None) -> bytes:
+    """The file of a changed document at path: beside the given one its text but for the changes.
+
+    Elsewhere it says where its assets are, and what it includes is written out.
+    source: folder of the given file.
+    """
     here = source.resolve()
-    if path is None or path.resolve().parent == here or not any(e.get("file") for e in tree.iter()):
-        return tree
-    return assets_from(tree, Path(os.path.relpath(here, path.resolve().parent)))
+    away = path is not None and path.resolve().parent != here
+    if away and path is not None and any(e.get("file") for e in document.root.iter()):
+        find_assets(document.root, Path(os.path.relpath(here, path.resolve().parent)))
+    if not document.pieces:
+        return text_of(document.root)
+    return document.raw(whole=away)
 
 
 def told_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array]:
@@ -218,8 +212,8 @@ def told_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array]:
 
 def corrected(
     given: Given, chain: Chain, nominal: Robot, arm: Arm | None, names: Sequence[str] = ()
-) -> tuple[ET.Element, tuple[str, ...]]:
-    """A copy of the tree with an arm in it, and notices.
+) -> tuple[Document, tuple[str, ...]]:
+    """A copy of the model with an arm in it, and notices.
 
     nominal: the robot that the model is.  arm: None for the nominal one, that nothing bends.
     names: of the targets that become sites.
@@ -231,27 +225,45 @@ def corrected(
             f"{given.source} and the nominal robot differ by up to {1e3 * misfit:.3g} mm or mrad: "
             "the written model follows the calibrated robot"
         )
-    tree = deepcopy(given.tree)
+    document = given.document.copy()
+    tree = document.root
     robot = arm.robot if arm else nominal
     foot = base @ arm.mount if arm else base
     layout = seats(given, tree, chain, (nominal, base), (robot, foot))
     if arm and not chain.gravity and (arm.turn.any() or arm.base or arm.bend):
         raise RobotError(f"{given.source}: has no gravity, so nothing in it can sag; give it some")
-    if arm and any("gravcomp" in body.attrib for body in tree.iter("body")):
-        notices.append(f"{given.source}: gravcomp of its bodies is set to 0, or nothing would sag")
-        for body in tree.iter("body"):
-            body.attrib.pop("gravcomp", None)
     if arm and assumed(chain.robot):  # a file of ours: it has no masses of its own
         ours(layout, arm)
     held = stiff(nominal, masses_of(chain.robot, LEAST_MASS))
     arm = in_gravity(arm, chain.gravity) if arm else held
     equip(layout, arm)
-    for parent in list(tree.iter("body")):
-        for site in [e for e in parent if e.tag == "site" and e.get("name") in ("flange", *names)]:
-            parent.remove(site)
     if names:
         targets(layout, arm, names)
-    return tree, tuple(notices)
+    lengthen_keys(given, tree, chain.model)
+    return document, tuple(notices)
+
+
+def lengthen_keys(given: Given, tree: ET.Element, model: Any) -> None:
+    """Give the springs that a tree has now their places in its keyframes, at 0.
+
+    model: as it was.
+    """
+    keys = [key for part in tree.findall("keyframe") for key in part]
+    if not keys:
+        return
+    bare = deepcopy(tree)
+    for section in bare.findall("keyframe"):
+        bare.remove(section)
+    after, old = given.compiled(bare), {model.joint(j).name for j in range(model.njnt)}
+    new = [j for j in range(after.njnt) if after.joint(j).name and after.joint(j).name not in old]
+    for name, size, starts in (("qpos", model.nq, after.jnt_qposadr),
+                               ("qvel", model.nv, after.jnt_dofadr)):  # fmt: skip
+        for key in keys if new else ():
+            values = key.get(name, "").split()
+            if len(values) == size:  # otherwise MuJoCo has refused it, or there are none
+                for joint in new:
+                    values.insert(int(starts[joint]), "0")
+                key.set(name, " ".join(values))
 
 
 def ours(layout: Layout, arm: Arm) -> None:
@@ -325,9 +337,78 @@ def seats(
         seats=np.array(out),
         anchors=np.array([model.jnt_pos[j] for j in chain.joints]),
         axes=np.array([model.jnt_axis[j] for j in chain.joints]),
-        implicit=int(model.opt.integrator) in IMPLICIT,
+        drives=drives_of(chain),
         degrees=compiler_of(given).get("angle", "degree") == "degree",
     )
+
+
+def drives_of(chain: Chain) -> Drives:
+    """The servos of a model as MuJoCo sees them."""
+    model, n = chain.model, len(chain.joints)
+    gain, damper, own = np.zeros(n), np.zeros(n), np.zeros(n)
+    limits = np.array([[-np.inf, np.inf]] * n)
+    for i, joint in enumerate(chain.joints):
+        own[i] = model.dof_damping[model.jnt_dofadr[joint]]
+        if model.jnt_actfrclimited[joint]:
+            limits[i] = model.jnt_actfrcrange[joint]
+        servo = chain.servo(joint)
+        if servo < 0:
+            continue
+        gear = float(model.actuator_gear[servo, 0])
+        gain[i] = -model.actuator_biasprm[servo, 1] * gear**2
+        damper[i] = -model.actuator_biasprm[servo, 2] * gear**2
+        if model.actuator_forcelimited[servo]:
+            ends = np.sort(model.actuator_forcerange[servo] * gear)
+            limits[i] = max(limits[i, 0], ends[0]), min(limits[i, 1], ends[1])
+    floating = model.body_gravcomp[list(chain.bodies)] > 0.0
+    free = bool(floating.any() and not model.jnt_actgravcomp[list(chain.joints)].any())
+    return Drives(
+        gain, damper + own, own, limits, largest_inertia(chain), float(model.opt.timestep), free,
+        int(model.opt.integrator) in IMPLICIT,
+    )  # fmt: skip
+
+
+def check_limits(chain: Chain, q: Array, source: str) -> None:
+    """Raise RobotError where gravity alone asks for more than a joint's force limit.
+
+    q: (m, n) poses that the arm is to hold [rad, m].
+    """
+    drives, (model, mj) = drives_of(chain), (chain.model, mujoco())
+    if drives.gravity_free:
+        return
+    data = mj.MjData(model)
+    at = [int(model.jnt_qposadr[joint]) for joint in chain.joints]
+    dofs = [int(model.jnt_dofadr[joint]) for joint in chain.joints]
+    for row in q:
+        data.qpos[at] = row
+        mj.mj_forward(model, data)
+        needed = data.qfrc_bias[dofs]
+        short = (needed <= drives.limits[:, 0]) | (needed >= drives.limits[:, 1])
+        if short.any():
+            i = int(np.argmax(short))
+            unit = "N" if chain.robot.prismatic[i] else "N m"
+            most = float(np.abs(drives.limits[i]).min())
+            raise RobotError(
+                f"{source}: joint {chain.names[i]}: gravity asks for {abs(needed[i]):.4g} {unit} at"
+                f" a measured pose, its force limit is {most:.4g} {unit}; raise the limit "
+                "(forcerange), or mend the masses"
+            )
+
+
+def largest_inertia(chain: Chain) -> Array:
+    """(n,) about each joint, its motor's with it, over poses all over the workspace [kg m^2]."""
+    model, mj = chain.model, mujoco()
+    data, column = mj.MjData(model), np.zeros(model.nv)
+    at = [int(model.jnt_qposadr[joint]) for joint in chain.joints]
+    dofs = [int(model.jnt_dofadr[joint]) for joint in chain.joints]
+    out = np.zeros(len(dofs))
+    for row in random_joints(chain.robot, (SAMPLES,), np.random.default_rng(0)):
+        data.qpos[at] = row
+        mj.mj_forward(model, data)
+        for i, unit in enumerate(np.eye(model.nv)[dofs]):
+            mj.mj_mulM(model, data, column, unit)
+            out[i] = max(out[i], column[dofs[i]])
+    return out
 
 
 def compiler_of(given: Given) -> dict[str, str]:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from minimax_cal.fitting.options import Progress, silent
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
-from minimax_cal.ground.stages import count_stage
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
@@ -28,17 +27,27 @@ from minimax_cal.simulators.arm import Arm, arm_of, assumed, unheld
 from minimax_cal.simulators.causes import Causes, causes_of
 from minimax_cal.simulators.chain import Chain, chain_of, mujoco
 from minimax_cal.simulators.commands import Commands
-from minimax_cal.simulators.given import Given, corrected, moved_to, read_model, told_masses
-from minimax_cal.simulators.mjcf import beside, text_of, told
+from minimax_cal.simulators.document import Document
+from minimax_cal.simulators.drive import Driven, drive
+from minimax_cal.simulators.given import (
+    Given,
+    check_limits,
+    content_for,
+    corrected,
+    read_model,
+    told_masses,
+)
+from minimax_cal.simulators.mjcf import beside, told
 from minimax_cal.simulators.placing import placed_error
-from minimax_cal.simulators.rest import at_rest
 from minimax_cal.simulators.result import Rung, SimulatorGap
 from minimax_cal.solvers.status import Status
 
 AGREES, AGREES_MM = 0.1, 0.002  # of an error by a fit's formulas, and the simulator's [-, mm]
 WORSE = 0.01  # relative rise of an error that is one
+AT_LIMIT = 0.01  # an arm that follows is at a force limit in no larger share of the timesteps
 COMMANDED = ".commands.xml"  # ending of a model that a command map belongs to
-TRAINING = 200  # poses that place base and targets
+FIRST_MOVES = 4  # that show whether a model is stable
+TRAINING = 100  # poses that place base and targets
 
 
 def simulator_gap(
@@ -72,6 +81,8 @@ def simulator_gap(
     rows = data if isinstance(data, Measurements) else read_measurements(data)
     given = read_model(model)
     chain = chain_of(given.compiled(), rows.q.shape[1], given.source, tip, unknown=given.assumed)
+    check_joints(chain.robot, rows)
+    check_model(chain, rows.q, given.source)
     causes = causes_of(chain, rows, fit, diagnosis, (holdout, seed), progress)
     if not causes.held.any():
         raise OptionError(f"{causes.data.source}: no pose is held out; give holdout=0.2")
@@ -101,6 +112,17 @@ def simulator_gap(
         provenance=Provenance.of(chain.robot, rows, {"model": str(model), "holdout": holdout,
                                                      "seed": seed}),
     )  # fmt: skip
+
+
+def check_model(chain: Chain, q: Array, source: str) -> None:
+    """Raise RobotError for a model that cannot hold its own weight, or is unstable.
+
+    Before anything that takes long: some moves show it.
+    """
+    if any(chain.servo(joint) < 0 for joint in chain.joints):
+        return
+    check_limits(chain, q, source)
+    drive(chain, q[:FIRST_MOVES], source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +170,9 @@ class Run:
                 "driven, in the model as given"
             )
             return [replace(first[0], why="joints set, not driven")]
-        tree, notices = corrected(self.given, self.chain, self.nominal.robot, None)
+        document, notices = corrected(self.given, self.chain, self.nominal.robot, None)
         self.notices += notices
-        stiff = self.rung("servo sag removed", self.of(tree), self.nominal)[0]
+        stiff = self.rung("servo sag removed", self.of(document), self.nominal)[0]
         fall = first[0].sag_mrad
         return [
             replace(first[0], why=f"servos give way by up to {fall:.3g} mrad"),
@@ -184,8 +206,8 @@ class Run:
     def last(self, best: Best, path: Path | None) -> Last:
         """The last rung from its file, with targets, and what a command map does."""
         fit, arm, before = best.fit, self.arm(best.fit), best.rungs[-1]
-        tree, notices = self.tree(arm, fit)
-        rung = self.rung(before.name, self.saved(tree, path), fit.cell, arm, fit)[0]
+        document, notices = self.with_arm(arm, fit)
+        rung = self.rung(before.name, self.saved(document, path), fit.cell, arm, fit)[0]
         commands = None
         if best.mapped:
             fit = self.causes.fitted([*fit.cell.effects.terms, *best.mapped])
@@ -196,11 +218,11 @@ class Run:
         notices = (*notices, *told(replace(arm, remainder=0.0, left_out=left_out)))
         return Last(replace(rung, why=before.why), commands, left_out, notices)
 
-    def saved(self, tree: ET.Element, path: Path | None) -> Chain:
+    def saved(self, document: Document, path: Path | None) -> Chain:
         """The arm in a changed tree, from the file where one is written."""
-        content = text_of(moved_to(tree, self.given.folder, path))
+        content = content_for(document, self.given.folder, path)
         if path is None:
-            return self.of(tree)
+            return self.of(document)
         write_whole(path, content)
         return self.chain_in(mujoco().MjModel.from_xml_path(str(path)))
 
@@ -210,7 +232,7 @@ class Run:
         It is another arm than that of the last rung: what commands take over changes the rest.
         """
         model = None if path is None else path.with_suffix(COMMANDED)
-        chain = self.saved(self.tree(whole, fit)[0], model)
+        chain = self.saved(self.with_arm(whole, fit)[0], model)
         if path is not None and model is not None:
             for ending, content in beside(fit.cell, whole).items():
                 write_whole(path.with_suffix(ending), content)
@@ -233,17 +255,17 @@ class Run:
     def fitted(self, name: str, fit: Fit) -> Rung:
         """The simulator with the arm of a fit."""
         arm = self.arm(fit)
-        return self.rung(name, self.of(self.tree(arm, fit)[0]), fit.cell, arm, fit)[0]
+        return self.rung(name, self.of(self.with_arm(arm, fit)[0]), fit.cell, arm, fit)[0]
 
-    def tree(self, arm: Arm, fit: Fit) -> tuple[ET.Element, tuple[str, ...]]:
-        """The model's tree with an arm and its targets in it, and notices."""
+    def with_arm(self, arm: Arm, fit: Fit) -> tuple[Document, tuple[str, ...]]:
+        """The model with an arm and its targets in it, and notices."""
         names = fit.cell.target_names
-        tree, notices = corrected(self.given, self.chain, self.nominal.robot, arm, names)
-        return tree, tuple(notices)
+        document, notices = corrected(self.given, self.chain, self.nominal.robot, arm, names)
+        return document, tuple(notices)
 
-    def of(self, tree: ET.Element) -> Chain:
+    def of(self, document: Document) -> Chain:
         """The arm in a changed tree."""
-        return self.chain_in(self.given.compiled(tree))
+        return self.chain_in(self.given.compiled(document.root))
 
     def chain_in(self, model: Any) -> Chain:
         """The same joints in another compiled model."""
@@ -270,28 +292,44 @@ class Run:
 
         def heard(done: int) -> None:
             if done % 20 == 0 or done == count:
-                self.progress(count_stage(f"{name}:", done, count, " poses"))
+                self.progress(f"{name}: {done} of {count} poses")
 
-        rested = at_rest(chain, q, asked, play, heard)
-        self.tell(name, rested.moving, rested.touching)
+        driven = drive(chain, asked, self.given.source, play, heard)
+        self.tell(name, driven)
         error = placed_error(
-            rested.poses, self.data, ~self.held, guess(start, rested.poses[0], q[0])
+            driven.poses, self.data, ~self.held, guess(start, driven.poses[0], q[0])
         )
         held, train = accuracy(error[:, self.held]), accuracy(error[:, ~self.held])
-        told = fit.accuracy["holdout"].rms_mm if fit and self.causes.same else float("nan")
-        off = np.abs(rested.q - asked)[:, ~chain.robot.prismatic]
-        rung = Rung(name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
-                    1e3 * float(off.max(initial=0.0)), told)  # fmt: skip
-        return rung, rested.driven
+        off = np.abs(driven.q - asked)[:, ~chain.robot.prismatic]
+        rung = Rung(
+            name, held.rms_mm, held.max_mm, train.rms_mm, train.max_mm,
+            1e3 * float(off.max(initial=0.0)), self.predicted(fit),
+            moving_poses=int(driven.moving.sum()), at_limit=float(driven.limited.max()),
+        )  # fmt: skip
+        return rung, driven.driven
 
-    def tell(self, name: str, moving: Array, touching: Array) -> None:
-        """Notices on poses that did not come to rest, or where something touched the arm."""
-        for rows, what in ((moving, "did not come to rest"), (touching, "touched something")):
+    def predicted(self, fit: Fit | None) -> float:
+        """Held-out RMS of the driven poses by the formulas of a fit, NaN where it has others."""
+        if fit is None or not self.causes.same:
+            return float("nan")
+        return accuracy(fit.cell.error(self.data)[:, self.held]).rms_mm
+
+    def tell(self, name: str, driven: Driven) -> None:
+        """Notices on poses that did not come to rest, or where something held the arm up."""
+        for rows, what in (
+            (driven.moving, "did not come to rest within 1.5 s of its move"),
+            (driven.touching, "touched something"),
+        ):
             if rows.any():
                 lines = ", ".join(str(line) for line in self.data.line[rows][:8])
                 self.notices.append(
                     f"{name}: the simulated arm {what} at {rows.sum()} poses (lines {lines})"
                 )
+        for i in np.flatnonzero(driven.limited > AT_LIMIT):
+            self.notices.append(
+                f"{name}: joint {i + 1} is at its force limit in {driven.limited[i]:.0%} of the "
+                "timesteps: raise the limit, or drive more slowly"
+            )
 
 
 def disagreement(rungs: Sequence[Rung]) -> list[str]:

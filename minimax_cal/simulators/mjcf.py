@@ -21,7 +21,8 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import Arm
 from minimax_cal.simulators.chain import ROBOT
-from minimax_cal.simulators.elements import Layout, equip, part, quaternion, targets
+from minimax_cal.simulators.elements import Layout, equip, known, part, quaternion, targets
+from minimax_cal.simulators.servos import Drives
 
 COMMANDS = ".commands.json"
 SEEN = 0.02  # radius of the links that are drawn [m]
@@ -98,15 +99,15 @@ def skeleton(root: ET.Element, arm: Arm) -> Layout:
     axes[:, 2] = robot.sign
     names = tuple(f"joint{i + 1}" for i in range(n))
     seats = np.broadcast_to(np.eye(4), (n, 4, 4))
-    return Layout(root, names, tuple(bodies), tuple(joints), seats, np.zeros((n, 3)), axes)
+    zero, new = np.zeros((n, 3)), Drives.none(n)
+    return Layout(root, names, tuple(bodies), tuple(joints), seats, zero, axes, new)
 
 
 def weigh(body: ET.Element, arm: Arm, i: int) -> None:
     """Give a body whose joint axis is z at its origin the mass of a link."""
-    for old in body.findall("inertial"):
-        body.remove(old)
-    part(body, "inertial", pos=in_link(replace(arm.robot, com=arm.com), i), mass=arm.mass[i],
-         diaginertia=[inertia_of(arm.robot.mdh, i, arm.mass[i])] * 3)  # fmt: skip
+    centre = in_link(replace(arm.robot, com=arm.com), i)
+    known(body, "inertial", pos=centre, mass=arm.mass[i],
+          diaginertia=[inertia_of(arm.robot.mdh, i, arm.mass[i])] * 3)  # fmt: skip
 
 
 def joint_of(robot: Robot, i: int) -> dict[str, object]:

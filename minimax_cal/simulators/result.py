@@ -20,6 +20,7 @@ from minimax_cal.modelling.cell import saved_content
 from minimax_cal.solvers.status import Status
 
 KIND = "simulator_gap"
+HOLDS, HOLDS_MM = 0.1, 0.02  # of an error: a simulator that holds what a fit claims [-, mm]
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class Rung:
 
     why: what is wrong, or what this rung mends.  holdout_*, train_*: distances [mm].  sag_mrad:
     largest that a joint stands from its command.  predicted_rms_mm: held out, by the formulas of
-    the fit, NaN where there is none.
+    the fit, NaN where there is none.  moving_poses: at which the arm did not come to rest.
+    at_limit: largest share of the timesteps at which a joint was at its force limit.
     """
 
     name: str
@@ -39,6 +41,14 @@ class Rung:
     sag_mrad: float
     predicted_rms_mm: float = math.nan
     why: str = ""
+    moving_poses: int = 0
+    at_limit: float = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the simulator does what the formulas of the fit say; True where none do."""
+        off = abs(self.holdout_rms_mm - self.predicted_rms_mm)
+        return not off > max(HOLDS * self.predicted_rms_mm, HOLDS_MM)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -79,6 +89,11 @@ class SimulatorGap:
         """For a notebook."""
         return f"<p>{escape(self.headline())}</p>\n{self.table().html()}"
 
+    @property
+    def holds(self) -> bool:
+        """Whether what was corrected last, and its command map, do what the fit claims."""
+        return self.rungs[-1].holds and (self.commands is None or self.commands.holds)
+
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
         return {
@@ -92,6 +107,7 @@ class SimulatorGap:
             "noise_floor_from": self.floor_from,
             "poses": {"train": self.train_poses, "holdout": self.holdout_poses},
             "status": str(self.status),
+            "holds": self.holds,
             "beyond": dict(self.beyond),
             "left_out": list(self.left_out),
             "notices": list(self.notices),
@@ -181,6 +197,7 @@ class GapPart(Part):
     noise_floor_from: str = ""
     poses: dict[str, int]
     status: Status = Status.CONVERGED
+    holds: bool = True
     beyond: dict[str, Any] = Field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()

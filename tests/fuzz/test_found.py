@@ -409,13 +409,13 @@ def test_a_simulator_keeps_no_log_beside_the_results(
 def test_xml_in_another_encoding_than_it_says_is_refused(code: str, tmp_path: Path) -> None:
     """One of the two parsers that read a model did not mind."""
     pytest.importorskip("mujoco", reason="needs pip install minimax-cal[mujoco]")
-    from minimax_cal.simulators.given import parsed
+    from minimax_cal.simulators.document import read_document
 
     path = tmp_path / "arm.xml"
     other = "utf-8" if code == "utf-16" else "utf-16"
     path.write_bytes(f'<?xml version="1.0" encoding="{other}"?><mujoco/>'.encode(code))
     with pytest.raises(mc.CalibrationError, match=r"arm\.xml"):
-        parsed(path)
+        read_document(path)
 
 
 def test_import_writes_nothing_that_cannot_be_read(

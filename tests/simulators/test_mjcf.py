@@ -196,7 +196,11 @@ def test_turns_without_an_element_go_into_the_commands(tmp_path: Path) -> None:
     data = mujoco.MjData(model)
     for row, point in zip(q, in_base(cell, q), strict=True):
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.ctrl[:] = row, commands(row)
+        for i, (value, asked) in enumerate(zip(row, commands(row), strict=True)):
+            data.joint(f"joint{i + 1}").qpos[0], data.actuator(f"joint{i + 1}").ctrl[0] = (
+                value,
+                asked,
+            )
         mujoco.mj_step(model, data, 1000)
         assert_allclose(data.site("smr1").xpos, point[0], rtol=0, atol=FIRST_ORDER)
     other = tmp_path / "cell.json"

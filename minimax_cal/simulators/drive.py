@@ -1,0 +1,261 @@
+"""A simulated arm driven from pose to pose as a controller would: the judge of every model.
+
+Commands follow a minimum-jerk move of 2 s, or as long as keeps every joint below 1 rad/s (slides:
+0.25 m/s), at the model's own timestep; then the arm has 1.5 s to come to rest.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import RobotError
+from minimax_cal.simulators.chain import Chain, body_pose, carrier, mujoco, way_to
+
+MOVE, REST = 2.0, 1.5  # a move lasts at least, and a rest after it [s]
+FASTEST, FASTEST_SLIDE = 1.0, 0.25  # no joint is commanded faster [rad/s, m/s]
+STILL, STILL_SLIDE = 2e-3, 1e-3  # slower is at rest [rad/s, m/s]
+PEAK = 1.875  # largest speed of a minimum-jerk move of length 1 in time 1
+RUNS = 4  # of neighbouring poses, whatever the machine: its results are those of any other
+LOOKS = 10  # timesteps of a rest between two looks at its forces
+TOUCH = 1e-6  # a smaller force of a contact is none [N]
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """Where an arm was after its moves, row by row.
+
+    poses: (m, 4, 4) of the body that carries the targets, in the world [m].
+    q: (m, n) where the joints were [rad, m].  speed: (m,) largest of all joints, springs with them,
+    as a share of what counts as rest.  limited: (n,) share of the timesteps at which a joint's
+    actuator was at its force limit.  touching: (m,) True where something pressed on the arm.
+    driven: whether servos moved it; else its joints were set.
+    """
+
+    poses: Array
+    q: Array
+    speed: Array
+    limited: Array
+    touching: Array
+    driven: bool
+
+    @property
+    def moving(self) -> Array:
+        """(m,) True where it had not come to rest."""
+        return np.asarray(self.speed > 1.0)
+
+
+def drive(
+    chain: Chain,
+    commands: Array,
+    source: str,
+    play: Array | None = None,
+    progress: Callable[[int], object] = lambda done: None,
+) -> Driven:
+    """Drive an arm from command to command and let it rest at each.
+
+    commands: (m, n) [rad, m].  play: (m, n) where each joint rests in its play [rad].
+    progress: called with the number of poses done.  The poses are dealt out to threads in runs of
+    neighbours; each run begins at rest at the pose before its first one.
+    Raises RobotError where MuJoCo finds that the model is unstable.
+    """
+    servos = np.array([chain.servo(joint) for joint in chain.joints])
+    if (servos < 0).any():
+        return set_joints(chain, commands, play)
+    count = len(commands)
+    runs = np.array_split(np.arange(count), min(RUNS, count))
+    lock, done = Lock(), [0]
+
+    def heard() -> None:
+        with lock:
+            done[0] += 1
+            progress(done[0])
+
+    def one(rows: Array) -> list[Visit]:
+        sides = np.zeros(commands.shape) if play is None else play
+        return visits(chain, servos, commands, sides, rows, source, heard)
+
+    with ThreadPoolExecutor(min(len(runs), os.cpu_count() or 1)) as pool:
+        found = [visit for part in pool.map(one, runs) for visit in part]
+    return Driven(
+        poses=np.array([visit.pose for visit in found]),
+        q=np.array([visit.q for visit in found]),
+        speed=np.array([visit.speed for visit in found]),
+        limited=np.mean([visit.limited for visit in found], axis=0),
+        touching=np.array([visit.touching for visit in found]),
+        driven=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Visit:
+    """One row of `Driven`."""
+
+    pose: Array
+    q: Array
+    speed: float
+    limited: Array
+    touching: bool
+
+
+def visits(
+    chain: Chain,
+    servos: Array,
+    commands: Array,
+    play: Array,
+    rows: Array,
+    source: str,
+    heard: Callable[[], object],
+) -> list[Visit]:
+    """A run of moves, one after the other, with a model of its own."""
+    mj, model = mujoco(), copy(chain.model)
+    chain_here = Chain(model, chain.joints, chain.seen, chain.robot, chain.base, chain.gravity)
+    data, sides = mj.MjData(model), plays(chain_here)
+    at = np.array([int(model.jnt_qposadr[joint]) for joint in chain.joints])
+    moved = way_to(model, carrier(chain_here))
+    dofs = np.array([int(model.jnt_dofadr[joint]) for joint in moved])
+    rest = np.where(model.jnt_type[list(moved)] == 2, STILL_SLIDE, STILL)
+    limits = Limits.of(chain_here, servos)
+    step = float(model.opt.timestep)
+    start = commands[rows[0] - 1]
+    data.qpos[at], data.ctrl[servos] = start, start
+    settle(mj, model, data, limits, round(REST / step))
+    out = []
+    for row in rows:
+        for joint, place in sides.items():
+            model.qpos_spring[place] = play[row, joint]
+        path = moves(start, commands[row], chain.robot.prismatic, step)
+        looks = (
+            move(mj, model, data, servos, path, limits),
+            settle(mj, model, data, limits, round(REST / step)),
+        )
+        check_stable(mj, data, source)
+        (moved_at, moved_for), (rested_at, rested_for) = looks
+        share = (moved_at + rested_at) / (moved_for + rested_for)
+        out.append(Visit(
+            body_pose(data, carrier(chain_here)), np.array(data.qpos[at]),
+            float((np.abs(data.qvel[dofs]) / rest).max()), share,
+            bool(data.ncon) and pressed(mj, model, data),
+        ))  # fmt: skip
+        start = commands[row]
+        heard()
+    return out
+
+
+def moves(start: Array, end: Array, slides: Array, step: float) -> Array:
+    """(steps, n) commands of a minimum-jerk move [Flash and Hogan 1985, eq. 3]."""
+    way = end - start
+    needed = PEAK * np.abs(way) / np.where(slides, FASTEST_SLIDE, FASTEST)
+    count = max(1, round(max(MOVE, float(needed.max(initial=0.0))) / step))
+    t = np.arange(1, count + 1)[:, None] / count
+    return np.asarray(start + way * t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Force limits of the arm's actuators, and of its joints.
+
+    servos, dofs: (n,) ids.  force, torque: (n, 2) limits, infinite where there are none.
+    """
+
+    servos: Array
+    dofs: Array
+    force: Array
+    torque: Array
+
+    @staticmethod
+    def of(chain: Chain, servos: Array) -> Limits:
+        """Those of a model, a little inside, so that rounding does not hide what is at one."""
+        m, joints = chain.model, list(chain.joints)
+        open_ends = np.array([-np.inf, np.inf])
+        force = np.where(m.actuator_forcelimited[servos, None], m.actuator_forcerange[servos],
+                         open_ends)  # fmt: skip
+        torque = np.where(m.jnt_actfrclimited[joints, None], m.jnt_actfrcrange[joints], open_ends)
+        inside = 1.0 - 1e-9
+        return Limits(servos, np.array(m.jnt_dofadr[joints]), force * inside, torque * inside)
+
+    def reached(self, force: Array, torque: Array) -> Array:
+        """(..., n) True where an actuator or its joint is at a limit."""
+        return np.asarray(
+            (force <= self.force[:, 0]) | (force >= self.force[:, 1])
+            | (torque <= self.torque[:, 0]) | (torque >= self.torque[:, 1])
+        )  # fmt: skip
+
+
+def move(
+    mj: Any, model: Any, data: Any, servos: Array, path: Array, limits: Limits
+) -> tuple[Array, int]:
+    """Follow commands, one a timestep; how many of them at each limit, and how many there are."""
+    force, torque = np.empty(path.shape), np.empty(path.shape)
+    for k, command in enumerate(path):
+        data.ctrl[servos] = command
+        mj.mj_step(model, data)
+        force[k], torque[k] = data.actuator_force[servos], data.qfrc_actuator[limits.dofs]
+    return limits.reached(force, torque).sum(axis=0), len(path)
+
+
+def settle(mj: Any, model: Any, data: Any, limits: Limits, count: int) -> tuple[Array, int]:
+    """Stay at a command; the same, from a look every few timesteps."""
+    at_limit, done = np.zeros(len(limits.servos), dtype=int), 0
+    while done < count:
+        steps = min(LOOKS, count - done)
+        mj.mj_step(model, data, steps)
+        found = limits.reached(data.actuator_force[limits.servos], data.qfrc_actuator[limits.dofs])
+        at_limit += steps * found
+        done += steps
+    return at_limit, count
+
+
+def check_stable(mj: Any, data: Any, source: str) -> None:
+    """Raise RobotError where MuJoCo found numbers that no arm has, and began anew."""
+    for kind in (mj.mjtWarning.mjWARN_BADQPOS, mj.mjtWarning.mjWARN_BADQVEL,
+                 mj.mjtWarning.mjWARN_BADQACC):  # fmt: skip
+        if data.warning[int(kind)].number:
+            raise RobotError(
+                f"{source}: the simulation is unstable (MuJoCo: {kind.name}); give its servos "
+                'dampers (kv), a shorter timestep, or <option integrator="implicitfast">'
+            )
+
+
+def set_joints(chain: Chain, commands: Array, play: Array | None) -> Driven:
+    """The same for a model without servos: its joints are set and nothing moves."""
+    model, mj, out = chain.model, mujoco(), []
+    data = mj.MjData(model)
+    at = np.array([int(model.jnt_qposadr[joint]) for joint in chain.joints])
+    for row in range(len(commands)):
+        data.qpos[at] = commands[row]
+        for joint, place in plays(chain).items():
+            data.qpos[place] = 0.0 if play is None else play[row, joint]
+        mj.mj_kinematics(model, data)
+        out.append(body_pose(data, carrier(chain)))
+    count, still = len(commands), np.zeros(len(commands))
+    limited = np.zeros(commands.shape[1])
+    return Driven(np.array(out), commands, still, limited, np.zeros(count, dtype=bool), False)
+
+
+def pressed(mj: Any, model: Any, data: Any) -> bool:
+    """Whether a contact carries force."""
+    force = np.zeros(6)
+    for i in range(data.ncon):
+        mj.mj_contactForce(model, data, i, force)
+        if abs(force[0]) > TOUCH:
+            return True
+    return False
+
+
+def plays(chain: Chain) -> dict[int, int]:
+    """Joint, and where the position in its play is in qpos."""
+    model, out = chain.model, {}
+    for i in range(len(chain.joints)):
+        found = mujoco().mj_name2id(model, mujoco().mjtObj.mjOBJ_JOINT, f"play{i + 1}")
+        if found >= 0:
+            out[i] = int(model.jnt_qposadr[found])
+    return out

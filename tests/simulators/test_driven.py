@@ -1,0 +1,255 @@
+"""Every file that export and gap write holds still and moves, in a loop that shares no code."""
+
+import difflib
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import minimax_cal as mc
+from minimax_cal.correcting.exporters.job import job_of
+from minimax_cal.simulators.exporter import write
+from minimax_cal.simulators.result import SimulatorGap
+from tests.conftest import run
+from tests.problems_mjcf import drive_alone, published_like, ur10_like
+from tests.simulators.test_mjcf import cell_with, in_base, poses, robot_called, with_masses
+
+mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+
+from experiments import simulator_gap as study  # noqa: E402
+from minimax_cal.simulators.chain import chain_of  # noqa: E402
+from minimax_cal.simulators.document import read_document  # noqa: E402
+from minimax_cal.simulators.drive import drive  # noqa: E402
+from minimax_cal.simulators.given import read_model  # noqa: E402
+
+HOLDS, HOLDS_MM = 0.1, 0.02  # of what an effect does, or [mm]
+STILL = 2e-3  # [rad/s]
+SELDOM = 0.01  # of the timesteps at a force limit
+LARGEST_GAIN = 5e5  # that a file of ours may have, for the heaviest arm here [N m/rad]
+
+
+def check_held(
+    path: Path | str, cell: mc.Cell, q: np.ndarray, asked: np.ndarray | None = None
+) -> None:
+    """The contract's drive test: sites where the cell says, at rest, seldom at a limit."""
+    reached = drive_alone(path, q if asked is None else asked, cell.target_names)
+    wanted = in_base(cell, q)[1:]
+    off = 1e3 * np.linalg.norm(reached.sites - wanted, axis=-1)
+    plain = mc.Cell(cell.robot, cell.base, cell.target_names, cell.target_positions)
+    done = 1e3 * np.linalg.norm(in_base(plain, q)[1:] - wanted, axis=-1)
+    assert (off <= np.maximum(HOLDS * done, HOLDS_MM)).all(), off.max()
+    assert reached.speed < STILL
+    assert reached.limited < SELDOM
+
+
+@pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes", "scara_600"])
+def test_a_new_file_holds_still_and_moves(name: str) -> None:
+    robot = with_masses(robot_called(name))
+    cell = cell_with(robot, "joint_compliance:all", "encoder_gain:all", "base_flex:frame",
+                     size=3e-6, base_flex=[2e-7],
+                     encoder_gain=[2e-4] * int((~robot.prismatic).sum()))  # fmt: skip
+    text = write(job_of("cell", cell)).content.decode()
+    check_held(text, cell, poses(robot, 4))
+    model = mujoco.MjModel.from_xml_string(text)
+    assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
+    # joints that are compliant all alike need no springs of their own
+    assert not any(model.joint(j).name.startswith("flex") for j in range(model.njnt))
+
+
+def test_one_compliant_joint_among_stiff_ones_has_a_spring() -> None:
+    robot = with_masses(robot_called("irb2600"))
+    cell = cell_with(robot, "joint_compliance:J2", "link_bending:L1", size=3e-6,
+                     link_bending=[1e-6])  # fmt: skip
+    text = write(job_of("cell", cell)).content.decode()
+    check_held(text, cell, poses(robot, 4))
+    model = mujoco.MjModel.from_xml_string(text)
+    assert model.jnt_stiffness[model.joint("flex2").id] == pytest.approx(1.0 / 3e-6, rel=0.3)
+    assert model.actuator_gainprm[:, 0].max() < LARGEST_GAIN
+
+
+def measured(folder: Path, model: Path) -> mc.Fit:
+    """A fit of a compliant arm that has the masses of a model."""
+    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    truth = mc.Truth(compliance=8e-6)
+    data = mc.simulate(weighs, 40, 3, seed=3, truth=truth).data
+    mc.write_measurements(folder / "poses.csv", data)
+    fit = mc.calibrate(weighs, folder / "poses.csv", "sum", effects="joint_compliance:all")
+    fit.save(folder / "fit.json")
+    return fit
+
+
+@pytest.fixture(scope="module", params=[(5000.0,) * 6, (5000.0,) * 3 + (500.0,) * 3, (500.0,) * 6])
+def case(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, mc.Fit, SimulatorGap]:
+    """A UR10 as published, corrected: its folder, the fit, the gap."""
+    folder = tmp_path_factory.mktemp("ur10")
+    model = ur10_like(folder, request.param)
+    fit = measured(folder, model)
+    gap = mc.simulator_gap(model, folder / "poses.csv", fit=folder / "fit.json",
+                           write=folder / "corrected.xml")  # fmt: skip
+    return folder, fit, gap
+
+
+def test_a_corrected_file_under_its_force_limits_does_what_the_gap_says(
+    case: tuple[Path, mc.Fit, SimulatorGap],
+) -> None:
+    folder, fit, gap = case
+    assert all(rung.at_limit < SELDOM and not rung.moving_poses for rung in gap.rungs[1:])
+    for rung in gap.rungs[2:]:
+        allowed = max(HOLDS * rung.predicted_rms_mm, HOLDS_MM)
+        assert abs(rung.holdout_rms_mm - rung.predicted_rms_mm) < allowed
+    assert gap.holds
+    check_held(folder / "corrected.xml", fit.cell, fit.data.q[fit.held][:4])
+    model = mujoco.MjModel.from_xml_path(str(folder / "corrected.xml"))
+    given = mujoco.MjModel.from_xml_path(str(folder / "ur10.xml"))
+    assert (model.actuator_forcerange == given.actuator_forcerange).all()
+    assert (model.jnt_actfrcrange == given.actuator_forcerange).all()
+    assert model.actuator_gainprm[:, 0].max() < 20 * 5000.0
+
+
+def test_gravity_still_counts_against_the_force_limits(
+    case: tuple[Path, mc.Fit, SimulatorGap],
+) -> None:
+    folder, fit, _ = case
+    model = mujoco.MjModel.from_xml_path(str(folder / "corrected.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:] = data.ctrl[:] = fit.data.q[0]
+    mujoco.mj_step(model, data, 2000)
+    dofs = [int(model.joint(f"joint{i + 1}").dofadr[0]) for i in range(6)]
+    np.testing.assert_allclose(data.qfrc_actuator[dofs], data.qfrc_bias[dofs], rtol=0, atol=0.01)
+
+
+def test_the_text_stays_but_for_what_changed(case: tuple[Path, mc.Fit, SimulatorGap]) -> None:
+    folder, fit, _ = case
+    before = (folder / "ur10.xml").read_text().splitlines()
+    after = (folder / "corrected.xml").read_text().splitlines()
+    lines = [line for line in difflib.unified_diff(before, after, lineterm="", n=0)
+             if line[0] in "+-" and line[:3] not in ("+++", "---")]  # fmt: skip
+    gone = [line for line in lines if line[0] == "-"]
+    new = [line for line in lines if line[0] == "+"]
+    assert all(re.match(r"-\s*<(body|joint|position) ", line) for line in gone), gone
+    sites = [line for line in new if "<site" in line]
+    assert len(sites) == 1 + len(fit.data.target_names)
+    assert len(gone) == len(new) - len(sites) <= 18  # a body, a joint, a servo each
+    assert "forcerange" not in "".join(line for line in gone if "position" in line)
+    for joint in range(1, 7):
+        assert any(f"<!-- joint {joint} -->" in line for line in after)
+
+
+def test_a_file_is_written_byte_for_byte(tmp_path: Path) -> None:
+    path = published_like(tmp_path, mc.load_robot("ur10"))
+    odd = (
+        b"<?xml version='1.0'?>\r\n<!-- > -->\r\n<mujoco   model = 'a &gt; b' >\t<option\r\n"
+        b"  timestep='0.002'/><include file='empty.xml'/>\r\n<worldbody ></worldbody >\r\n"
+        b"<!-- <body> --><include file='arm.xml'/> text\r\n</mujoco>\r\n\r\n"
+    )
+    (tmp_path / "odd.xml").write_bytes(odd)
+    (tmp_path / "empty.xml").write_bytes(b"<mujoco><!-- nothing --></mujoco>")
+    assert read_document(path).raw() == path.read_bytes()
+    document = read_document(tmp_path / "odd.xml")
+    assert document.raw() == odd
+    option = document.root.find("option")
+    assert option is not None
+    option.set("timestep", "0.001")
+    assert document.raw() == odd.replace(b"'0.002'", b"'0.001'")
+    del option.attrib["timestep"]
+    option.set("integrator", "Euler")
+    changed = odd.replace(b"<option\r\n  timestep='0.002'/>", b'<option integrator="Euler"/>')
+    assert document.raw() == changed
+
+
+def test_an_include_is_written_out_only_where_it_changed(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        "<mujoco>\n  <include file='a.xml'/>\n  <include file='b.xml'/>\n</mujoco>\n"
+    )
+    (tmp_path / "a.xml").write_text(
+        "<mujocoinclude>\n  <option gravity='0 0 0'/>\n</mujocoinclude>"
+    )
+    (tmp_path / "b.xml").write_text("<mujocoinclude>\n  <size nkey='1'/>\n</mujocoinclude>")
+    document = read_document(tmp_path / "arm.xml")
+    document.root[0].set("gravity", "0 0 -9")
+    assert document.raw().decode() == (
+        "<mujoco>\n  <option gravity='0 0 -9'/>\n  <include file='b.xml'/>\n</mujoco>\n"
+    )
+
+
+def test_a_keyframe_grows_with_the_springs(tmp_path: Path) -> None:
+    model = ur10_like(tmp_path)
+    text = model.read_text().replace("qpos='0 0 0 0 0 0 '", "qpos='1 2 3 4 5 6'")
+    model.write_text(text)
+    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    cell = cell_with(weighs, "joint_compliance:J2", "base_flex:frame", size=5e-6, base_flex=[2e-7])
+    job = replace(
+        job_of("cell", cell),
+        nominal=weighs,
+        fitted=True,
+        model=model,
+        path=tmp_path / "out.xml",
+    )
+    out = mujoco.MjModel.from_xml_string(write(job).content.decode())
+    assert out.nq == 9
+    at = [int(out.joint(f"joint{i + 1}").qposadr[0]) for i in range(6)]
+    assert out.key_qpos[0][at].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert out.key_qpos[0].sum() == 21.0
+
+
+UNSTABLE = "integrator='Euler' timestep='0.005'"
+
+
+def test_an_unstable_model_is_an_error_of_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = ur10_like(tmp_path, (1e4,) * 6, UNSTABLE, (1e6,) * 6, damping=0.0)
+    text = model.read_text().replace('armature="0.1"', "").replace("armature='0.1'", "")
+    model.write_text(text.replace("damping='1'", ""))
+    mc.write_measurements(tmp_path / "poses.csv", mc.simulate("ur10", 30, 3, seed=3).data)
+    assert run("gap", model, tmp_path / "poses.csv") == 2  # before any diagnosis
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"{model}: the simulation is unstable" in said
+    assert "kv" in said
+
+
+def test_a_force_limit_below_the_weight_is_an_error_of_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = ur10_like(tmp_path, limits=(330.0, 60.0, 150.0, 56.0, 56.0, 56.0))
+    data = mc.simulate("ur10", 30, 3, seed=3).data
+    mc.write_measurements(tmp_path / "poses.csv", data)
+    assert run("gap", model, tmp_path / "poses.csv") == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"{model}: joint joint2: gravity asks for" in said
+    assert "its force limit is 60 N m" in said
+    fit = mc.calibrate("ur10", data, "sum")
+    fit.save(tmp_path / "fit.json")
+    to = ("--to", "mjcf", "--mjcf", model, "-o", tmp_path / "out.xml")
+    assert run("export", tmp_path / "fit.json", *to) == 2
+    assert "gravity asks for" in capsys.readouterr().err
+    assert not (tmp_path / "out.xml").exists()
+
+
+def test_a_limit_that_binds_is_counted(tmp_path: Path) -> None:
+    """A limit above the weight, below what the move asks for."""
+    q = np.array([[0.0, -1.5, 0.0, 0.0, 0.0, 0.0], [0.0, -0.4, 0.0, 0.0, 0.0, 0.0]] * 2)
+    free = ur10_like(tmp_path)
+    chain = chain_of(read_model(free).compiled(), 6, str(free))
+    assert drive(chain, q, "free").limited.max() == 0.0
+    model, data = chain.model, mujoco.MjData(chain.model)
+    data.qpos[:] = q[1]
+    mujoco.mj_forward(model, data)
+    tight = (330.0, 1.002 * abs(float(data.qfrc_bias[1])), 150.0, 56.0, 56.0, 56.0)
+    bound = ur10_like(tmp_path, limits=tight)
+    limited = drive(chain_of(read_model(bound).compiled(), 6, str(bound)), q, "bound").limited
+    assert limited[1] > SELDOM
+    assert limited[[0, 2, 3, 4, 5]].max() == 0.0
+
+
+@pytest.mark.parametrize("name", ["ur10", "irb2600", "seven_axes"])
+@pytest.mark.slow
+def test_the_study_s_corrected_files_hold_still_and_move(name: str, tmp_path: Path) -> None:
+    result = study.run(study.Trial(name, 48, 0))
+    assert abs(result.alone_mm - result.gap.rungs[-1].holdout_rms_mm) < HOLDS_MM
+    assert result.speed < STILL
+    assert result.limited < SELDOM
