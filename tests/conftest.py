@@ -1,5 +1,6 @@
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,9 @@ def robot() -> mc.Robot:
 
 @pytest.fixture(scope="session")
 def noisy(robot: mc.Robot) -> Simulation:
-    """Geometric errors, compliance and tracker noise."""
-    return simulate(robot, 60, 3, seed=5)
+    """Geometric errors, compliance and tracker noise; its files look as those of a tracker."""
+    made = simulate(robot, 60, 3, seed=5)
+    return replace(made, data=replace(made.data, simulated=False))
 
 
 @pytest.fixture(scope="session")

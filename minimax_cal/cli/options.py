@@ -173,7 +173,7 @@ def kind_of(default: Any, told: Option, name: str) -> tuple[type, Any, str, Call
     return str, None, "", told.read or (tuple if told.values > 1 else str)
 
 
-NAMED = re.compile(r"(?<![\w-])(\w+)=(?:'([^']*)')?(?=(\S?))")
+NAMED = re.compile(r"(?<![\w-])(\w+)=(?:True\b|'([^']*)')?(?=(\S?))")
 
 
 def in_flags(text: str, command: click.Command) -> str:

@@ -17,8 +17,8 @@ from minimax_cal.fitting.checks import POOR_FIT, check_plausible
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
-    contradiction,
     crossed_of,
+    drawn_crossed_of,
     is_crossed,
     unjudged,
     unseen_suspects,
@@ -33,6 +33,7 @@ from minimax_cal.fitting.fit import (
     WorstCase,
     link_by_link,
 )
+from minimax_cal.fitting.improvement import no_better, rms_of, said_without
 from minimax_cal.fitting.opened import Writes, listed_effects
 from minimax_cal.fitting.options import (
     Options,
@@ -45,6 +46,13 @@ from minimax_cal.fitting.options import (
     sigmas_of,
     silent,
     usable,
+)
+from minimax_cal.fitting.outcome import (
+    compared,
+    exchanged_rows,
+    hidden,
+    impossible,
+    said_of_exchanged,
 )
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.same_arm import wild
@@ -72,6 +80,7 @@ from minimax_cal.solvers.status import Status
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
+ENDED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +121,8 @@ def calibrate(
     effects: str | Path | Writes | Sequence[str | Path | Term] = (),
     loss: str = SQUARE,
     trim: float = 0.0,
+    allow_large_changes: bool = False,
+    simulated: bool = False,
     progress: Progress = silent,
 ) -> Fit:
     """Calibrate a robot from measurements.
@@ -131,6 +142,8 @@ def calibrate(
     unless given. resolution: relative singular value that counts as not measured.  effects: beyond
     geometry, as joint_compliance:J2, or a diagnosis (or its file), whose established effects are
     taken.  loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
+    allow_large_changes: accept links that differ from the drawing by more than 5 % of the reach, 5
+    degrees (alpha, beta) or 30 degrees (theta).  simulated: the points may be exact.
     progress: called with a word on each stage. Raises CalibrationError for wrong input; how the
     numbers ended is in the result's `status`.
 
@@ -158,6 +171,8 @@ def calibrate(
         effects=listed_effects(effects),
         loss=loss,
         trim=trim,
+        allow_large_changes=allow_large_changes,
+        simulated=simulated,
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = measured(data)
@@ -217,6 +232,7 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     if options.effects:
         data = with_history(data)  # the way to a pose is lost once its predecessor is held out
     data = with_groups(with_instrument(data, options.instrument))
+    data = replace(data, simulated=data.simulated or options.simulated)
     train, held, said = split(data, options.holdout, options.seed, options.holdout_by)
     kept = np.isin(data.line, train.line)
     said = (*said, *unplaced(data, kept))
@@ -266,10 +282,19 @@ def judged(
     data = cell.placed(poses.data)
     before, after = nominal.error(data), cell.error(data)
     suspects = (*solved.robust.suspects, *unseen_suspects(robot, data, held, solved))
-    crossed = NOT_CROSSED
+    drawn_crossed = crossed = NOT_CROSSED
     if is_crossed(options, poses.held):
         crossed = crossed_of(robot, options, data, held, solved)
-    wrong = contradiction(robot, data, after, held, suspects)
+        drawn_crossed = drawn_crossed_of(robot, options, data, held, solved)
+    swapped = exchanged_rows(robot, data, before)
+    wrong = impossible(robot, options, solved, data, held, before, after, swapped, suspects)
+    unseen = (drawn_crossed, crossed) if crossed.size else hidden(before, after, ~held)
+    better = compared(options, solved, data, unseen, suspects)
+    status, reason = solved.status, wrong
+    if wrong:
+        status = Status.FAILED
+    elif better and not better.is_better and status in ENDED:
+        status, reason = Status.NO_BETTER, no_better(better, suspects)
     alarming = tuple(alarms(robot, poses, solved, before[:, ~held]))
     notices = (
         *poses.notices,
@@ -281,14 +306,16 @@ def judged(
         *alarming,
         *bad_rows(suspects, data.source),
         *unjudged(data, crossed),
-        *([wrong] if wrong else []),
+        *([said_of_exchanged(data, swapped)] if len(swapped) and not wrong else []),
+        *([said_without(better, rms_of(*unseen))] if better and better.wrong else []),
+        *([reason] if reason else []),
     )
     fit = Fit(
         cell=cell,
         nominal=nominal,
         objective=options.objective,
         qp=qp_name(options.qp),
-        status=Status.FAILED if wrong else solved.status,
+        status=status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
         parameters=parameters_of(solved),
@@ -319,6 +346,8 @@ def judged(
         error_crossed=crossed,
         answered=solved.optimum.answered if solved.optimum else {},
         work=work_of(solved),
+        error_drawn_crossed=drawn_crossed,
+        reason=reason,
     )
     return fit, alarming
 

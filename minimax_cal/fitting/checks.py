@@ -53,20 +53,21 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
     if np.sqrt(given.mean_square) <= limit:
         return given
     mirrored = "the measurement frame looks left-handed; reverse one of its axes"
-    trials = [(mirrored, given.mirrored)]
-    few = np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int)
+    few = data.take(np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int))
+    shown = fitted(robot, few) if few.poses < data.poses else given  # of the same rows as trials
+    trials = [(mirrored, shown.mirrored)]
     with work(brief=False):
-        for text, mended in suspicions(robot, data.take(few)):
+        for text, mended in suspicions(robot, few):
             left = fitted(robot, mended).mean_square
             if left < EXPLAINED * spread(mended):  # points drawn together are near any arm
                 trials.append((text, left))
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
-    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < EXPLAINED * given.mean_square:
+    if np.sqrt(mean_square) <= 4.0 * limit and mean_square < EXPLAINED * shown.mean_square:
         raise DataError(
             f"{data.source}: {text} (the nominal robot then misses by "
-            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(given.mean_square):.3g} mm)"
+            f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(shown.mean_square):.3g} mm)"
         )
     return given
 
@@ -144,6 +145,12 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     pose, points = scipy.optimize.linear_sum_assignment(distance)
     fits = distance[pose, points] < max(CLOSE * typical, LEAST * robot.reach() / 4.0)
     return bad, bad[np.where(fits, points, pose)]
+
+
+def exchanged(robot: Robot, data: Measurements) -> Array:
+    """(b,) rows whose points belong to other rows: their lines were exchanged."""
+    rows, source = misplaced(robot, data)
+    return np.asarray(rows[rows != source])
 
 
 def put_right(data: Measurements, rows: Array, source: Array) -> Measurements:

@@ -157,6 +157,25 @@ def crossed_of(
     )
 
 
+def drawn_crossed_of(
+    robot: Robot, options: Options, data: Measurements, held: Array, solved: Solved
+) -> Array:
+    """The same of the drawn arm: base, targets and frames are fitted without each pose."""
+    train, names = data.take(~held), data.target_names
+    free = np.arange(5 * robot.joints + 6 + 3 * len(names)) >= 5 * robot.joints
+    free &= solved.identification.active[: len(free)]
+    model, state = refitted(robot, train, solved.nominal, free)
+    return crossed(
+        Estimator(model, np.ones(len(names))),
+        state,
+        held,
+        grouped(data, options.holdout_by),
+        errors_of(robot, data, solved),
+        options.seed,
+        steps_of(data.frames),
+    )
+
+
 def beyond_of(
     robot: Robot,
     options: Options,

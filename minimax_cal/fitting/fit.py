@@ -315,7 +315,9 @@ class Fit:
     weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
-    error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated.
+    error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated;
+    error_drawn_crossed: the same of the drawn arm.
+    reason: why it failed or is no better than the drawn arm, and what to do; empty where neither.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
     stated_geometric: `geometric` as the file of the fit holds it.
     """
@@ -352,6 +354,8 @@ class Fit:
     answered: Mapping[str, int] = field(default_factory=dict)
     work: Work = Work()
     stated_geometric: Cell | None = None
+    error_drawn_crossed: Array = field(default_factory=NOT_CROSSED.copy)
+    reason: str = ""
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)
@@ -370,8 +374,19 @@ class Fit:
         """The calibrated robot of geometry alone, usable wherever a robot is.
 
         Beside effects it is fitted without them: that of `cell` is right only together with them.
+        The drawn one where the calibrated arm is no better.
         """
-        return self.geometric.robot
+        return self.kept.robot
+
+    @property
+    def kept(self) -> Cell:
+        """The arm to use: `geometric`, or the drawn one in its place where that is no better."""
+        return self.nominal if self.is_no_better and self.nominal else self.geometric
+
+    @property
+    def is_no_better(self) -> bool:
+        """Whether the calibrated arm is no better than the drawn one."""
+        return self.status is Status.NO_BETTER
 
     @cached_property
     def geometric(self) -> Cell:
@@ -513,7 +528,9 @@ class Fit:
         group = grouped(self.data, self.options.holdout_by) if self.data.poses else np.zeros(0)
         if self.error_crossed.size:
             judged = np.isfinite(self.error_crossed).any(axis=(0, 2))
-            before, after = accuracy(self.error_nominal[:, judged]), accuracy(self.error_crossed)
+            after = accuracy(self.error_crossed)
+            drawn = self.error_drawn_crossed
+            before = accuracy(np.where(np.isfinite(self.error_crossed), drawn, np.nan))
             missed = len(self.unjudged)
             of = f" of {after.poses + missed}" if missed else ""
             where = f"{after.poses}{of} poses, each judged by a fit without it"
@@ -545,7 +562,8 @@ class Fit:
     def accuracies(self) -> Iterator[tuple[str, Accuracy]]:
         """What the table of accuracy tells, with titles."""
         if self.error_crossed.size:
-            yield "cross-validated", self.within.after
+            yield "cross-validated, nominal", self.within.before
+            yield "cross-validated, calibrated", self.within.after
         for title, key in ACCURACIES:
             yield title, self.accuracy[key]
             if key == "holdout" and any(one.held for one in self.suspects):
@@ -621,7 +639,9 @@ class Fit:
             f"(condition {self.identification.condition:.3g}); {self.status} after "
             f"{self.iterations} iterations, {self.seconds:.2f} s.{self.solved_by()}"
         )
-        return text + (f" {self.status.advice}." if self.status.advice else "")
+        advice = "" if self.reason else self.status.advice
+        first = f"{self.reason[:1].upper()}{self.reason[1:]}. " if self.reason else ""
+        return first + text + (f" {advice}." if advice else "")
 
     def solved_by(self) -> str:
         """Who answered the quadratic programs, after a space; empty where there were none."""

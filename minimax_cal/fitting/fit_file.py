@@ -67,7 +67,7 @@ from minimax_cal.solvers.status import Status
 
 SCHEMA = 1
 NO_KKT = Kkt(math.nan, math.nan, math.nan)
-POSE_BY_POSE = ("weights", "share", "measured", "crossed")
+POSE_BY_POSE = ("weights", "share", "measured", "crossed", "drawn crossed")
 EARLIER = "an earlier version wrote this file"
 NEAR = 1e-6  # a file's own errors come back to this, or it lacks columns of the measurements [m]
 
@@ -214,6 +214,7 @@ class FitPart(Part):
     minimax: MinimaxPart | None = None
     certificate: CertificatePart | None = None
     suspects: tuple[SuspectPart, ...] = ()
+    reason: str = ""
     notices: tuple[str, ...] = ()
     loss: str = "square"
     widening: float = 1.0
@@ -226,9 +227,9 @@ class FitPart(Part):
 
 def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
     """The JSON of the contract, and more.  poses: whether with what was measured."""
-    out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", **fit.geometric.whole()}
+    out: dict[str, Any] = {"schema": SCHEMA, "kind": "calibration", **fit.kept.whole()}
     out["cell"] = {"effects": out.pop("effects")}
-    if fit.geometric is not fit.cell:
+    if fit.kept is not fit.cell:
         out["cell"] = fit.cell.whole()
     if fit.nominal:
         out["nominal_robot"] = fit.nominal.robot.to_dict()
@@ -241,7 +242,8 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         "answered": dict(fit.answered),
         "work": vars(fit.work),
         "status": str(fit.status),
-        "advice": fit.status.advice,
+        "advice": fit.reason or fit.status.advice,
+        "reason": fit.reason,
         "iterations": fit.iterations,
         "seconds": finite(fit.seconds),
         "parameters": [p.to_dict() for p in fit.parameters],
@@ -282,7 +284,7 @@ def crossed_to_dict(fit: Fit) -> dict[str, Any]:
     names = ("rms_ci95_mm", "max_ci95_mm")
     return (
         fit.within.after.to_dict()
-        | {"not_judged": [int(x) for x in fit.unjudged]}
+        | {"not_judged": [int(x) for x in fit.unjudged], "nominal": fit.within.before.to_dict()}
         | {
             name: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
             for name, interval in zip(names, (fit.within.rms, fit.within.largest), strict=True)
@@ -328,7 +330,7 @@ def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
             [[(i.low, i.high) for i in fit.intervals[key]] for key in ("nominal", "holdout")]
         ),
         **cell_arrays(fit.cell, "cell"),
-        **(cell_arrays(fit.geometric, "geometric") if fit.geometric is not fit.cell else {}),
+        **(cell_arrays(fit.kept, "geometric") if fit.kept not in (fit.cell, fit.nominal) else {}),
         **(cell_arrays(fit.nominal, "nominal") if fit.nominal else {}),
     }
     if fit.uncertainty:
@@ -337,7 +339,7 @@ def arrays_of(fit: Fit, *, poses: bool) -> dict[str, Any]:
     if fit.data.poses:
         out["measured"] = fit.data.y
     if fit.error_crossed.size:
-        out["crossed"] = fit.error_crossed
+        out["crossed"], out["drawn crossed"] = fit.error_crossed, fit.error_drawn_crossed
     if not poses:
         out = {name: values for name, values in out.items() if name not in POSE_BY_POSE}
         out |= {"share": fit.share} if fit.share.ndim == 1 else {}
@@ -371,7 +373,7 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
             f"{source}: its arrays cannot be read ({said(error)}); {AGAIN}"
         ) from error
     cell, geometric = refined(cell, arrays, "cell"), None
-    if cell.effects.causes:
+    if cell.effects.causes and part.status is not Status.NO_BETTER:
         alone = cell_from_dict({**content, "cell": {}}, source)
         geometric = refined(alone, arrays, "geometric")
     for name, scores in part.accuracy.told():
@@ -440,6 +442,8 @@ def assembled(
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
         answered=part.answered,
         work=part.work,
+        error_drawn_crossed=arrays.get("drawn crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
+        reason=part.reason,
     )
 
 

@@ -36,12 +36,14 @@ UNKNOWN = Interval(math.nan, math.nan)
 
 
 def told(interval: Interval, seen: float) -> Interval:
-    """An interval as it is told to people: open above where the poses give no upper end.
+    """An interval as it is told to people: never ending below what was seen, and open above where
+    the poses give no upper end.
 
     Of few poses, or where one is nearly all of the error, the samples that lack it leave the end to
     the tail of an assumed law: it covers, and says nothing.  seen: the value itself [m].
     """
-    return interval if interval.high <= FARTHEST * seen else Interval(interval.low, math.nan)
+    high = max(interval.high, seen) if interval.high <= FARTHEST * seen else math.nan
+    return Interval(interval.low, high)
 
 
 def rms_interval(

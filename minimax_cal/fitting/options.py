@@ -83,6 +83,8 @@ class Options:
     effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
     loss: of the distances in the least squares: square, huber, cauchy or tukey.
     trim: at most this share of the points, those that stand out, is set aside.
+    allow_large_changes: whether the arm may be another than the one drawn.  simulated: whether
+    points may be exact, as no instrument measures them.
     """
 
     objective: str = option(
@@ -199,6 +201,18 @@ class Options:
         "How far a distance between targets may be off [default: as measured].",
         "mm",
         group="How it is solved",
+    )
+    allow_large_changes: bool = option(
+        False,
+        "Accept links that differ from the drawing by more than 5 % of the reach, 5 degrees "
+        "(alpha, beta) or 30 degrees (theta).",
+        group="What is known",
+    )
+    simulated: bool = option(
+        False,
+        "The points are of a simulation and may be exact; a file that begins with # simulated says "
+        "so itself.",
+        group="What is known",
     )
     resolution: float = identify.RESOLUTION
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from minimax_cal.fitting.checks import check_plausible
@@ -13,12 +15,14 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.joint_fit import refitted
-from minimax_cal.modelling.parameters import Names, zero_positions
+from minimax_cal.modelling.parameters import Names, links_of, zero_positions
 from minimax_cal.robots.robot import Robot
 
 WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
-NAMED = 5  # implausible changes that are told one by one
+LARGE_LENGTH = 0.05  # of the reach: with an identified length so far off it is another arm
+LARGE_TWIST, LARGE_ZERO = math.radians(5.0), math.radians(30.0)  # alpha, beta; theta, as well
+NAMED = 5  # changes that are told one by one
 
 
 def wild(names: Names, change: Array, reach: float) -> str:
@@ -31,6 +35,40 @@ def wild(names: Names, change: Array, reach: float) -> str:
     return ", ".join(
         f"{names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
         for i in far[:NAMED]
+    )
+
+
+def too_changed(robot: Robot, after: Robot, active: Array) -> str:
+    """Why a result is of another arm than the one drawn, by its links; empty where it is not.
+
+    after: calibrated.  active: (5n,) True for link parameters that were identified.  What moves all
+    points as the base or the tool does (d and theta of the first joint, the last link) may be
+    anywhere.
+    """
+    kinds = np.arange(5 * robot.joints).reshape(5, -1)  # a, d, theta, alpha, beta of each joint
+    counts = active.copy()
+    counts[[kinds[1, 0], kinds[2, 0], *kinds[:, -1]]] = False
+    change = links_of(after.mdh - robot.mdh)
+    change[2 * robot.joints :] = np.angle(np.exp(1j * change[2 * robot.joints :]))
+    zero = kinds[2]
+    most = np.full(len(change), LARGE_TWIST)
+    most[: 2 * robot.joints], most[zero] = LARGE_LENGTH * robot.reach(), LARGE_ZERO
+    far = np.flatnonzero(counts & (np.abs(change) > most))
+    if robot.rough or not len(far):
+        return ""
+    far = far[np.argsort(-np.abs(change[far]) / most[far])]
+    names, lengths = Names(robot.joints, ()).all, 2 * robot.joints
+    named = ", ".join(
+        f"{names[i]} by {1e3 * change[i]:+.3g} mm" if i < lengths
+        else f"{names[i]} by {math.degrees(change[i]):+.3g} degrees"
+        for i in far[:NAMED]
+    )  # fmt: skip
+    more = f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
+    return (
+        f"the measured arm is not the one that {robot.name} draws: {named}{more} (at most "
+        f"{1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of alpha and "
+        "beta, 30 of theta): check the robot file, joint signs and units; where the drawing is "
+        "rough, give allow_large_changes=True"
     )
 
 

@@ -40,6 +40,7 @@ OPTIONAL = {
         "base": r"base\d+_[xyz]_(mm|m)",
     }.items()
 }
+SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
 TEXT = {"session", "group", "pose", "split"}  # labels, compared but never computed with
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
@@ -49,7 +50,7 @@ OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 class Rows:
     """A CSV file as text: header, rows, and the line on which each row ends.
 
-    digest: SHA-256 of the file.
+    digest: SHA-256 of the file.  simulated: whether its first line says `SIMULATED`.
     """
 
     path: Path | str
@@ -57,6 +58,7 @@ class Rows:
     rows: tuple[tuple[str, ...], ...]
     line: Array
     digest: str
+    simulated: bool = False
 
     def text(self, name: str) -> list[str]:
         """The cells of a column."""
@@ -92,6 +94,11 @@ def read_rows(path: Path | str) -> Rows:
     return rows_in(text_of(raw, path, kind=DataError), path)
 
 
+def is_simulated(text: str) -> bool:
+    """Whether the first line of a file says that its points were computed, not measured."""
+    return text.lstrip("\ufeff").partition("\n")[0].strip(' \t\r,;"').lower() == SIMULATED
+
+
 def rows_in(text: str, path: Path | str) -> Rows:
     """The rows of CSV that is, or shall be, in a file.  Raises DataError where it is none."""
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -102,7 +109,8 @@ def rows_in(text: str, path: Path | str) -> Rows:
         lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except csv.Error as error:
         raise DataError(f"{path}:{reader.line_num}: is not CSV ({error})") from error
-    rows = [(number, row) for number, row in lines if any(row)]
+    simulated = is_simulated(text)
+    rows = [(number, row) for number, row in lines[simulated:] if any(row)]
     if not rows:
         raise DataError(f"{path}: is empty")
     (_, header), *body = rows
@@ -114,6 +122,7 @@ def rows_in(text: str, path: Path | str) -> Rows:
         tuple(tuple(row) for _, row in body),
         np.array([number for number, _ in body], dtype=int),
         digest,
+        simulated,
     )
 
 

@@ -17,6 +17,7 @@ from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.words import one_line
 from minimax_cal.measuring.columns import (
     JOINT,
+    SIMULATED,
     TARGET,
     TEXT,
     Rows,
@@ -58,6 +59,7 @@ class Measurements:
     source, digest: path and SHA-256 of the file.
     frames: (4, 4) where the measurement frame of each session stands in the one that y is given in,
     by its label, the first one's first [m]; empty where y is as measured.
+    simulated: whether the source says that its points were computed.
     """
 
     q: Array
@@ -71,6 +73,7 @@ class Measurements:
     source: str = "measurements"
     digest: str = ""
     frames: Mapping[str, Array] = field(default_factory=dict)
+    simulated: bool = False
 
     @property
     def poses(self) -> int:
@@ -275,6 +278,7 @@ def measurements_in(file: Rows) -> Measurements:
         unknown=unknown,
         source=str(path),
         digest=file.digest,
+        simulated=file.simulated,
     )
     data = check_finite(data)
     blind = np.asarray(~data.seen.any(axis=1))
@@ -323,13 +327,15 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
 
 
 def measurements_text(data: Measurements) -> str:
-    """The CSV of measurements."""
+    """The CSV of measurements, `SIMULATED` above it where they are."""
     joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
     named = {name: file_column(name) for name in data.columns}
     header += [name for name, _ in named.values()]
     stream = io.StringIO()
+    if data.simulated:
+        stream.write(f"{SIMULATED}\n")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
     for j in range(data.poses):

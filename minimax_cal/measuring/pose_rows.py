@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ def pose_rows(data: Measurements, held: Array, errors: Mapping[str, Array]) -> d
         "measured_mm": 1e3 * data.y,
         "errors_mm": {name: 1e3 * np.moveaxis(error, 0, 1) for name, error in errors.items()},
         "columns": columns,
+        **({"simulated": True} if data.simulated else {}),
     }
     return dict(plain(whole))
 
@@ -69,4 +71,5 @@ def read_poses(content: Mapping[str, Any], source: str) -> tuple[Measurements, A
             f"{source}: its list of poses cannot be read ({said(error)}); write the file "
             "again with minimax-cal calibrate"
         ) from error
-    return Measurements(data.q, data.y, names, sliding, line, columns, source=source), held
+    known = Measurements(data.q, data.y, names, sliding, line, columns, source=source)
+    return replace(known, simulated=content.get("simulated") is True), held

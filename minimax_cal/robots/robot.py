@@ -89,6 +89,7 @@ class RobotSchema(BaseModel):
     joints: Annotated[list[JointSchema], Field(min_length=1)]
     up: Vector = (0.0, 0.0, 1.0)
     repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
+    nominal: Literal["drawn", "rough"] = "drawn"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,7 @@ class Robot:
     com: (n, 3) its centre of gravity in frame i, NaN where unknown [m].
     up: (3,) vertical in the base frame.
     repeatability: of its data sheet, by ISO 9283; NaN where unknown [m].
+    rough: whether its geometry is no drawing but a first guess, from which it may be far.
     """
 
     name: str
@@ -117,6 +119,7 @@ class Robot:
     com: Array
     up: Array
     repeatability: float = math.nan
+    rough: bool = False
 
     @property
     def joints(self) -> int:
@@ -196,6 +199,7 @@ class Robot:
             "units": {"length": "mm", "angle": "rad"},
             "up": [float(u) for u in self.up],
             **({"repeatability_mm": 1e3 * self.repeatability} if known else {}),
+            **({"nominal": "rough"} if self.rough else {}),
             "joints": [joint(i) for i in range(self.joints)],
         }
 
@@ -297,6 +301,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         com=np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3,
         up=up / np.linalg.norm(up),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
+        rough=schema.nominal == "rough",
     )
 
 

@@ -13,6 +13,7 @@ class Status(StrEnum):
     STALLED = "stalled"
     INFEASIBLE = "infeasible"
     FAILED = "failed"
+    NO_BETTER = "no_better"
 
     @property
     def advice(self) -> str:
@@ -30,4 +31,6 @@ ADVICE = {
     "them (in a calibration the distance tolerance)",
     Status.FAILED: "the numbers broke down, or the result contradicts its own data; check the "
     "robot file, units and joint signs, or try another QP backend",
+    Status.NO_BETTER: "the calibrated arm is no better than the drawn one on new poses; keep the "
+    "drawn arm",
 }

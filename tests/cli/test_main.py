@@ -164,8 +164,8 @@ def test_wrong_input_is_one_line_and_exit_2(
     before = set(tmp_path.iterdir())
     code = run(*(csv if a == "CSV" else a for a in arguments))
     out, err = capsys.readouterr()
-    if arguments[1] == "ur10":  # another robot than the data's: a notice, or a refusal
-        assert code in (0, 2)
+    if arguments[1] == "ur10":  # another robot than that of the data: failed, or refused
+        assert code in (1, 2)
         return
     assert code == 2
     lines = [line for line in err.splitlines() if line.startswith("error: ")]

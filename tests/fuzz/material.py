@@ -78,7 +78,7 @@ def make() -> None:
     done("export", "fit.json", "--to", "urdf", "-o", "robot.urdf")
     done("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
     Path("cells.toml").write_text(CELLS)
-    rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
+    rows = list(csv.reader(Path("data.csv").read_text().splitlines()[1:]))  # below the mark
     bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
     write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])
     Path("weld.mod").write_text(module(robot, bent[:3]))

@@ -7,6 +7,7 @@ import socket
 import stat
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,8 @@ STARTING = ("waiting for a free core", "diagnose")  # what a job says before its
 def poses(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A synthetic cell."""
     path = tmp_path_factory.mktemp("cell") / "poses.csv"
-    mc.write_measurements(path, mc.simulate("irb120", POSES, TARGETS, seed=4).data)
+    data = mc.simulate("irb120", POSES, TARGETS, seed=4).data
+    mc.write_measurements(path, replace(data, simulated=False))
     return path.read_bytes()
 
 

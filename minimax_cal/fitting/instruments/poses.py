@@ -112,7 +112,9 @@ def fit_poses(
     shared = ("holdout", "seed", "fix", "free", "method", "resolution")
     chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
     try:
-        fit = calibrate(robot, targets, objective="sum", progress=progress, **chosen)
+        fit = calibrate(
+            robot, targets, objective="sum", simulated=True, progress=progress, **chosen
+        )
     except DataError as wrong:  # the user's columns have other names
         raise DataError(str(wrong).replace("smr1_x_", "flange_x_")) from wrong
     train, state = targets.take(~fit.held), fit.cell.state

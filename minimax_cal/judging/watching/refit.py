@@ -79,6 +79,8 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
+        error_drawn_crossed=np.zeros((0, 0, 3)),
+        reason="",
         stated_geometric=geometric_of(fit, cell, data) if cell.effects.causes else None,
     )
 

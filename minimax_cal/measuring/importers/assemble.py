@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.columns import is_simulated
 from minimax_cal.measuring.importers import contract
 from minimax_cal.measuring.importers.join import Places, in_file_order, place, settled
 from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Reading, Told
@@ -122,6 +123,7 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
         notices=tuple(notice for reading in readings for notice in reading.notices),
         source=str(joints.sheet.path),
         digest=hashlib.sha256("".join(r.sheet.text for r in readings).encode()).hexdigest(),
+        simulated=any(is_simulated(r.sheet.text) for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
     return Assembly(check_finite(data), readings, meanings, matched)

@@ -1,0 +1,139 @@
+"""Whether the calibrated arm is better than the drawn one on poses that neither has seen.
+
+Both are judged on the same poses by the same rule: base, targets and frames of the drawn arm are
+fitted to the same training poses as the calibrated arm is.  The comparison is paired, pose by pose,
+so that what both miss alike, as noise, does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.fitting.suspects import Suspect, aside
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.measurements import Measurements
+
+# A point that both arms miss by so many times what lies between them there does not say which of
+# them is right; a point that only the calibrated arm misses does, and counts.
+APART = 2.0
+LEFT = 2.0 / 3.0  # of the points: where fewer are left, all count
+NAMED = 5  # points that a reason names
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """RMS of the drawn and of the calibrated arm on the same points [mm].
+
+    gain: by how much the mean square is lower [mm^2].  error: standard error of that.
+    wrong: points that both arms miss and that were set aside, as a clause; empty for none.
+    """
+
+    before: float
+    after: float
+    gain: float
+    error: float
+    wrong: str = ""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the calibrated arm is better by one standard error; True where none is known."""
+        return not (self.gain <= self.error)
+
+    @property
+    def numbers(self) -> str:
+        """Calibrated against drawn, for people."""
+        return f"{self.after:#.3g} against {self.before:#.3g} mm"
+
+
+def compare_arms(drawn: Array, calibrated: Array, group: Array) -> Improvement:
+    """The paired comparison of errors (k, m, 3) at the points that both have [m].
+
+    group: (m,) poses with one number belong together and count once.
+    """
+    both = np.isfinite(drawn[..., 0]) & np.isfinite(calibrated[..., 0])
+    each = [np.where(both, 1e6 * (error**2).sum(axis=-1), 0.0) for error in (drawn, calibrated)]
+    names, member = np.unique(group, return_inverse=True)
+    parts = (both, each[0] - each[1])
+    count, lower = (np.bincount(member, part.sum(axis=0), len(names)) for part in parts)
+    lower, count = lower[count > 0.0], count[count > 0.0]
+    points, poses = count.sum(), len(count)
+    before, after = (float(np.sqrt(square.sum() / points)) if poses else np.nan for square in each)
+    if poses < 2:
+        return Improvement(before, after, np.nan, np.nan)
+    gain = float(lower.sum() / points)
+    off = lower - gain * count  # of a ratio of sums, to first order
+    error = float(np.sqrt((off**2).sum() * poses / (poses - 1.0)) / points)
+    return Improvement(before, after, gain, error)
+
+
+def improvement(
+    drawn: Array,
+    calibrated: Array,
+    group: Array,
+    data: Measurements,
+    suspects: Sequence[Suspect],
+) -> Improvement:
+    """The comparison of all points; without wrong points where these alone hide what is better.
+
+    drawn, calibrated: (k, m, 3) errors [m], NaN where not judged.  group: (m,).  suspects: points
+    that stand out from the calibrated arm.
+    """
+    whole = compare_arms(drawn, calibrated, group)
+    if whole.is_better:
+        return whole
+    between = np.linalg.norm(drawn - calibrated, axis=-1)
+    alike = np.linalg.norm(calibrated, axis=-1) > APART * between
+    wrong = alike & np.isnan(aside(calibrated, data, suspects)[..., 0])
+    judged = np.isfinite(calibrated[..., 0])
+    if not (wrong & judged).any() or (judged & ~wrong).sum() < LEFT * judged.sum():
+        return whole
+    hidden = np.where(wrong[..., None], np.nan, calibrated)
+    less = compare_arms(drawn, hidden, group)
+    named = points_of(data, wrong & judged, calibrated)
+    if less.is_better:
+        return Improvement(less.before, less.after, less.gain, less.error, named)
+    return Improvement(whole.before, whole.after, whole.gain, whole.error)
+
+
+def points_of(data: Measurements, which: Array, error: Array) -> str:
+    """Points in words.  which: (k, m).  error: (k, m, 3) [m]."""
+    far = np.argwhere(which)
+    size = 1e3 * np.linalg.norm(error, axis=-1)
+    shown = [
+        f"line {data.line[pose]} {data.target_names[target]} {size[target, pose]:.3g} mm"
+        for target, pose in far[:NAMED].tolist()
+    ]
+    more = f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
+    return ", ".join(shown) + more
+
+
+def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
+    """The sentence for an arm that is no better than the drawn one, and what to do."""
+    off = [f"line {one.line} {one.target} {1e3 * one.distance:.3g} mm" for one in suspects]
+    more = f" and {len(off) - NAMED} more" if len(off) > NAMED else ""
+    rows = f"; check the points that stand out ({', '.join(off[:NAMED])}{more})" if off else ""
+    return (
+        f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "
+        "the drawn arm, or calibrate again with more poses, joint values with all their digits "
+        f"and less noise{rows}"
+    )
+
+
+def said_without(found: Improvement, whole: tuple[float, float]) -> str:
+    """Notice that wrong points hide what is better.  whole: RMS before and after of all [mm]."""
+    return (
+        f"points that the drawn and the calibrated arm both miss ({found.wrong}) hide the "
+        f"improvement on new poses: {whole[0]:#.3g} -> {whole[1]:#.3g} mm with them, "
+        f"{found.before:#.3g} -> {found.after:#.3g} mm without; correct or delete these rows"
+    )
+
+
+def rms_of(drawn: Array, calibrated: Array) -> tuple[float, float]:
+    """RMS of both at the points that both have [mm]."""
+    both = np.isfinite(drawn) & np.isfinite(calibrated)
+    before, after = (accuracy(np.where(both, one, np.nan)).rms_mm for one in (drawn, calibrated))
+    return before, after
