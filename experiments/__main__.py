@@ -33,6 +33,14 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "From which starts the least-squares methods reach the minimum, and how fast",
     ),
     "any_base": ("experiments.any_base", "Starts for a robot whose base may stand anywhere"),
+    "algorithm_1": (
+        "experiments.algorithm_1",
+        "Paper M's Algorithm 1 to the letter, with and without a line search",
+    ),
+    "random_arms": (
+        "experiments.random_arms",
+        "Arms of any kind with gross errors of all angles: how many reach the noise",
+    ),
     "conditions": (
         "experiments.conditions",
         "Errors, training and held out, under each way to fit, simulated and real",

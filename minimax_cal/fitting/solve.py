@@ -59,6 +59,11 @@ AT_BOUND = "at its bound"
 EXACT = 1e-9  # an error below is rounding: data that were computed, not measured [m]
 HOPELESS = 10.0 * POOR_FIT  # worst errors above this share of the reach: no calibration, so that
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
+# Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
+# by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Random arms whose
+# angles are off by up to 0.5 rad need 2e-2 (`experiments random_arms`).
+GROWN = 1e-2
+GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -160,6 +165,27 @@ class Task:
             known=np.concatenate([np.isfinite(self.sigma), model.prior.weight[count:] > 0.0]),
             resolution=self.options.resolution,
         )
+
+    def grown(self, model: Model, state: State, known: Identification) -> Identification | None:
+        """What the poses tell besides, where a fit ended; None where it is nothing.
+
+        Axes that the drawing has parallel or coaxial may stand well apart in the arm.  What was
+        identified stays so, and what joins must be told clearly (`GROWN`).
+        """
+        if not (self.allowed & ~known.active).any():
+            return None
+        stays = known.active[self.order]
+        found = identify.identify(
+            model,
+            state,
+            np.concatenate([self.order[~stays], self.order[stays]]),
+            allowed=self.allowed,
+            reference=self.reference,
+            known=np.isfinite(self.sigma),
+            resolution=max(self.options.resolution, GROWN),
+        )
+        more = found.active.sum() > known.active.sum()
+        return found if more and found.active[known.active].all() else None
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""
@@ -336,6 +362,14 @@ def geometry(task: Task, progress: Progress) -> Stage:
     wide, notices = wider(task.robot, robust.model, robust.fit, progress)
     if wide is not robust.fit:
         robust = task.robust(robust.plain, wide)
+    for _ in range(GROWTHS):
+        state = robust.fit.x.take(np.array(0))
+        more = task.grown(task.base.emphasise(task.share), state, identification)
+        if more is None:
+            break
+        identification = more
+        model, squares = task.squares(robust.plain.only(more.active), state)
+        robust = task.robust(model, squares)
     return Stage(task.base, identification, robust, robust.fit, notices=notices)
 
 

@@ -1,0 +1,252 @@
+"""Paper M's Algorithm 1 to the letter, on simulated and real arms.
+
+    python -m experiments.algorithm_1 [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
+
+The quadratic programs with one active function I (eq. 22, 25, 27), the printed T on the rows that
+are violated, steps of length 1/p along it from Δx = 0 and λ = 0, full outer steps, BFGS with λ(k+1)
+and λ(k) and q q' / (q's).  Mended are the sign of r and the ε of c_l alone (errata 5 and 6).  The
+paper does not say: the first H, here that of the Gauss-Newton fit it starts from (eq. 32); units,
+here each parameter scaled to unit curvature; redundant parameters, here left out; an update of H
+with q's <= 0, which would break the H > 0 that it asks for, here left out.
+
+Beside it the same with a line search, which the paper has not, and our own two backends of the
+method.  What is told is RMSE(φ) over the optimum of the exact SQP, minus one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from experiments import sweep
+from experiments.conditions import FOLDERS, ROBOTS
+from experiments.real import here
+from experiments.speed import fitted
+from experiments.sweep import Study, study_options
+from minimax_cal.fitting.minimax_problem import (
+    MinimaxProblem,
+    measured_distances,
+    minimax_problem,
+)
+from minimax_cal.fitting.solve import QP_TOLERANCE
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.measuring.grouping import split
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.simulate import simulate
+from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.solvers import minimax
+from minimax_cal.solvers.minimax import Linear
+from qp_backends import solve as solve_qp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ARMS = ("irb2600", "irb120", "ur10e", "meca500")  # simulated
+REAL = {"real irb120": "irb120", "real fanuc": "fanuc"}
+INNER = 3_000  # steps of the subgradient method, by the paper "while Δx not converge"
+OUTER = {True: 10, False: 20}
+SHOWN = (1, 2, 5, 10, 20)
+WAYS = {"as printed": False, "with a line search": True}
+OURS = ("subgradient:eliminated", "subgradient:raw")
+SHORTEST = 1e-6  # of a step in the line search
+GOOD = 1e-3  # over the optimum after ten outer steps: it works
+
+
+@dataclass(frozen=True)
+class Job:
+    """An arm."""
+
+    arm: str
+    seed: int
+    outer: int
+
+
+@dataclass(frozen=True)
+class Course:
+    """RMSE(φ) over the optimum minus one.
+
+    ways: after each outer step, from the start on, by name.  ours: at the end, by backend.
+    """
+
+    ways: Mapping[str, tuple[float, ...]]
+    ours: Mapping[str, float]
+
+
+def measured(job: Job) -> tuple[Robot, Measurements]:
+    """A simulated arm at 100 poses, or a real one's training poses of Table 3."""
+    if job.arm not in REAL:
+        robot = load_robot(job.arm)
+        return robot, simulate(robot, 100, 3, job.seed).data
+    _, make, train = ROBOTS[REAL[job.arm]]
+    robot, data = make(job.seed)
+    return robot, split(data, 1.0 - train / data.poses, job.seed)[0]
+
+
+def problem_of(job: Job, form: str) -> tuple[MinimaxProblem, State]:
+    """The minimax of an arm and its start, the least squares [M eq. 32].
+
+    form: of the distances, squared as in M eq. 8.
+    """
+    robot, data = measured(job)
+    model, start = fitted(robot, data)
+    return minimax_problem(model, start, measured_distances(data), form, "target"), start
+
+
+def rows_of(at: Linear) -> tuple[Array, Array, Array]:
+    """∇F_I (p,), and the rows C (r,) and G (r, p) of M eq. 17 and 27."""
+    active = int(at.f.argmax())
+    C = np.concatenate([at.f - at.f.max(), at.c - 1.0])  # c_l = rt² - ε, over ε
+    G = np.concatenate([at.jacobian - at.jacobian[active], at.normal])
+    return at.jacobian[active], C, G
+
+
+def subproblem(H: Array, slope: Array, C: Array, G: Array) -> tuple[Array, Array]:
+    """Δx and λ by the primal-dual subgradient method [M eq. 22-24, Algorithm 1, inner loop]."""
+    dx, lam = np.zeros(len(slope)), np.zeros(len(C))
+    for p in range(1, INNER + 1):
+        row = C + G @ dx
+        violated = row > 0.0
+        T_x = H @ dx + slope + G[violated].T @ lam[violated]
+        T_lam = -np.where(violated, row, 0.0)
+        size = math.sqrt(T_x @ T_x + T_lam @ T_lam)
+        if size == 0.0:
+            break
+        alpha = (1.0 / p) / size
+        dx, lam = dx - alpha * T_x, lam - alpha * T_lam
+    return dx, lam
+
+
+def searched(problem: MinimaxProblem, x: State, dx: Array) -> float:
+    """The first of 1, 1/2, 1/4 ... whose step lowers the largest of the F_i and keeps c_l <= 0."""
+
+    def merit(at: State) -> float:
+        f, c = problem.evaluate(at)
+        return float(f.max() + 10.0 * np.maximum(c - 1.0, 0.0).sum())
+
+    before, share = merit(x), 1.0
+    while share > SHORTEST and not merit(problem.step(x, share * dx)) < before:
+        share *= 0.5
+    return share if share > SHORTEST else 0.0
+
+
+def algorithm_1(problem: MinimaxProblem, x: State, outer: int, *, search: bool) -> list[float]:
+    """The largest F_i at the start and after each outer step [M Algorithm 1]."""
+    at = problem.linearise(x)
+    H = at.curvature(np.full(len(at.f), 1.0 / len(at.f)))
+    lam = np.zeros(len(at.f) + len(at.c))
+    values = [float(at.f.max())]
+    for _ in range(outer):
+        slope, C, G = rows_of(at)
+        dx, after = subproblem(H, slope, C, G)
+        dx = (searched(problem, x, dx) if search else 1.0) * dx
+        x = problem.step(x, dx)
+        at = problem.linearise(x)
+        values.append(float(at.f.max()))
+        if not np.isfinite(values[-1]):
+            break
+        next_slope, _, next_G = rows_of(at)
+        q = next_slope + next_G.T @ after - (slope + G.T @ lam)
+        lam = after
+        if q @ dx > 0.0:
+            Hs = H @ dx
+            H = H + np.outer(q, q) / (q @ dx) - np.outer(Hs, Hs) / (dx @ Hs)
+    return values
+
+
+def course_of(job: Job) -> Course:
+    """All ways on one arm."""
+    problem, start = problem_of(job, "squared")
+    exact, _ = problem_of(job, "two-sided")  # the same set, with gradients that do not vanish
+    best = minimax.solve(exact, start, partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE)).value
+
+    def over(value: float) -> float:
+        return float(np.sqrt(value / best) - 1.0)
+
+    ways = {
+        way: tuple(map(over, algorithm_1(problem, start, job.outer, search=search)))
+        for way, search in WAYS.items()
+    }
+    ours = {
+        name: over(minimax.solve(exact, start, partial(solve_qp, name=name)).value) for name in OURS
+    }
+    return Course(ways, ours)
+
+
+def study_of(study: Study) -> dict[Job, Course]:
+    """All arms that are here."""
+    arms = [*ARMS, *(arm for arm, name in REAL.items() if here(FOLDERS[name]))]
+    jobs = [Job(arm, study.seed, OUTER[study.quick]) for arm in arms]
+    return dict(zip(jobs, study.sweep(course_of, jobs, "arms"), strict=True))
+
+
+def table_of(found: Mapping[Job, Course]) -> Table:
+    """RMSE(φ) over the optimum after some outer steps, and of our backends at the end."""
+    steps = [step for step in SHOWN if all(step <= job.outer for job in found)]
+    rows: list[tuple[Cell, ...]] = []
+    for job, course in found.items():
+        rows += [
+            (job.arm, way, values[0], *(reached(values, step) for step in steps))
+            for way, values in course.ways.items()
+        ]
+        rows += [
+            (job.arm, name, course.ways["as printed"][0], *[math.nan] * (len(steps) - 1), value)
+            for name, value in course.ours.items()
+        ]
+    header = ("arm", "way", "start", *(f"step {step}" for step in steps))
+    return Table(
+        "Algorithm 1 of paper M: RMSE(φ) over the optimum, minus one; our backends at their end",
+        header,
+        tuple(rows),
+        ("", "", *[".1e"] * (len(steps) + 1)),
+    )
+
+
+def reached(values: tuple[float, ...], step: int) -> float:
+    """After an outer step, infinite where the numbers broke down before."""
+    return values[step] if step < len(values) else math.inf
+
+
+def works(values: tuple[float, ...]) -> bool:
+    """Whether it is near the optimum after ten outer steps."""
+    return reached(values, 10) <= GOOD
+
+
+def picture(found: Mapping[Job, Course]) -> Figure:
+    """Course of every arm."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    for axes, way in zip(figure.subplots(1, 2, sharey=True), WAYS, strict=True):
+        for job, course in found.items():
+            axes.semilogy(np.maximum(course.ways[way], 1e-13), label=job.arm)
+        axes.set(title=way, xlabel="outer step", ylabel="RMSE(phi) over the optimum - 1")
+    axes.legend(fontsize="small")
+    return figure
+
+
+def save(study: Study, found: Mapping[Job, Course]) -> None:
+    """Table and picture."""
+    content = {
+        job.arm: {"ways": dict(course.ways), "ours": dict(course.ours)}
+        for job, course in found.items()
+    }
+    study.save([table_of(found)], content, {"algorithm_1": picture(found)})
+
+
+@click.command()
+@study_options("algorithm_1")
+def main(study: Study) -> None:
+    """Paper M's Algorithm 1 to the letter, on simulated and real arms."""
+    save(study, study_of(study))
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)
