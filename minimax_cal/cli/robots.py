@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from minimax_cal.cli import options
+from minimax_cal.cli.schemas import print_schema, schema_option
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.tables import Table
 from minimax_cal.robots.robot import builtin_robots, load_robot
@@ -12,8 +13,12 @@ from minimax_cal.robots.robot import builtin_robots, load_robot
 
 @click.command(name="robots", cls=options.InGroups)
 @options.JSON
-def robots_command(as_json: bool) -> int:
+@schema_option
+def robots_command(as_json: bool, schema: str | None) -> int:
     """The robots that come with the package."""
+    if schema:
+        print_schema(schema)
+        return 0
     names = {name: load_robot(name) for name in builtin_robots()}
     if as_json:
         content = {name: robot.to_dict() for name, robot in names.items()}

@@ -16,14 +16,16 @@ from pydantic import (
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     ValidationError,
+    WithJsonSchema,
 )
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_before_validator_function
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, said
-from minimax_cal.ground.files import MOST
+from minimax_cal.ground.files import MOST, plain
 
 AGAIN = "write it again with minimax-cal"
 FAULTS = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
@@ -40,11 +42,29 @@ def pair_or_nan(value: object) -> object:
     return (math.nan, math.nan) if value is None else value
 
 
+NUMBER = {"type": ["number", "null"]}
+PAIR = {"type": ["array", "null"], "items": NUMBER, "minItems": 2, "maxItems": 2}
 Number = Annotated[float, BeforeValidator(number_or_nan)]
-Ends = Annotated[tuple[Number, Number], BeforeValidator(pair_or_nan)]
+Ends = Annotated[tuple[Number, Number], BeforeValidator(pair_or_nan), WithJsonSchema(PAIR)]
 Count = Annotated[int, Field(ge=0, lt=10**9)]
 Square = Annotated[float, Field(ge=0.0)]
 UNKNOWN = (math.nan, math.nan)
+
+
+def json_schema(kind: type[BaseModel], title: str) -> dict[str, Any]:
+    """The JSON schema of a file, for editors and other programs; null stands for no number."""
+    made: dict[str, Any] = plain(nullable(kind.model_json_schema()))  # null for a default NaN
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **made, "title": title}
+
+
+def nullable(schema: Any) -> Any:
+    """A JSON schema in which a number may be null, as it is written where there is none."""
+    if isinstance(schema, list):
+        return [nullable(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    made = {key: nullable(value) for key, value in schema.items()}
+    return made | ({"type": ["number", "null"]} if schema.get("type") == "number" else {})
 
 
 def check_schema(content: Mapping[str, Any], source: str, known: int) -> None:
@@ -80,6 +100,21 @@ class Gaps:
             return {**unknown, **value, **null}
 
         return no_info_before_validator_function(filled, handler(kind))
+
+    def __get_pydantic_json_schema__(
+        self, core: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """That of the dataclass; only what is no number, or required, has to be there."""
+        made = handler(core)
+        inner: dict[str, Any] = handler.resolve_ref_schema(made)
+        numbers = {
+            name
+            for name, part in inner.get("properties", {}).items()
+            if part.get("type") == "number"
+        }
+        gone = numbers.difference(self.required)
+        inner["required"] = [name for name in inner.get("required", ()) if name not in gone]
+        return made
 
 
 Kind = TypeVar("Kind")

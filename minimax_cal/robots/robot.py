@@ -7,7 +7,7 @@ import json
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import resources
@@ -43,17 +43,38 @@ def turning(ratio: float) -> float:
     return ratio
 
 
+FREE = ("x_", "source", "note")  # how keys begin that a robot file may hold for people
+
+
+def only_known(known: Collection[str], given: object, free: tuple[str, ...] = ()) -> object:
+    """Keys of a part of a file, if all are known or free.  Raises ValueError with the nearest."""
+    for key in map(str, given if isinstance(given, Mapping) else ()):
+        if key not in known and not (free and key.startswith(free)):
+            (near,) = difflib.get_close_matches(key, known, 1, cutoff=0.0)
+            more = "; begin a note of your own with x_, source or note" if free else ""
+            raise ValueError(f"unknown key {key[:60]!r}; did you mean {near!r}?{more}")
+    return given
+
+
 class UnitsSchema(BaseModel):
     """Units of a robot file."""
 
+    model_config = ConfigDict(extra="forbid")
+
     length: Literal["mm", "m"]
     angle: Literal["rad", "deg"]
+
+    @model_validator(mode="before")
+    @classmethod
+    def no_slip(cls, given: object) -> object:
+        """What is not known would be ignored in silence."""
+        return only_known(cls.model_fields, given)
 
 
 class JointSchema(BaseModel):
     """One joint of a robot file, in the file's units."""
 
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(extra="forbid")
 
     a: Finite
     d: Finite
@@ -72,16 +93,20 @@ class JointSchema(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def no_slip(cls, given: object) -> object:
-        """A key that is nearly a known one is a slip of the pen; other keys are notes."""
-        for key in given if isinstance(given, Mapping) else ():
-            near = difflib.get_close_matches(str(key), cls.model_fields, 1, cutoff=0.7)
-            if key not in cls.model_fields and near:
-                raise ValueError(f"unknown key {key!r}; did you mean {near[0]!r}?")
-        return given
+        """What is not known would be ignored in silence."""
+        return only_known(cls.model_fields, given)
 
 
 class RobotSchema(BaseModel):
-    """A robot file.  Other top-level keys are allowed: they are notes."""
+    """A robot file.  Keys that begin as `FREE` says are notes; others are refused."""
+
+    model_config = ConfigDict(
+        extra="ignore",
+        json_schema_extra={
+            "patternProperties": {f"^({'|'.join(FREE)})": {}},
+            "additionalProperties": False,
+        },
+    )
 
     name: str
     convention: str = CONVENTION
@@ -90,6 +115,12 @@ class RobotSchema(BaseModel):
     up: Vector = (0.0, 0.0, 1.0)
     repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
     nominal: Literal["drawn", "rough"] = "drawn"
+
+    @model_validator(mode="before")
+    @classmethod
+    def no_slip(cls, given: object) -> object:
+        """What is not known would be ignored in silence."""
+        return only_known(cls.model_fields, given, FREE)
 
 
 @dataclass(frozen=True, eq=False)
