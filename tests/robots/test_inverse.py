@@ -76,7 +76,7 @@ def test_no_pose_is_one_line(robot: mc.Robot, pose: object, near: object, said: 
 def test_a_fit_counts_its_effects(noisy: Simulation, rng: np.random.Generator) -> None:
     """The flange with its compliance, by the law itself, is at the pose."""
     fit = mc.calibrate("irb2600", noisy.data, "sum", effects="joint_compliance:all")
-    arm, robot = arm_of(fit.cell), fit.robot
+    arm, robot = arm_of(fit.cell), fit.cell.robot
     q = random_poses(robot, 10, rng)
     turn, moved = bent(arm, still(q, arm.target_names, robot))
     assert np.abs(turn).max() > 1e-4
