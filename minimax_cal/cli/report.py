@@ -31,6 +31,13 @@ ASKED, SAID = "What is required", "What the page says"
         metavar="CLAIM",
         group=ASKED,
     ),
+    deliver=Option(
+        "Judge by what this reaches: a format of export, or compensate; may be given several "
+        "times [default: corrected targets, where the result holds effects].",
+        metavar="FORMAT",
+        many=tuple,
+        group=ASKED,
+    ),
     facts=Option(
         "A TOML file with serial_number, controller, tool, payload, temperature, instrument, "
         "certificate, place, validity.",

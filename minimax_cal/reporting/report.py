@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from datetime import date as Date
 from pathlib import Path
 
+from minimax_cal.fitting.options import listed
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.judging.tolerance import claim_called, limits_of
@@ -24,7 +25,6 @@ from minimax_cal.reporting.html import (
 )
 from minimax_cal.reporting.html.facts import WORDS, read_facts
 from minimax_cal.reporting.html.first_page import Signed
-from minimax_cal.reporting.html.first_page import signed as judgement
 from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
 
@@ -43,6 +43,7 @@ def report(
     tolerance_for: str = "inside",
     facts: Path | str | None = None,
     rung: int | None = None,
+    deliver: str | Sequence[str] = (),
     pdf: Path | str | None = None,
     notify: Callable[[str], object] = warnings.warn,
 ) -> Path:
@@ -54,14 +55,18 @@ def report(
     title: that of the robot unless given.  customer, author: who accepts, who measured.  date:
     YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  tolerance: what is required in mm, as
     ``rms 0.2, max 0.5``; tolerance_for: inside or outside the measured poses. facts: a TOML file
-    with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.  pdf:
-    printed to this file as well, by an installed Chromium, Chrome or Edge.  notify: called with
-    what the reader should know of both together, which the page says too.  Lengths on the page are
-    in mm, angles in mrad. Returns the path of the page.  Raises CalibrationError for wrong input.
+    with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.
+    deliver: formats of `export`, or compensate: the requirement is judged by what each reaches,
+    fitted for exactly what it carries; where a result holds effects and nothing is named, by
+    corrected targets.  pdf: printed to this file as well, by an installed Chromium, Chrome or Edge.
+    notify: called with what the reader should know of both together, which the page says too.
+    Lengths on the page are in mm, angles in mrad. Returns the path of the page.  Raises
+    CalibrationError for wrong input.
 
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """
-    chosen = Chosen(title, customer, author, date, tolerance, tolerance_for, facts, rung)
+    chosen = Chosen(title, customer, author, date, tolerance, tolerance_for, facts, rung,
+                    tuple(listed(deliver)))  # fmt: skip
     signed(results, path, chosen, pdf, notify)
     return Path(path)
 
@@ -78,6 +83,7 @@ class Chosen:
     tolerance_for: str = "inside"
     facts: Path | str | None = None
     rung: int | None = None
+    deliver: tuple[str, ...] = ()
 
     def wording(self) -> Wording:
         """As the page needs it.  Raises OptionError."""
@@ -86,7 +92,7 @@ class Chosen:
             getattr(self, name) or told.get(name, "") for name in WORDS
         )
         return Wording(date_of(date), title, customer, author, told, limits_of(self.tolerance),
-                       claim_called(self.tolerance_for), self.rung)  # fmt: skip
+                       claim_called(self.tolerance_for), self.rung, self.deliver)  # fmt: skip
 
 
 def signed(
@@ -107,7 +113,8 @@ def signed(
     if not isinstance(results, Sequence) or isinstance(results, str):
         results = [results]
     sources = read_sources(results)
-    content = compose(sources, wording)
+    found = wording.judge(sources)
+    content = compose(sources, wording, found)
     if suffix in PAGES:
         write_whole(path, render(content))
     elif suffix in PAPERS:
@@ -118,7 +125,7 @@ def signed(
         print_pdf(render(content, paper=True), Path(pdf), browser)
     for notice in sources.notices:
         notify(notice)
-    return judgement(sources, wording.limits, wording.which, wording.rung)
+    return found
 
 
 def date_of(given: str) -> str:

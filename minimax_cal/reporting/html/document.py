@@ -17,7 +17,7 @@ from minimax_cal.judging.tolerance import Limit
 from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
 from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
 from minimax_cal.reporting.html.facts import told_facts
-from minimax_cal.reporting.html.first_page import page_blocks, signed
+from minimax_cal.reporting.html.first_page import Signed, page_blocks, signed
 from minimax_cal.reporting.html.fit_tables import settings_table
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import gap_verdict
@@ -67,6 +67,7 @@ class Wording:
 
     date: of the report, ISO 8601.  facts: by the keys of `facts.FACTS`.  limits: what is required,
     which: of which claim, inside or outside.  rung: of a diagnosis.
+    deliver: by which deliverables.
     """
 
     date: str
@@ -77,10 +78,18 @@ class Wording:
     limits: tuple[Limit, ...] = ()
     which: str = "inside"
     rung: int | None = None
+    deliver: tuple[str, ...] = ()
+
+    def judge(self, sources: Sources) -> Signed:
+        """What the page judges.  Raises OptionError."""
+        return signed(sources, self.limits, self.which, self.rung, self.deliver)
 
 
-def compose(sources: Sources, wording: Wording) -> Report:
-    """The whole report.  Raises CalibrationError for a part of a file that cannot be read."""
+def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> Report:
+    """The whole report.  Raises CalibrationError for a part of a file that cannot be read.
+
+    found: the judgement, where it was made already.
+    """
     told = sources.provenance
     kind = named(sources)[0][0].capitalize()
     data = sources.results[0].data if not sources.relative else None
@@ -95,7 +104,7 @@ def compose(sources: Sources, wording: Wording) -> Report:
         for name, title, made in parts
         if name != "simulator" or sources.simulator
     )
-    found = signed(sources, wording.limits, wording.which, wording.rung)
+    found = found or wording.judge(sources)
     first = Section("verdict", "Requirement and result", page_blocks(sources, found))
     return Report(
         title=visible(wording.title) or f"{kind} of {sources.robot}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Note, text
+from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
 from minimax_cal.robots.robot import Robot
@@ -47,18 +49,31 @@ NO_LIMIT = "No requirement was given: the result is stated, and nothing is passe
 class Signed:
     """The judgement of a report.  claims: inside, then outside where there is one.
 
-    wild: links that no whole arm changes so much, empty where there are none.
+    wild: links that no whole arm changes so much, empty where there are none.  rows: of what leaves
+    the house; row: that of them which is judged, None where the result itself is.
     """
 
     model: str
     claims: tuple[Claim, ...]
     judged: tuple[Judgement, ...]
     wild: str = ""
+    rows: tuple[Row, ...] = ()
+    row: Row | None = None
 
     @property
     def verdict(self) -> str:
         """passed, not passed or not stated; empty without a requirement."""
         return overall(self.judged) if self.judged else ""
+
+    @property
+    def holds_for(self) -> str:
+        """What the result holds for, in a sentence; empty where it is of geometry alone."""
+        if self.row is None:
+            return ""
+        rest = ""
+        if any(row.delivered.not_carried for row in self.rows if row is not self.row):
+            rest = "; what carries fewer effects is judged below"
+        return f"Result and verdict hold for {self.row.name} ({self.model}){rest}."
 
     @property
     def besides(self) -> list[str]:
@@ -72,13 +87,24 @@ class Signed:
     def lines(self) -> list[str]:
         """For a terminal."""
         said = [one.sentence() for one in self.judged]
-        return [self.verdict, *said, *self.besides] if self.judged else []
+        if not self.judged:
+            return []
+        told = [self.holds_for] if self.row else []
+        return [self.verdict, *said, *told, *(row.line() for row in self.rows), *self.besides]
 
 
-def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | None) -> Signed:
+def signed(
+    sources: Sources,
+    limits: tuple[Limit, ...],
+    which: str,
+    rung: int | None,
+    deliver: Sequence[str] = (),
+) -> Signed:
     """The claims of a result, and the requirements against the one that is named.
 
-    which: inside or outside.  rung: of a diagnosis.  Raises OptionError.
+    which: inside or outside.  rung: of a diagnosis.  deliver: what is judged of the result, as of
+    `deliver`; where it holds effects and nothing is named, corrected targets: no file of a robot
+    reaches what it says.  Raises OptionError.
     """
     if rung is not None and not (sources.gap and not sources.fit):
         raise OptionError("rung: only a report of a diagnosis alone has rungs")
@@ -88,11 +114,16 @@ def signed(sources: Sources, limits: tuple[Limit, ...], which: str, rung: int | 
         model, claims = claims_at(sources.gap, rung)
     else:
         model, claims = "calibration without coordinates", (claim_of_parts(sources),)
+    fit = sources.fit
+    odd = changed(fit.before.robot, fit.cell.robot) if fit else ""
+    rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
+    if row := governing(rows, bool(deliver)):
+        model = with_effects(row.delivered.cell)
+        return Signed(model, row.claims, row.judged, odd, rows, row)
     chosen = next((claim for claim in claims if claim.name == which), None)
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
-    fit, asked = sources.fit, tuple(judge(limit, chosen) for limit in limits)
-    return Signed(model, claims, asked, changed(fit.before.robot, fit.cell.robot) if fit else "")
+    return Signed(model, claims, tuple(judge(limit, chosen) for limit in limits), odd)
 
 
 def changed(before: Robot, after: Robot) -> str:
@@ -178,7 +209,9 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     banner = found.verdict[:1].upper() + found.verdict[1:] if found.verdict else NO_LIMIT
     lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
     lines += [Note(f"{said}.", "warning") for said in found.besides]
+    lines += [text(found.holds_for)] if found.row else []
     lines += [result_table(sources, found), text(basis(found))]
+    lines += [delivered_table(found.rows)] if found.rows else []
     lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
     if limiting := limits_now(sources, found):
         lines.append(text(f"What limits it now: {limiting}"))
@@ -250,6 +283,10 @@ def basis(found: Signed) -> str:
 def limits_now(sources: Sources, found: Signed) -> str:
     """The one thing that keeps the error from being smaller; empty where nobody knows."""
     left = found.claims[0].rms.value
+    if found.row and found.row.delivered.lacks:
+        own = found.row.delivered
+        whole = number(own.whole.rms)
+        return f"{own.lacks}, which {own.format} does not hold; the full model has {whole} RMS."
     if sources.gap:
         lacking = [f for f in causes(sources.gap) if not (holds(sources, f) or f.share < CLOSES)]
         if lacking and sources.gap.verdict in CERTAIN:

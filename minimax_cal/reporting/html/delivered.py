@@ -1,0 +1,148 @@
+"""The requirement against what leaves the house: files, or corrected targets, by their own fits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, deliver
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.judging.tolerance import (
+    NOT_PASSED,
+    NOT_STATED,
+    Bound,
+    Claim,
+    Judgement,
+    Limit,
+    judge,
+    overall,
+)
+from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.solvers.status import Status
+
+USUAL = (COMPENSATED, "urdf")  # where none is named: all that joints correct, and no effect
+NOWHERE = Bound(math.nan, math.nan)
+CORRECTED = "targets corrected by minimax-cal compensate"
+
+Claims = tuple[Claim, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One deliverable.  claims: inside, then outside.  judged: each requirement against them."""
+
+    delivered: Delivered
+    claims: Claims
+    judged: tuple[Judgement, ...]
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        to = self.delivered.format
+        return CORRECTED if to == COMPENSATED else f"the file of export --to {to}"
+
+    @property
+    def verdict(self) -> str:
+        """passed, not passed or not stated; empty without a requirement."""
+        return overall(self.judged) if self.judged else ""
+
+    def line(self) -> str:
+        """For a terminal."""
+        verdict = f"{self.verdict}: " if self.verdict else ""
+        return f"{self.delivered.format}: {verdict}{self.delivered.sentence()}"
+
+
+def rows_of(
+    sources: Sources,
+    names: Sequence[str],
+    rung: int | None,
+    limits: Sequence[Limit],
+    which: str,
+    claims_of: Callable[[Fit], Claims],
+    as_it_is: Claims,
+) -> tuple[Row, ...]:
+    """Each deliverable against the requirements.
+
+    names: as of `deliver`; the usual ones where nothing is named and the result has effects.
+    as_it_is: the claims of the result itself.  Raises OptionError.
+    """
+    source = sources.fit or sources.gap
+    if source is None:
+        if names:
+            raise OptionError("deliver: lengths alone tell no accuracy of a file; leave it out")
+        return ()
+    if not names and (source.status is Status.FAILED or not has_effects(sources, rung)):
+        return ()
+    out = []
+    for name in names or USUAL:
+        try:
+            found = deliver(source, name, rung=rung)
+        except OptionError:
+            if names:
+                raise
+            continue  # the rest of a model that fails without its effects is no deliverable
+        claims = as_it_is
+        if found.reason:
+            claims = tuple(
+                Claim(claim.name, NOWHERE, NOWHERE, 0, "", reason=found.reason)
+                for claim in as_it_is
+            )
+        elif found.fit and found.fit is not source:
+            claims = claims_of(found.fit)
+        chosen = next((claim for claim in claims if claim.name == which), None)
+        if chosen is None:
+            why = "this result makes no such claim"
+            chosen = Claim(which, NOWHERE, NOWHERE, 0, "", reason=why)
+        out.append(Row(found, claims, tuple(judge(limit, chosen) for limit in limits)))
+    return tuple(out)
+
+
+def has_effects(sources: Sources, rung: int | None) -> bool:
+    """Whether the result holds more than geometry."""
+    if sources.fit:
+        return bool(sources.fit.cell.effects.causes)
+    gap = sources.gap
+    rungs = [cell for _, cell in gap.rungs()] if gap else []
+    if not rungs:
+        return False
+    at = len(rungs) - 1 if rung is None else rung
+    return 0 <= at < len(rungs) and bool(rungs[at].effects.causes)
+
+
+def governing(rows: Sequence[Row], named: bool) -> Row | None:
+    """That which the verdict is of: of those named the worst, else corrected targets."""
+    if not rows:
+        return None
+    if not named:
+        return rows[0]
+    for verdict in (NOT_PASSED, NOT_STATED):
+        for row in rows:
+            if row.verdict == verdict:
+                return row
+    return rows[0]
+
+
+def delivered_table(rows: Sequence[Row]) -> Table:
+    """What each carries and reaches, beside the full model."""
+    whole = rows[0].delivered
+    every = (*whole.carries, *whole.not_carried)
+    shown: list[tuple[Cell, ...]] = [
+        ("full model, no file", kinds(every), "", whole.whole.rms, whole.whole.worst, "")
+    ]
+    shown += [
+        (row.delivered.format, kinds(row.delivered.carries), kinds(row.delivered.not_carried),
+         row.delivered.figures.rms, row.delivered.figures.worst, row.verdict)
+        for row in rows
+    ]  # fmt: skip
+    header = ("delivered as", "carries", "does not carry", "inside, RMS mm",
+              "outside, worst RMS mm", "verdict")  # fmt: skip
+    title = "What leaves the house, each fitted for exactly what it carries"
+    return Table(title, header, tuple(shown), ("", "", "", ".3f", ".3f", ""))
+
+
+def kinds(labels: Sequence[str]) -> str:
+    """Effects in words, each kind once."""
+    return ", ".join(dict.fromkeys(each.partition(":")[0].replace("_", " ") for each in labels))
