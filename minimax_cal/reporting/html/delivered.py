@@ -42,7 +42,7 @@ class Row:
     def name(self) -> str:
         """For people."""
         to = self.delivered.format
-        return CORRECTED if to == COMPENSATED else f"the file of export --to {to}"
+        return CORRECTED if to == COMPENSATED else f"an exported {to} file"
 
     @property
     def verdict(self) -> str:
