@@ -1,0 +1,1 @@
+"""Poses at rest from ROS 2 topics to a measurement file of minimax-cal."""
