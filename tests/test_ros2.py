@@ -6,7 +6,7 @@ import sys
 import xml.etree.ElementTree as Xml
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_an_arm_stands_after_a_second_without_moving() -> None:
 class Node:
     """What the node uses of rclpy's."""
 
-    given: dict[str, Any] = {}
+    given: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, name: str) -> None:
         self.heard: dict[str, Any] = {}

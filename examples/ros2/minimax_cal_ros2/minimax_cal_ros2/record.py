@@ -1,9 +1,9 @@
 """A node that writes a row whenever a point is measured while the arm stands.
 
-ros2 run minimax_cal_ros2 record --ros-args -p joints:="[joint1,...]" -p targets:="[smr1,smr2]" -p path:=poses.csv
+ros2 run minimax_cal_ros2 record --ros-args -p targets:="[smr1,smr2]" -p path:=poses.csv
 
-Topics: /joint_states (sensor_msgs/JointState) and /measured/TARGET (geometry_msgs/PointStamped, in the
-tracker's frame, metres), one for each target.  A row is finished when the arm moves on.
+Topics: /joint_states (sensor_msgs/JointState) and /measured/TARGET (geometry_msgs/PointStamped, in
+the tracker's frame, metres), one for each target.  A row is finished when the arm moves on.
 """
 
 from __future__ import annotations
