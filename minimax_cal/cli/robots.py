@@ -3,28 +3,59 @@
 from __future__ import annotations
 
 import click
+import numpy as np
 
 from minimax_cal.cli import options
 from minimax_cal.cli.schemas import print_schema, schema_option
 from minimax_cal.ground.files import json_text
-from minimax_cal.ground.tables import Table
-from minimax_cal.robots.robot import builtin_robots, load_robot
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.units import turned_for_people
+from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
+
+LENGTHS = ("a", "d")
 
 
 @click.command(name="robots", cls=options.InGroups)
+@click.argument("robot", required=False)
 @options.JSON
 @schema_option
-def robots_command(as_json: bool, schema: str | None) -> int:
-    """The robots that come with the package."""
+def robots_command(robot: str | None, as_json: bool, schema: str | None) -> int:
+    """The robots that come with the package.
+
+    With ROBOT, a file or one of their names: its links, in mm and degrees.
+    """
     if schema:
         print_schema(schema)
         return 0
+    if robot:
+        arm = load_robot(robot)
+        if as_json:
+            click.echo(json_text(arm.to_dict()), nl=False)
+        else:
+            options.show(links_table(arm))
+        return 0
     names = {name: load_robot(name) for name in builtin_robots()}
     if as_json:
-        content = {name: robot.to_dict() for name, robot in names.items()}
+        content = {name: arm.to_dict() for name, arm in names.items()}
         click.echo(json_text({"schema": 1, "robots": content}), nl=False)
         return 0
-    rows = tuple((name, robot.name, robot.joints, robot.reach()) for name, robot in names.items())
+    rows = tuple((name, arm.name, arm.joints, arm.reach()) for name, arm in names.items())
     header = ("name", "robot", "joints", "links in all m")
     options.show(Table("built-in robots", header, rows, ("", "", "d", ".2f")))
     return 0
+
+
+def links_table(robot: Robot) -> Table:
+    """Links and limits in millimetres and degrees."""
+    (length, mm), (angle, deg) = turned_for_people("m"), turned_for_people("rad")
+    scale = np.array([length if name in LENGTHS else angle for name in MDH_NAMES])
+    rows: list[tuple[Cell, ...]] = []
+    for i, (link, slides) in enumerate(zip(robot.mdh, robot.prismatic, strict=True)):
+        ends = (length if slides else angle) * np.array([robot.lower[i], robot.upper[i]])
+        numbers = [*(scale * link).tolist(), *ends.tolist()]
+        rows.append((f"J{i + 1}", *numbers, mm if slides else deg))
+    units = (f"{name} {mm if name in LENGTHS else deg}" for name in MDH_NAMES)
+    header = ("joint", *units, "from", "to", "in")
+    formats = ("", *[".3f"] * 5, *[".1f"] * 2, "")
+    return Table(f"{robot.name}: links and limits", header, tuple(rows), formats)

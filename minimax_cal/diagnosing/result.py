@@ -29,6 +29,8 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.frames import frames_of
+from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -370,6 +372,8 @@ class Diagnosis:
                     for step in self.ladder
                 ],
             },
+            "frames": {name: frame.to_dict() for name, frame in self.frames.items()},
+            "frames_convention": CONVENTION,
             "remainder": self.remainder.to_dict() if self.remainder else None,
             "noise": {
                 "instrument_mm": finite(1e3 * self.noise),
@@ -388,6 +392,11 @@ class Diagnosis:
             "seconds": self.seconds,
             "provenance": vars(self.provenance),
         }
+
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """Where base and tool stand with all effects, and the corrections: `frames_of`."""
+        return frames_of(self.cells[-1], self.nominal) if self.cells else {}
 
     def rungs(self) -> tuple[tuple[str, Cell], ...]:
         """Every arm with its name: nominal, geometric, then with each effect."""

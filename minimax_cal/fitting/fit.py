@@ -31,7 +31,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.optional import optional
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
-from minimax_cal.ground.units import for_people, in_files
+from minimax_cal.ground.units import for_people, in_files, turned_for_people
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
@@ -40,9 +40,11 @@ from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
+from minimax_cal.modelling.frames import frames_of, tables_of
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
-from minimax_cal.modelling.parameters import Names
+from minimax_cal.modelling.parameters import BASE_NAMES, Names
+from minimax_cal.robots.frames import Frame
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
@@ -57,6 +59,12 @@ ACCURACIES = (  # where accuracy is told: title, key
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 ROUGH = 1e-6  # a QP answered worse than this is told
 NOT_IDENTIFIED = "not identified because"
+CORRECTIONS = {  # parameters that are no values but corrections, and of what
+    **dict.fromkeys(BASE_NAMES, "the base of the drawn arm, along its axes"),
+    **dict.fromkeys(
+        ("tool_rx", "tool_ry", "tool_rz"), "the tool of the drawn arm, along the flange's axes"
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,18 @@ class Parameter:
         return ":" in self.name
 
     @property
+    def corrects(self) -> str:
+        """What it is a correction of, empty where it is a value by itself."""
+        return CORRECTIONS.get(self.name, "")
+
+    @property
+    def title(self) -> str:
+        """Its name for people, who must not take a correction for a value."""
+        return f"{self.name} (correction)" if self.corrects else self.name
+
+    @property
     def scale(self) -> tuple[float, str]:
-        """Factor and unit in which people read it: millimetres, milliradians."""
+        """Factor and unit in which people read its change: millimetres, milliradians."""
         return for_people(self.unit)
 
     @property
@@ -102,6 +120,8 @@ class Parameter:
             "unit": unit,
             "identifiable": self.identifiable,
         }
+        if self.corrects:
+            out |= {"correction": (self.value - self.nominal) * scale, "corrects": self.corrects}
         return out | ({"reason": self.reason} if self.reason else {})
 
 
@@ -205,14 +225,20 @@ def link_by_link(
 
 
 def parameter_table(parameters: Iterable[Parameter]) -> Table:
-    """Parameters of geometry with nominal value, change and sigma, in mm and mrad."""
-    rows = tuple(
-        (p.name, p.scale[1], p.nominal * p.scale[0], p.value * p.scale[0],
-         (p.value - p.nominal) * p.scale[0], p.sigma * p.scale[0], p.why_not)
-        for p in parameters
-    )  # fmt: skip
-    header = ("name", "unit", "nominal", "calibrated", "change", "sigma", NOT_IDENTIFIED)
-    return Table("parameters", header, rows, ("", "", ".4f", ".4f", "+.4f", ".2g", ""))
+    """Parameters of geometry: values in mm and degrees, changes and sigmas in mm and mrad.
+
+    Of a correction there is a change alone: where base and tool stand, their frames say.
+    """
+    rows: list[tuple[TableCell, ...]] = []
+    for p in parameters:
+        (size, unit), (scale, of_change) = turned_for_people(p.unit), p.scale
+        drawn, found = (math.nan if p.corrects else size * v for v in (p.nominal, p.value))
+        change = scale * (p.value - p.nominal)
+        unit = "" if p.corrects else unit
+        rows.append((p.title, drawn, found, unit, change, scale * p.sigma, of_change, p.why_not))
+    header = ("name", "nominal", "calibrated", "in", "change", "sigma", "in", NOT_IDENTIFIED)
+    formats = ("", ".4f", ".4f", "", "+.4f", ".2g", "", "")
+    return Table("parameters", header, tuple(rows), formats)
 
 
 @dataclass(frozen=True)
@@ -602,6 +628,11 @@ class Fit:
             ("", *[".4f"] * 6),
         )
 
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """Where base and tool stand, those of the drawn arm, and the corrections: `frames_of`."""
+        return frames_of(self.cell, self.nominal)
+
     def parameter_table(self) -> Table:
         """Every parameter of geometry."""
         return parameter_table(p for p in self.parameters if not p.of_effect)
@@ -663,7 +694,8 @@ class Fit:
             every.append(self.minimax.table())
         if self.certificate:
             every.append(self.certificate.table())
-        every += [self.effect_table(), table_of(self.suspects), self.parameter_table()]
+        every += [*tables_of(self.frames), self.effect_table(), table_of(self.suspects)]
+        every.append(self.parameter_table())
         return tuple(table for table in every if table.rows)
 
     def summary(self, width: int = 110) -> str:

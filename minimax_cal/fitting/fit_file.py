@@ -59,6 +59,7 @@ from minimax_cal.measuring.pose_rows import pose_rows, read_poses
 from minimax_cal.measuring.spans import Span
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.parameters import Names
+from minimax_cal.robots.frames import CONVENTION
 from minimax_cal.robots.kinematics import rotation
 from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.transforms import transform
@@ -235,6 +236,8 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         out["nominal_robot"] = fit.nominal.robot.to_dict()
         out["nominal_cell"] = fit.nominal.to_dict()
     out |= {
+        "frames": {name: frame.to_dict() for name, frame in fit.frames.items()},
+        "frames_convention": CONVENTION,
         "objective": fit.objective,
         "loss": fit.loss,
         "suspects": [suspect.to_dict() for suspect in fit.suspects],

@@ -1,9 +1,16 @@
 """In which units people and files read a value that is in SI here."""
 
+from math import pi
+
 
 def for_people(unit: str) -> tuple[float, str]:
-    """Factor and unit in which people read a value: millimetres, milliradians."""
+    """Factor and unit in which people read a length, or a change of an angle: mm, mrad."""
     return {"m": (1e3, "mm"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
+
+
+def turned_for_people(unit: str) -> tuple[float, str]:
+    """Factor and unit in which people read a value itself: an angle of a robot is in degrees."""
+    return (180.0 / pi, "deg") if unit == "rad" else for_people(unit)
 
 
 def in_files(unit: str) -> tuple[float, str]:

@@ -104,9 +104,10 @@ class Bootstrap:
         """Every parameter with its percentiles, in mm, mrad, or the effect's own unit."""
         rows: list[tuple[Cell, ...]] = []
         for i, (low, high) in enumerate(self.interval(level)):
-            scale, unit = for_people(self.units[i])
-            numbers = (self.value[i], self.sigma[i], low, high)
-            rows.append((self.names[i], unit, *(scale * float(number) for number in numbers)))
+            one, (scale, unit) = self.fit.parameters[self.names[i]], for_people(self.units[i])
+            start = one.nominal if one.corrects else 0.0
+            numbers = (self.value[i] - start, self.sigma[i], low - start, high - start)
+            rows.append((one.title, unit, *(scale * float(number) for number in numbers)))
         return Table(
             f"{len(self.change)} calibrations of poses drawn anew: {100.0 * level:g} % intervals",
             ("name", "unit", "value", "sigma", "low", "high"),

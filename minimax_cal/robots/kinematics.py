@@ -116,9 +116,23 @@ def rotation(w: Array) -> Array:
 
 
 def rotation_vector(turn: Array) -> Array:
-    """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of `rotation`.
+    """The rotation vector (3,) of a rotation (3, 3) [rad]: the inverse of `rotation`."""
+    v, w = along_quaternion(turn)
+    sine = float(np.linalg.norm(v))
+    return np.asarray(v * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
 
-    By the quaternion, from its largest entry [Shepperd 1978].
+
+def quaternion(turn: Array) -> Array:
+    """The unit quaternion (4,) of a rotation (3, 3): w, x, y, z with w not negative."""
+    v, w = along_quaternion(turn)
+    every = np.array([w, *v])
+    return np.asarray(every / np.linalg.norm(every))
+
+
+def along_quaternion(turn: Array) -> tuple[Array, float]:
+    """Vector (3,) and scalar of the quaternion of a rotation (3, 3), of any length.
+
+    From its largest entry [Shepperd 1978].
     """
     square = np.append(np.diag(turn), np.trace(turn))  # 4 x^2 ... 4 w^2, alike up to a constant
     largest = int(np.argmax(square))
@@ -131,6 +145,4 @@ def rotation_vector(turn: Array) -> Array:
         v[i] = 1.0 + turn[i, i] - turn[j, j] - turn[k, k]
         v[j], v[k] = turn[j, i] + turn[i, j], turn[k, i] + turn[i, k]
         w = turn[k, j] - turn[j, k]
-    v, w = (-v, -w) if w < 0.0 else (v, w)
-    sine = float(np.linalg.norm(v))
-    return np.asarray(v * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
+    return (-v, -float(w)) if w < 0.0 else (v, float(w))

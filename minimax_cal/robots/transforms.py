@@ -68,15 +68,24 @@ def from_rpy(xyz: Array, rpy: Array) -> Array:
 def to_rpy(pose: Array, near: Array | None = None) -> Array:
     """Roll, pitch, yaw of a pose [rad]; of the two ways to write them, the one nearer to near."""
     near = np.zeros(3) if near is None else near
-    r = pose[:3, :3]
-    steep = np.hypot(r[0, 0], r[1, 0]) < 1e-14  # then only roll - yaw or roll + yaw counts
-    yaw = near[2] if steep else np.arctan2(r[1, 0], r[0, 0])
-    rest = turn(2, -yaw)[:3, :3] @ r  # = Ry(pitch) Rx(roll): well conditioned everywhere
-    one = np.array([np.arctan2(-rest[1, 2], rest[1, 1]), np.arctan2(-rest[2, 0], rest[0, 0]), yaw])
+    one = level_rpy(pose, near[2])
     other = np.array([one[0] + np.pi, np.pi - one[1], one[2] + np.pi])
     both = [near + np.remainder(way - near + np.pi, 2 * np.pi) - np.pi for way in (one, other)]
     best = both[int(np.abs(both[1] - near).sum() < np.abs(both[0] - near).sum() - 1e-9)]
     return np.asarray(np.where(np.abs(best) < 1e-17, 0.0, best))
+
+
+def level_rpy(pose: Array, yaw: float = 0.0) -> Array:
+    """Roll, pitch, yaw of a pose [rad], the pitch within a quarter turn.
+
+    yaw: taken where the pitch is one, and only roll - yaw or roll + yaw counts.
+    """
+    r = pose[:3, :3]
+    steep = np.hypot(r[0, 0], r[1, 0]) < 1e-14
+    yaw = yaw if steep else float(np.arctan2(r[1, 0], r[0, 0]))
+    rest = turn(2, -yaw)[:3, :3] @ r  # = Ry(pitch) Rx(roll): well conditioned everywhere
+    roll, pitch = np.arctan2(-rest[1, 2], rest[1, 1]), np.arctan2(-rest[2, 0], rest[0, 0])
+    return np.array([roll, pitch, yaw])
 
 
 def difference(one: Array, other: Array) -> float:

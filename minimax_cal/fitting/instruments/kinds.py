@@ -138,7 +138,7 @@ def from_poses(
         errors=errors,
         numbers={key: 6 * error.shape[1] for key, error in errors.items()},
         turns=turns,
-        instrument=poses.pose_place(calibration.cell, fitted.tool, lever),
+        instrument=poses.pose_place(fitted, lever),
         identification=calibration.identification,
         position_sigma=position_sigma(robot, fitted.model, fitted.state, fitted.covariance),
         beyond=beyond,

@@ -23,7 +23,7 @@ from minimax_cal.fitting.instruments.split import before_and_after
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.cell import Cell, pose_to_dict
 from minimax_cal.modelling.model import Model, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import hat, rotation_vector
@@ -212,13 +212,12 @@ def beyond_one(fitted: PoseFit, robot: Robot, options: RelativeOptions) -> tuple
     return (*(names.all[i] for i in np.flatnonzero(more)), *place, *TOOL[3:])
 
 
-def pose_place(cell: Cell, tool: Array, lever: float) -> dict[str, Any]:
+def pose_place(fitted: PoseFit, lever: float) -> dict[str, Any]:
     """For JSON: base in the measurement frame, measured frame in the flange, and the lever."""
-    return {
-        "base": cell.to_dict()["base"],
-        "tool": {
-            "translation_mm": (1e3 * tool[:3, 3]).tolist(),
-            "rotation_vector_rad": rotation_vector(tool[:3, :3]).tolist(),
-        },
-        "lever_mm": 1e3 * lever,
+    places = {
+        "base": fitted.fit.cell.base,
+        "tool": fitted.tool,
+        "nominal_base": fitted.fit.before.base,
+        "nominal_tool": fitted.nominal_tool,
     }
+    return {name: pose_to_dict(pose) for name, pose in places.items()} | {"lever_mm": 1e3 * lever}

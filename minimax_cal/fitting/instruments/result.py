@@ -18,9 +18,12 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
-from minimax_cal.ground.records import Number, Part, checked
+from minimax_cal.ground.records import Number, Part, checked, reading
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
+from minimax_cal.modelling.cell import pose_from_dict
+from minimax_cal.modelling.frames import paired, tables_of
+from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
@@ -156,7 +159,18 @@ class RelativeCalibration:
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         parts = (self.parts_table(),) if len(self.parts) > 1 and self.errors else ()
-        return (self.accuracy_table(), *parts, parameter_table(self.parameters))
+        frames = tables_of(self.frames)
+        return (self.accuracy_table(), *parts, *frames, parameter_table(self.parameters))
+
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """Base and tool of whole poses, those of the drawn arm, and the corrections."""
+        places = {
+            name: pose_from_dict(self.instrument[name]) if name in self.instrument else None
+            for name in ("base", "nominal_base", "tool", "nominal_tool")
+        }
+        base = paired("base", places["base"], places["nominal_base"])
+        return base | paired("tool", places["tool"], places["nominal_tool"])
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
@@ -190,6 +204,14 @@ class RelativeCalibration:
             "robot": self.robot.to_dict(),
             "nominal_robot": self.nominal.to_dict(),
             "parts": list(self.parts),
+            **(
+                {
+                    "frames": {name: frame.to_dict() for name, frame in self.frames.items()},
+                    "frames_convention": CONVENTION,
+                }
+                if self.frames
+                else {}
+            ),
             "instrument": dict(self.instrument),
             "status": str(self.status),
             "advice": self.status.advice,
@@ -211,7 +233,7 @@ class RelativeCalibration:
         """From `to_dict`, without the errors of single rows.  Raises CalibrationError."""
         part = checked(RelativePart, content, source)
         known = np.array([p.identifiable for p in part.parameters])
-        return RelativeCalibration(
+        found = RelativeCalibration(
             kind=part.measured,
             robot=robot_from_dict(content["robot"], f"{source}: robot"),
             nominal=robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot"),
@@ -235,6 +257,9 @@ class RelativeCalibration:
             provenance=part.provenance,
             stated={key: each.accuracy() for key, each in part.accuracy.items()},
         )
+        with reading(source, "instrument"):
+            _ = found.frames  # poses that are none are refused here, not when they are shown
+        return found
 
     def json(self) -> str:
         """`to_dict` as text."""

@@ -9,6 +9,7 @@ from minimax_cal.fitting.suspects import table_of
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283 import iso9283
+from minimax_cal.modelling.frames import tables_of
 from minimax_cal.reporting.html.content import Block, Blocks, caveat, missing, text
 from minimax_cal.reporting.html.error_charts import (
     Names,
@@ -105,13 +106,15 @@ def joints(sources: Sources) -> Blocks:
 
 def parameters(fit: Fit) -> Blocks:
     """What was identified, how surely, and what was not."""
-    blocks: list[Block] = [fit.parameter_table(), *filled(fit.effect_table())]
+    blocks: list[Block] = [*tables_of(fit.frames)]
+    blocks += [fit.parameter_table(), *filled(fit.effect_table())]
     blocks.append(
         text(
-            "Lengths in mm, angles in mrad. Sigma is the standard deviation that measurement noise "
-            "and the scatter of the residuals give the identified value; a dash means that the "
-            "parameter was kept. Condition number of what was identified: "
-            f"{fit.identification.condition:.3g}."
+            "Lengths in mm, angles in degrees, their changes and sigmas in mrad; base_x to base_rz "
+            "correct the base of the drawn arm, along its own axes. Sigma is the standard "
+            "deviation that measurement noise and the scatter of the residuals give the identified "
+            "value; a dash means that the parameter was kept. Condition number of what was "
+            f"identified: {fit.identification.condition:.3g}."
         )
     )
     return [*blocks, *why_not(fit)]

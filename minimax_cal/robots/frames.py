@@ -1,0 +1,78 @@
+"""A frame as people write it: origin in mm, A, B, C in degrees; quaternion and rotation vector.
+
+A turns about z, B about the y axis that results, C about the x axis that results then, as KUKA
+does: the rotation is Rz(A) Ry(B) Rx(C).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Table
+from minimax_cal.ground.units import for_people, turned_for_people
+from minimax_cal.robots.kinematics import quaternion, rotation_vector
+from minimax_cal.robots.transforms import from_rpy, level_rpy
+
+CONVENTION = "A about z, then B about y, then C about x, each axis as turned: Rz(A) Ry(B) Rx(C)"
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rigid motion: where a frame stands in another.  Angles A, B, C; B within 90 degrees."""
+
+    xyz_mm: Triple
+    abc_deg: Triple
+    quaternion_wxyz: tuple[float, float, float, float]
+    rotation_vector_rad: Triple
+
+    @staticmethod
+    def of(pose: Array) -> Frame:
+        """From a pose (4, 4) [m]."""
+        (length, _), (angle, _) = for_people("m"), turned_for_people("rad")
+        x, y, z = (length * pose[:3, 3]).tolist()
+        c, b, a = (angle * level_rpy(pose)).tolist()
+        w, *v = quaternion(pose[:3, :3]).tolist()
+        turn = rotation_vector(pose[:3, :3]).tolist()
+        return Frame((x, y, z), (a, b, c), (w, *v), tuple(turn))
+
+    @property
+    def pose(self) -> Array:
+        """(4, 4) [m]."""
+        a, b, c = self.abc_deg
+        scale, _ = turned_for_people("rad")
+        xyz = np.array(self.xyz_mm) / for_people("m")[0]
+        return from_rpy(xyz, np.array([c, b, a]) / scale)
+
+    @property
+    def distance_mm(self) -> float:
+        """Of its origin."""
+        return float(np.linalg.norm(self.xyz_mm))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {name: list(value) for name, value in vars(self).items()}
+
+
+def frames_tables(frames: Mapping[str, Frame], title: str) -> tuple[Table, Table]:
+    """Frames by their names as X, Y, Z and A, B, C, and as quaternions and rotation vectors."""
+    rows = tuple((name, *frame.xyz_mm, *frame.abc_deg) for name, frame in frames.items())
+    turns = tuple(
+        (name, *frame.quaternion_wxyz, *frame.rotation_vector_rad) for name, frame in frames.items()
+    )
+    header = ("frame", "X mm", "Y mm", "Z mm", "A deg", "B deg", "C deg")
+    other = ("frame", "w", "x", "y", "z", "rx rad", "ry rad", "rz rad")
+    return (
+        Table(f"{title}; {CONVENTION}", header, rows, ("", *[".3f"] * 3, *[".4f"] * 3)),
+        Table(
+            "the same rotations as unit quaternions (w, x, y, z) and as rotation vectors",
+            other,
+            turns,
+            ("", *[".6f"] * 7),
+        ),
+    )
