@@ -40,7 +40,7 @@ from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
-from minimax_cal.modelling.frames import frames_of, tables_of
+from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
 from minimax_cal.modelling.parameters import BASE_NAMES, Names
@@ -442,7 +442,7 @@ class Fit:
     def spans(self) -> tuple[Span, ...]:
         """How far each joint went in the training poses; none where a file does not tell."""
         train = self.train
-        return spans_of(self.robot, train) if train.poses else self.beyond.spans
+        return spans_of(self.cell.robot, train) if train.poses else self.beyond.spans
 
     @property
     def errors(self) -> Mapping[str, Array]:
@@ -630,8 +630,14 @@ class Fit:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """Where base and tool stand, those of the drawn arm, and the corrections: `frames_of`."""
-        return frames_of(self.cell, self.nominal)
+        """Where base and tool stand, those of the drawn arm, and the corrections: `frames_of`.
+
+        They go with `robot`; those that go with the effects of the `cell` stand beside them.
+        """
+        out = frames_of(self.geometric, self.nominal)
+        if self.geometric is not self.cell:
+            out |= with_effects(frames_of(self.cell, self.nominal))
+        return out
 
     def parameter_table(self) -> Table:
         """Every parameter of geometry."""

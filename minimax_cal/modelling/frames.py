@@ -13,8 +13,9 @@ from minimax_cal.robots.frames import Frame, frames_tables
 from minimax_cal.robots.transforms import inverse, nearest_rotation, transform
 
 FLAT = 0.02  # width over length of reflectors from which their turn is told; as `checks.collinear`
-DRAWN, CORRECTION, SESSION = "_nominal", "_correction", "session "  # of the frames' names
-IN_WORDS = {DRAWN: " of the drawn arm", CORRECTION: " correction"}
+# of the frames' names
+DRAWN, CORRECTION, EFFECTS, SESSION = "_nominal", "_correction", "_with_effects", "session "
+IN_WORDS = {DRAWN: " of the drawn arm", CORRECTION: " correction", EFFECTS: ", with effects"}
 
 
 def frames_of(cell: Cell, nominal: Cell | None) -> dict[str, Frame]:
@@ -54,6 +55,12 @@ def tools(after: Array, before: Array) -> tuple[Array | None, Array | None]:
     return transform(turn, after.mean(axis=0)), transform(np.eye(3), before.mean(axis=0))
 
 
+def with_effects(frames: Mapping[str, Frame]) -> dict[str, Frame]:
+    """The frames that a fit with effects changes, under names that say so."""
+    fixed = (DRAWN, SESSION)
+    return {f"{n}{EFFECTS}": f for n, f in frames.items() if not any(part in n for part in fixed)}
+
+
 def is_thin(centred: Array) -> bool:
     """Whether points (k, 3) about their centroid lie nearly on a line."""
     size = np.linalg.svd(centred, compute_uv=False)
@@ -76,4 +83,6 @@ def in_words(name: str) -> str:
     """A frame's name for people."""
     if name.startswith(SESSION):
         return f"instrument of {name}"
-    return next((name.replace(end, said) for end, said in IN_WORDS.items() if end in name), name)
+    for part, said in IN_WORDS.items():
+        name = name.replace(part, said)
+    return name

@@ -154,6 +154,22 @@ def test_whole_poses_have_base_and_tool(robot: mc.Robot) -> None:
     assert again.to_dict()["frames"] == found.to_dict()["frames"]
 
 
+def test_frames_with_effects_stand_beside_those_of_geometry(
+    robot: mc.Robot, noisy: Simulation
+) -> None:
+    fit = mc.calibrate(robot, noisy.data, "sum", effects="joint_compliance:all")
+    frames = fit.to_dict()["frames"]
+    plain, whole = (1e3 * cell.base[:3, 3] for cell in (fit.geometric, fit.cell))
+    assert_allclose(frames["base"]["xyz_mm"], plain, rtol=1e-15)
+    assert frames["base"]["xyz_mm"] == fit.to_dict()["base"]["translation_mm"]
+    assert_allclose(frames["base_with_effects"]["xyz_mm"], whole, rtol=1e-15)
+    assert np.abs(plain - whole).max() > 1e-3
+    moved = frames["base_correction_with_effects"]["xyz_mm"][0]
+    one = fit.parameters["base_x"]  # of the table, which is of the fit with effects
+    assert moved == pytest.approx(1e3 * (one.value - one.nominal), abs=1e-9)
+    assert "base correction, with effects" in fit.summary(200)
+
+
 def test_a_diagnosis_writes_its_frames(results: Path) -> None:
     found = json.loads((results / "gap.json").read_text())["frames"]
     base = mc.Diagnosis.from_dict(json.loads((results / "gap.json").read_text())).cells[-1].base
