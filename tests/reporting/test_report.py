@@ -177,12 +177,20 @@ def test_accuracy_is_that_of_the_calibration(results: Path, seen: Seen) -> None:
 
 def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> None:
     rows = {row[0]: row for row in seen.tables["parameters"][1:]}
-    assert set(rows) == {p["name"] for p in fit["parameters"]}
+    titles = {p["name"]: f"{p['name']} (correction)" if "corrects" in p else p["name"]
+              for p in fit["parameters"]}  # fmt: skip
+    assert set(rows) == set(titles.values())
     for p in fit["parameters"]:
-        scale = 1e3 if p["unit"] == "rad" else 1.0
-        _, unit, nominal, value, change, sigma, reason = rows[p["name"]]
-        assert unit == {"rad": "mrad", "mm": "mm"}[p["unit"]]
-        assert (nominal, value) == (f"{scale * p['nominal']:.4f}", f"{scale * p['value']:.4f}")
+        turns = p["unit"] == "rad"
+        scale, size = (1e3, 180.0 / np.pi) if turns else (1.0, 1.0)
+        _, nominal, value, unit, change, sigma, of_change, reason = rows[titles[p["name"]]]
+        assert of_change == ("mrad" if turns else "mm")
+        if "corrects" in p:
+            assert (nominal, value, unit) == ("-", "-", "")
+        else:
+            assert unit == ("deg" if turns else "mm")
+            shown = (f"{size * p[key]:.4f}" for key in ("nominal", "value"))
+            assert (nominal, value) == tuple("0.0000" if s == "-0.0000" else s for s in shown)
         assert change == f"{scale * (p['value'] - p['nominal']):+.4f}"
         assert sigma == ("-" if p["sigma"] is None else f"{scale * p['sigma']:.2g}")
         assert reason == ("" if p["identifiable"] else p["reason"])
