@@ -196,6 +196,21 @@ def test_a_keyframe_grows_with_the_springs(tmp_path: Path) -> None:
     assert out.key_qpos[0].sum() == 21.0
 
 
+def test_a_command_map_reaches_what_the_fit_says(tmp_path: Path) -> None:
+    model = ur10_like(tmp_path)
+    weighs = chain_of(read_model(model).compiled(), 6, str(model)).robot
+    cell = cell_with(weighs, "joint_compliance:all", "gear_error:J3:turns=1", size=8e-6,
+                     gear_error=[4e-4, -2e-4])  # fmt: skip
+    job = replace(job_of("cell", cell), nominal=weighs, fitted=True, model=model)
+    made = write(replace(job, path=tmp_path / "out.xml"))
+    (tmp_path / "out.xml").write_bytes(made.content)
+    (tmp_path / "out.commands.json").write_bytes(made.beside[".commands.json"])
+    q = poses(weighs, 4)
+    asked = mc.load_commands(tmp_path / "out.commands.json")(q)
+    assert np.abs(asked - q).max() > 1e-4
+    check_held(tmp_path / "out.xml", cell, q, asked)
+
+
 UNSTABLE = "integrator='Euler' timestep='0.005'"
 
 
