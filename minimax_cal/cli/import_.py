@@ -23,12 +23,11 @@ from minimax_cal.cli.options import (
     with_output,
 )
 from minimax_cal.ground.files import json_text
-from minimax_cal.ground.options import names_of
 from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
-from minimax_cal.measuring.left_out import left_out
 from minimax_cal.measuring.measurements import check_finite, measurements_in
+from minimax_cal.measuring.set_aside import left_out
 
 TOLD = "What the files do not tell"
 
@@ -63,10 +62,10 @@ TOLD = "What the files do not tell"
 @plain_option(
     TOLD,
     "--leave-out",
-    default="",
-    metavar="POINTS",
-    help="The points to treat as if nobody had measured them: 12:smr2 is that of line 12, 12 all "
-    "of its pose; several with commas.",
+    multiple=True,
+    metavar="POINTS[=WHY]",
+    help="Points to set aside, and why: 12:smr2 is that of line 12, 12 all of its pose; several "
+    "with commas, the reason after an equals sign.",
 )
 @SAFE_CELLS
 @JSON
@@ -79,7 +78,7 @@ def import_command(
     joints: Path | None,
     layout: str | None,
     decimal: str | None,
-    leave_out: str,
+    leave_out: tuple[str, ...],
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -89,7 +88,7 @@ def import_command(
     Without -o nothing is written.
     """
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
-    found = replace(found, data=left_out(found.data, names_of([leave_out])))
+    found = replace(found, data=left_out(found.data, leave_out))
     check_finite(found.data)  # what is left of it
     off = [fault.text for fault in distance_faults(found.data)]
     found = replace(found, data=replace(found.data, notices=(*found.data.notices, *off)))
@@ -129,5 +128,6 @@ def content(found: Imported, output: Path | None) -> dict[str, object]:
             }
             for row, table in zip(files.rows, columns, strict=True)
         ],
+        "set_aside": [point.to_dict() for point in found.data.set_aside],
         "notices": list(found.data.notices),
     }

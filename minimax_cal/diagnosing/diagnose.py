@@ -39,6 +39,7 @@ from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Step
+from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
 from minimax_cal.diagnosing.verdict import judged
@@ -201,6 +202,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     told = (*asked.data.notices, *notices, *clean.remarks, *unread)
     if late:
         told = (*told, f"points that stand out beside all that was found: {listed(late)}")
+    gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
     every = ladder.last.cell.placed(clean.given)
     told = (*told, *contradictions(every, ladder.last.cell.error(every)))
     settings = vars(options) | {"exclude": list(options.exclude)}
@@ -228,6 +230,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         cells=tuple(fit.cell for fit in ladder.fits),
         nominal=study.nominal,
         remainder=rest,
+        set_aside=gone,
+        with_them=counted,
     )
 
 
@@ -336,13 +340,15 @@ def located(study: Study) -> Where:
 class Clean:
     """Measurements with rows and points put right or left out.
 
-    given: as measured, but for points that stood in each other's rows.  faults: their rows as lines
+    given: as measured, but for points that stood in each other's rows.  left: points that no fit
+    counts, by lines of the file.  faults: their rows as lines
     of the file.  remarks: on them, for people.  fit: the geometric fit of the training poses, where
     it is that of the clean data.  moments: as `Study` has them.
     """
 
     data: Measurements
     given: Measurements
+    left: tuple[Fault, ...]
     faults: tuple[Fault, ...]
     remarks: tuple[str, ...]
     fit: Solved | None
@@ -390,7 +396,8 @@ def cleaned(asked: Asked, progress: Progress) -> Clean:
     remarks = tuple(fault.text for fault in told if fault.effect != TARGET_SHIFT.name)
     rows = np.concatenate([NO_ROWS, *(fault.rows for fault in jumped)])
     moments = sound.columns["clock"][rows]
-    return Clean(sound, data, faults, remarks, None if more else fit, moments)
+    left = tuple(in_lines(data, (*found, *more), "outliers", RESEAT))
+    return Clean(sound, data, left, faults, remarks, None if more else fit, moments)
 
 
 def in_order(robot: Robot, data: Measurements) -> tuple[Measurements, tuple[Fault, ...]]:

@@ -16,12 +16,14 @@ from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual
 from minimax_cal.evidence.limits import BAND, ENOUGH, FIRM, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import finite, json_text, number, plain, write_whole
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import in_files
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.history import with_history
@@ -263,6 +265,7 @@ class Diagnosis:
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
     remainder: what free functions still predict, None in an old file.
+    set_aside: points that no fit counts; with_them: how the last step does where they count.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -291,6 +294,8 @@ class Diagnosis:
     stated_curves: Mapping[str, Curve] | None = None
     nominal: Cell | None = None
     remainder: Remainder | None = None
+    set_aside: tuple[SetAside, ...] = ()
+    with_them: WithThem | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -352,6 +357,12 @@ class Diagnosis:
             "verdict": self.verdict,
             "reasons": list(self.reasons),
             "effects": [finding.to_dict() for finding in self.findings],
+            "set_aside": [point.to_dict() for point in self.set_aside],
+            **(
+                {"accuracy": {"holdout_with_them": self.with_them.to_dict()}}
+                if self.with_them
+                else {}
+            ),
             "gap": {
                 "holdout_rms_mm": held("rms_mm"),
                 "holdout_max_mm": held("max_mm"),
@@ -500,7 +511,8 @@ class Diagnosis:
 
     def headline(self) -> str:
         """The verdict in words."""
-        return " ".join(self.reasons)
+        aside = aside_sentence(self.set_aside, self.with_them) if self.set_aside else ""
+        return " ".join(filter(None, [*self.reasons, aside]))
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

@@ -30,6 +30,7 @@ from minimax_cal.fitting.fit_file import (
     TableParameter,
     in_si,
     measured_poses,
+    with_them_of,
 )
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import numbers
@@ -43,6 +44,7 @@ from minimax_cal.ground.records import (
     check_schema,
     checked,
 )
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
@@ -202,6 +204,12 @@ class CurvePart(Part):
         return Curve(self.title, self.x.label, self.y.label, x, y)
 
 
+class WithPart(Part):
+    """The accuracy where points that were set aside count."""
+
+    holdout_with_them: ScoresPart | None = None
+
+
 class DiagnosisPart(Part):
     """The file of `minimax-cal diagnose -o`."""
 
@@ -210,6 +218,8 @@ class DiagnosisPart(Part):
     verdict: Literal["none", "named", "one_of", "unknown", "not_repeatable"]
     effects: tuple[FindingPart, ...]
     gap: GapPart
+    set_aside: tuple[Recorded[SetAside], ...] = ()
+    accuracy: WithPart = WithPart()
     remainder: RemainderPart | None = None
     noise: NoisePart = NoisePart()
     structure: StructurePart = StructurePart()
@@ -269,6 +279,8 @@ def assembled(
         held=held,
         cells=cells,
         remainder=part.remainder.remainder() if part.remainder else None,
+        set_aside=part.set_aside,
+        with_them=with_them_of(part.accuracy.holdout_with_them),
         stated_errors=errors,
         stated_curves={name: curve.curve() for name, curve in part.curves.items()},
     )

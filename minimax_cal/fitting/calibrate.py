@@ -57,6 +57,7 @@ from minimax_cal.fitting.outcome import (
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.same_arm import wild
 from minimax_cal.fitting.second_visits import contradictions
+from minimax_cal.fitting.set_aside import judged_with
 from minimax_cal.fitting.solve import LEAST_POSES, PER, Solved, fit_cell
 from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps, stationed, unplaced
@@ -64,11 +65,13 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
 from minimax_cal.measuring import checks, faults
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.aside import TOOL
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
 from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
+from minimax_cal.measuring.set_aside import set_aside
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
@@ -244,9 +247,10 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
     notices = (*data.notices, *filter(None, doubts), *said)
     few = train.seen.sum(axis=0) < LEAST_POSES
     if few.any() and not few.all():
-        names = ", ".join(np.array(data.target_names)[few])
+        names, why = ", ".join(np.array(data.target_names)[few]), f"fewer than {LEAST_POSES} poses"
         notices += (f"left out: {names}, measured at fewer than {LEAST_POSES} training poses",)
-        data, train, held = data.keep(~few), train.keep(~few), held.keep(~few)
+        data = set_aside(data, data.seen & few, f"the fit has {why} with this target", TOOL)
+        data, train, held = (part.keep(~few) for part in (data, train, held))
         objective_of(options.objective, data)
     near = EVERYWHERE
     if len(np.unique(groups(train))) >= LEAST_POSES:
@@ -295,6 +299,7 @@ def judged(
         status = Status.FAILED
     elif better and not better.is_better and status in ENDED:
         status, reason = Status.NO_BETTER, no_better(better, suspects)
+    gone, counted = judged_with(data, held, cell, after, crossed, solved, options)
     alarming = tuple(alarms(robot, poses, solved, before[:, ~held]))
     notices = (
         *poses.notices,
@@ -324,6 +329,7 @@ def judged(
             "train": accuracy(after[:, ~held]),
             "holdout": accuracy(after[:, held]),
             "nominal_train": accuracy(before[:, ~held]),
+            **({"holdout_with_them": counted.accuracy} if counted else {}),
         },
         identification=solved.identification,
         uncertainty=solved.uncertainty,
@@ -344,6 +350,8 @@ def judged(
         provenance=Provenance.of(robot, data, options.settings()),
         claim=partial(beyond_of, robot, options, data, held, solved, suspects),
         error_crossed=crossed,
+        set_aside=gone,
+        with_them=counted,
         answered=solved.optimum.answered if solved.optimum else {},
         work=work_of(solved),
         error_drawn_crossed=drawn_crossed,

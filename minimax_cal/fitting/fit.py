@@ -23,6 +23,7 @@ from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.minimax_problem import Distances, measured_distances
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
 from minimax_cal.ground.arrays import Array, rms
@@ -33,6 +34,7 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.ground.units import for_people, in_files, turned_for_people
 from minimax_cal.measuring.accuracy import Accuracy, accuracy, before_and_after
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.grouping import clusters, grouped
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
@@ -56,6 +58,7 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
 )
+WITH_THEM = "holdout_with_them"  # the key of the accuracy with the points set aside
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 ROUGH = 1e-6  # a QP answered worse than this is told
 NOT_IDENTIFIED = "not identified because"
@@ -344,6 +347,7 @@ class Fit:
     error_crossed: (k, m, 3) of every pose by a fit without it [m], empty unless cross-validated;
     error_drawn_crossed: the same of the drawn arm.
     reason: why it failed or is no better than the drawn arm, and what to do; empty where neither.
+    set_aside: points that take no part; with_them: how it does where they count, None without any.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
     stated_geometric: `geometric` as the file of the fit holds it.
     """
@@ -377,6 +381,8 @@ class Fit:
     claim: Callable[[], Beyond]
     stated: Mapping[str, tuple[Interval, Interval]] | None = None
     error_crossed: Array = field(default_factory=NOT_CROSSED.copy)
+    set_aside: tuple[SetAside, ...] = ()
+    with_them: WithThem | None = None
     answered: Mapping[str, int] = field(default_factory=dict)
     work: Work = Work()
     stated_geometric: Cell | None = None
@@ -525,11 +531,12 @@ class Fit:
 
         As they are told to people: open above where the poses tell no upper end.
         """
+        more = {WITH_THEM: (self.with_them.rms, self.with_them.largest)} if self.with_them else {}
         if self.stated is not None:
-            return self.stated
+            return {**self.stated, **more}
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
-        return {
+        return more | {
             key: (
                 told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * seen.rms_mm),
                 told(max_interval(self.errors[key], group, rng=rng), 1e-3 * seen.max_mm),
@@ -594,6 +601,8 @@ class Fit:
             yield title, self.accuracy[key]
             if key == "holdout" and any(one.held for one in self.suspects):
                 yield f"{title}, without suspects", self.trusted
+            if key == "holdout" and self.with_them:
+                yield f"{title}, with {len(self.set_aside)} set aside", self.with_them.accuracy
 
     def accuracy_table(self) -> Table:
         """Accuracy before and after, on the held-out and on the training poses."""
@@ -668,10 +677,11 @@ class Fit:
         """The result in a sentence or two."""
         before, after, where = self.within.before, self.within.after, self.within.where
         identified = sum(p.identifiable for p in self.parameters)
+        aside = f"{self.aside_sentence()} " if self.set_aside else ""
         beyond = f"{said} " if (said := self.beyond.sentence()) else ""
         text = (
             f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
-            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {beyond}"
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {aside}{beyond}"
             f"{identified} of {len(self.parameters)} parameters identified "
             f"(condition {self.identification.condition:.3g}); {self.status} after "
             f"{self.iterations} iterations, {self.seconds:.2f} s.{self.solved_by()}"
@@ -692,6 +702,10 @@ class Fit:
             how = f"used as they are, relative residual up to {work.qp_residual:.1g}"
         steps = f"{work.steps} steps of least squares ({work.least_squares})"
         return f" QPs: {who} ({how}), after {steps}."
+
+    def aside_sentence(self) -> str:
+        """How many points were set aside, by whom, and the error with them."""
+        return aside_sentence(self.set_aside, self.with_them)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""

@@ -30,6 +30,7 @@ from minimax_cal.fitting.fit import (
 )
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
 from minimax_cal.ground.arrays import Array
@@ -54,6 +55,7 @@ from minimax_cal.ground.records import (
     unpacked,
 )
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.measuring.pose_rows import pose_rows, read_poses
 from minimax_cal.measuring.spans import Span
@@ -135,6 +137,7 @@ class AccuraciesPart(Part):
     train: ScoresPart
     holdout: ScoresPart
     nominal_train: ScoresPart
+    holdout_with_them: ScoresPart | None = None
     beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
 
     def told(self) -> Iterator[tuple[str, ScoresPart]]:
@@ -216,6 +219,7 @@ class FitPart(Part):
     certificate: CertificatePart | None = None
     suspects: tuple[SuspectPart, ...] = ()
     reason: str = ""
+    set_aside: tuple[Recorded[SetAside], ...] = ()
     notices: tuple[str, ...] = ()
     loss: str = "square"
     widening: float = 1.0
@@ -241,6 +245,7 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         "objective": fit.objective,
         "loss": fit.loss,
         "suspects": [suspect.to_dict() for suspect in fit.suspects],
+        "set_aside": [point.to_dict() for point in fit.set_aside],
         "qp": fit.qp,
         "answered": dict(fit.answered),
         "work": vars(fit.work),
@@ -443,11 +448,23 @@ def assembled(
         claim=part.accuracy.beyond.beyond,
         stated=intervals_of(part, arrays),
         error_crossed=arrays.get("crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
+        set_aside=part.set_aside,
+        with_them=with_them_of(part.accuracy.holdout_with_them),
         answered=part.answered,
         work=part.work,
         error_drawn_crossed=arrays.get("drawn crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
         reason=part.reason,
     )
+
+
+def with_them_of(scores: ScoresPart | None) -> WithThem | None:
+    """How it does with the points that were set aside, where there were any."""
+    if scores is None:
+        return None
+    rms, largest = (
+        Interval(*(1e-3 * end for end in ends)) for ends in (scores.rms_ci95_mm, scores.max_ci95_mm)
+    )
+    return WithThem(scores.accuracy(), rms, largest)
 
 
 def check_settings(settings: Mapping[str, object]) -> None:

@@ -36,12 +36,13 @@ OPTIONAL = {
         "u95": r"u95_(mm|m)",
         "pose": r"pose",
         "split": r"split",
+        "set_aside": r"set_aside",
         "qread": r"qread\d+_(rad|deg|mm|m)",
         "base": r"base\d+_[xyz]_(mm|m)",
     }.items()
 }
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
-TEXT = {"session", "group", "pose", "split"}  # labels, compared but never computed with
+TEXT = {"session", "group", "pose", "split", "set_aside"}  # compared but never computed with
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
 OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 
@@ -220,7 +221,7 @@ def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
 def near(name: str) -> str:
     """A hint when a column's name is close to one that would be used."""
     known = ["order", "time_s", "temperature_C", "payload_kg", "session", "group", "u95_mm"]
-    known += ["pose", "split"]
+    known += ["pose", "split", "set_aside"]
     known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
     known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
     match = difflib.get_close_matches(name, known, 1, cutoff=0.75)

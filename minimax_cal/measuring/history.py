@@ -9,6 +9,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.set_aside import merged
 
 STILL = 1e-7  # a joint that moved less did not move [rad, m]
 
@@ -19,8 +20,23 @@ def with_history(data: Measurements) -> Measurements:
     approach1..n: (m,) sign of the joint's last move, 0 unknown.  move1..n: (m,) the move from the
     pose before [rad, m], 0 unknown.  followed: (m,) 1 where the pose before is known, else 0.
     clock: (m,) place in the session, 0 first to 1 last.  Without an order or times nothing of this
-    is known: all are 0.
+    is known: all are 0.  Poses that were set aside were visited as well.
     """
+    if data.aside is None:
+        return known_history(data)
+    every = known_history(merged(data, data.aside))
+    alone = replace(data.aside, columns=columns_at(every, data.aside.line))
+    return replace(data, columns=columns_at(every, data.line), aside=alone)
+
+
+def columns_at(data: Measurements, line: Array) -> dict[str, Array]:
+    """The columns at some lines of the file, of which the rows are in order."""
+    rows = np.searchsorted(data.line, line)
+    return {name: column[rows] for name, column in data.columns.items()}
+
+
+def known_history(data: Measurements) -> Measurements:
+    """As `with_history`, of rows that are all there."""
     if not ordered(data):
         joints = range(data.q.shape[1])
         names = [f"{stem}{j + 1}" for stem in ("approach", "move") for j in joints]

@@ -15,6 +15,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
 from minimax_cal.ground.words import one_line
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.measuring.columns import (
     JOINT,
     SIMULATED,
@@ -60,6 +61,8 @@ class Measurements:
     frames: (4, 4) where the measurement frame of each session stands in the one that y is given in,
     by its label, the first one's first [m]; empty where y is as measured.
     simulated: whether the source says that its points were computed.
+    set_aside: points that were measured and take no part; aside: these points alone, in rows of
+    their own, as the file has them.
     """
 
     q: Array
@@ -74,6 +77,8 @@ class Measurements:
     digest: str = ""
     frames: Mapping[str, Array] = field(default_factory=dict)
     simulated: bool = False
+    set_aside: tuple[SetAside, ...] = ()
+    aside: Measurements | None = None
 
     @property
     def poses(self) -> int:
@@ -103,12 +108,15 @@ class Measurements:
     def keep(self, targets: Array) -> Measurements:
         """Some targets only, at the poses where one of them was measured.  targets: (k,) mask."""
         names = tuple(name for name, kept in zip(self.target_names, targets, strict=True) if kept)
-        some = replace(self, y=self.y[:, targets], target_names=names)
+        aside = self.aside.keep(targets) if self.aside else None
+        aside = aside if aside and aside.poses else None
+        some = replace(self, y=self.y[:, targets], target_names=names, aside=aside)
         return some.take(np.asarray(some.seen.any(axis=1)))
 
     def only(self, target: int) -> Measurements:
         """One target alone, at the poses where it was measured."""
-        alone = replace(self, y=self.y[:, [target]], target_names=(self.target_names[target],))
+        name = (self.target_names[target],)
+        alone = replace(self, y=self.y[:, [target]], target_names=name, aside=None)
         return alone.take(self.seen[:, target])
 
     def with_y(self, y: Array) -> Measurements:
@@ -285,7 +293,10 @@ def measurements_in(file: Rows) -> Measurements:
     if blind.any():
         notices.append(f"{path}: {blind.sum()} rows hold no measured target and are left out")
     again, said = pasted(file, ~blind)
-    return replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
+    data = replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
+    from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
+
+    return from_column(data)
 
 
 def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
@@ -327,7 +338,10 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
 
 
 def measurements_text(data: Measurements) -> str:
-    """The CSV of measurements, `SIMULATED` above it where they are."""
+    """The CSV of measurements, points set aside with why, `SIMULATED` above it where they are."""
+    from minimax_cal.measuring.set_aside import whole  # which makes measurements itself
+
+    data = whole(data)
     joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]

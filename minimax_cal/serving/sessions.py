@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, json_text, read_raw, write_whole
 from minimax_cal.ground.words import one_line, visible
-from minimax_cal.measuring.left_out import POINT
+from minimax_cal.measuring.set_aside import POINT
 from minimax_cal.robots.robot import builtin_robots
 
 GIVEN, LOG = "given", "log"  # folders of a session: what people dropped, how each step ended

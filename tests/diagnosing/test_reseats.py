@@ -7,8 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.diagnosing.set_aside import WHY
+from minimax_cal.measuring.aside import TOOL, USER
+from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import DISTANCES
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.set_aside import left_out
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 TRUTH = Truth(noise=20e-6, noise_per_metre=0.0, compliance=0.0)
@@ -67,3 +71,22 @@ def test_8_of_60_poses_that_are_off_are_named(targets: int) -> None:
     assert set(wrong.rows) == set(sim.data.line[rows].tolist())
     assert found.ladder[-1].trusted.rms_mm < 2.0 * NOISE_MM
     assert found.floor.high < 2.5 * NOISE_MM
+
+
+def test_what_no_fit_counts_is_listed_and_counted() -> None:
+    """The re-seated part, and a point that the user set aside; both in the accuracy with them."""
+    data = reseated(simulate("irb120", 60, 3, seed=1, truth=TRUTH), (3e-3, 0.0, 4e-3))
+    found = mc.diagnose("irb120", left_out(data, ["3:smr1=looks odd"]), quick=True)
+    by = {(p.by, p.target) for p in found.set_aside}
+    assert by == {(USER, "smr1"), (TOOL, "smr2")}
+    assert len(found.set_aside) == 1 + min(ROW, 60 - ROW)
+    assert {p.why for p in found.set_aside if p.by == TOOL} == {WHY[RESEAT]}
+    assert found.with_them is not None
+    assert_allclose(found.with_them.accuracy.max_mm, 5.0, rtol=0.05)
+    content = found.to_dict()
+    assert len(content["set_aside"]) == len(found.set_aside)
+    assert content["accuracy"]["holdout_with_them"]["max_mm"] == found.with_them.accuracy.max_mm
+    again = mc.Diagnosis.from_dict(content)
+    assert again.set_aside == found.set_aside
+    assert again.to_dict()["accuracy"] == content["accuracy"]
+    assert "set aside (1 by the user, 30 by the program); with them RMS" in found.headline()

@@ -158,8 +158,8 @@ def test_leica_deleted_points_are_left_out(truth: mc.Measurements, write: Write)
         f"{points}: points that are marked deleted are left out: line 2",)  # fmt: skip
 
 
-def test_leica_points_deleted_and_not_measured_again_keep_their_place(
-    truth: mc.Measurements, write: Write
+def test_leica_points_deleted_and_not_measured_again_are_set_aside(
+    truth: mc.Measurements, write: Write, tmp_path: Path
 ) -> None:
     """By the targets' names, and where there is one: what follows stays with its joints."""
     joints = write("joints.csv", joint_rows(truth))
@@ -171,11 +171,20 @@ def test_leica_points_deleted_and_not_measured_again_keep_their_place(
         points = write("leica.csv", table(rows, LEICA))
         found = import_files([points], joints).data
         y = truth.y[:, :targets].copy()
-        y[[3, 7], [0, targets - 1]] = np.nan
-        assert_allclose(found.y, y, rtol=0, atol=2e-9)
+        gone = ([3, 7], [0, targets - 1])
+        y[gone] = np.nan
+        assert_allclose(found.y, y[np.isfinite(y).any(axis=(1, 2))], rtol=0, atol=2e-9)
         lines = ", ".join(str(2 + targets * p + t) for p, t in ((3, 0), (7, targets - 1)))
-        assert found.notices == (f"{points}: points that are marked deleted are poses without a "
-                                 f"measurement: lines {lines}",)  # fmt: skip
+        assert found.notices == (f"{points}: points that are marked deleted are set aside: "
+                                 f"lines {lines}",)  # fmt: skip
+        assert [(p.pose, p.target, p.by) for p in found.set_aside] == [
+            (4, "smr1", "file"), (8, f"smr{targets}", "file")]  # fmt: skip
+        assert found.aside is not None
+        assert found.aside.y[0, 0, 0] == 9.0
+        save(tmp_path / "poses.csv", import_files([points], joints))
+        again = mc.read_measurements(tmp_path / "poses.csv")
+        assert [(p.target, p.why, p.by) for p in again.set_aside] == [
+            (p.target, p.why, p.by) for p in found.set_aside]  # fmt: skip
     gone = write("leica.csv", table(rows[:-1], LEICA))
     words = "(left out as marked deleted: lines 5, 9)"
     assert refused(f"{joints}:59: joint row 58 has no point", gone, joints=joints).endswith(words)

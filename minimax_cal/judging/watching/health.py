@@ -15,6 +15,7 @@ from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.same_arm import check_arm
+from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
@@ -30,6 +31,7 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements, read_measurements
+from minimax_cal.modelling.cell import Cell
 
 KNOWN = ("frame", "targets")  # what may still be where it was
 SURE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
@@ -96,6 +98,8 @@ def check(
             *said,
             *remarks(watched, found),
         ),
+        set_aside=data.set_aside,
+        with_them=counting_all(watched, found.before, seed) if data.set_aside else None,
     )
 
 
@@ -107,6 +111,13 @@ def left(watched: Watched, placed: Placing) -> Array:
     state = placed.state
     model, _ = watched.fitted(np.zeros(watched.names.count, dtype=bool), state)
     return model.error(state) @ state.rotation.T
+
+
+def counting_all(watched: Watched, placed: Placing, seed: int) -> WithThem:
+    """The accuracy as placed, where the points that were set aside count too."""
+    cell, error = watched.cell, grown(left(watched, placed), placed.used)
+    now = Cell.of(cell.robot, placed.state, cell.target_names, cell.effects, cell.sessions)
+    return with_them(error, groups(watched.data), errors_of(now, watched.data.aside), seed=seed)
 
 
 def grown(error: Array, used: float) -> Array:

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.ground.files import json_text, plain, write_whole
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.tolerance import KINDS, Limit
 from minimax_cal.judging.watching.moved import Moved, moved_table
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.measuring.aside import SetAside
 from minimax_cal.solvers.status import Status
 
 VALID, NOT_VALID, NOT_DECIDED = "valid", "not valid", "not decided"
@@ -52,7 +54,8 @@ class Health:
     smallest shift of each zero position that these poses find in 95 of 100 cases [rad, m].
     enough: how many of these poses would have been enough to find SHIFT in every joint; asked:
     about how many would be, where these are not.  noise: by how much what is left is noisier than
-    the calibration was.  fit: refitted.
+    the calibration was.  fit: refitted.  set_aside: of these points, with_them: the accuracy where
+    they count, None without any.
     """
 
     robot: str
@@ -69,6 +72,8 @@ class Health:
     poses: int
     fit: Fit
     notices: tuple[str, ...] = field(default=())
+    set_aside: tuple[SetAside, ...] = ()
+    with_them: WithThem | None = None
 
     @property
     def valid(self) -> bool | None:
@@ -104,6 +109,8 @@ class Health:
             )
         else:
             text += "No joint is found to have moved."
+        if self.set_aside:
+            text += f" {aside_sentence(self.set_aside, self.with_them)}"
         return text
 
     def tables(self) -> tuple[Table, ...]:
@@ -147,6 +154,7 @@ class Health:
             unit = "mm" if slides else "rad"
             return {"parameter": name, "size": 1e3 * size if slides else size, "unit": unit}
 
+        with_it = {"holdout_with_them": self.with_them.to_dict()} if self.with_them else {}
         return dict(
             plain(
                 {
@@ -162,7 +170,8 @@ class Health:
                         for v in self.verdicts
                     ],
                     "not_separable": [vars(h) for h in self.hidden],
-                    "accuracy": self.accuracy.to_dict(),
+                    "accuracy": self.accuracy.to_dict() | with_it,
+                    "set_aside": [point.to_dict() for point in self.set_aside],
                     "accuracy_refitted": self.refitted.to_dict(),
                     "smallest_found": [scaled(n, s) for n, s in self.findable.items()],
                     "poses": {"given": self.poses, "enough": self.enough, "needed": self.asked,

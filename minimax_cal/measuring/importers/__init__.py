@@ -25,6 +25,7 @@ from minimax_cal.measuring.importers.reading import (
 )
 from minimax_cal.measuring.importers.sheet import DECIMALS, DELIMITERS, Sheet, cut, open_text
 from minimax_cal.measuring.measurements import Measurements, measurements_text
+from minimax_cal.measuring.set_aside import whole
 
 __all__ = ["IMPORTERS", "Imported", "csv_of", "import_files", "read_any", "save", "units_of"]
 
@@ -249,8 +250,8 @@ def save(path: Path | str, imported: Imported) -> None:
 
 
 def csv_of(imported: Imported) -> str:
-    """The contract's CSV; columns that nothing uses are kept as text."""
-    data = imported.data
+    """The contract's CSV; columns that nothing uses are kept as text, points set aside with why."""
+    data = whole(imported.data)
     columns = {name: blanks(column) for name, column in data.columns.items()}
     return measurements_text(replace(data, columns={**columns, **data.unknown}))
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.aside import FILE
 from minimax_cal.measuring.columns import is_simulated
 from minimax_cal.measuring.importers import contract
 from minimax_cal.measuring.importers.join import Places, in_file_order, place, settled
@@ -17,8 +18,10 @@ from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Rea
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
 from minimax_cal.measuring.measurements import Measurements, check_finite
+from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
 
-TEXTS = ("session", "group", "split", "pose")
+TEXTS = ("session", "group", "split", "pose", COLUMN)
+MARKED = "marked deleted in the tracker's file"
 OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns with a choice
 MIXED = "mixed"
 
@@ -126,7 +129,22 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
         simulated=any(is_simulated(r.sheet.text) for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
+    data = without_marked(from_column(data), points, places)
     return Assembly(check_finite(data), readings, meanings, matched)
+
+
+def without_marked(
+    data: Measurements, points: Sequence[Reading], places: Sequence[Places]
+) -> Measurements:
+    """The measurements without the points that the trackers' files mark deleted."""
+    marked = np.zeros((data.poses, len(data.target_names)), dtype=bool)
+    first = 0
+    for reading, spot in zip(points, places, strict=True):
+        rows = np.array(reading.deleted, dtype=int)
+        for number in range(len(reading.smrs)):
+            marked[spot.pose[rows], first + number * len(spot.names) + spot.slot[rows]] = True
+        first += len(reading.smrs) * len(spot.names)
+    return sound(set_aside(data, marked, MARKED, FILE)) if marked.any() else data
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,8 +307,8 @@ def understood(
         si = f"{values[0]:.6g} C" if len(values) else ""
         what = "temperature" if len(values) else "left out"
         return Understood(Meaning(column, what, unit, known, si), values)
-    if family in TEXTS:
-        return Understood(Meaning(column, family, "", known, first), np.array(column.cells))
+    if column.meaning in TEXTS:
+        return Understood(Meaning(column, column.meaning, "", known, first), np.array(column.cells))
     return optional(reading, column, unit, known)
 
 

@@ -39,26 +39,28 @@ def place(points: Reading, joints: Reading, layout: str) -> Places:
 
 
 def settled(points: Reading, joints: Reading, layout: str) -> Reading:
-    """A file of points without those that are marked deleted.
+    """A file of points, those that are marked deleted set aside.
 
-    A point that was measured anew has a row of its own: then the rest is as many as the joints.
-    Where it was not, its row keeps the place of its pose.  Raises DataError where neither holds.
+    A point that was measured anew has a row of its own: then the rest is as many as the joints, and
+    the deleted one is left out.  Where it was not, its row keeps the place of its pose.  Raises
+    DataError where neither holds.
     """
     if not points.deleted:
         return points
-    rest = points.left_out()
+    beside, rest = points.kept_beside(), points.measured_again()
     if points is joints:
-        return rest
+        return beside
+    keyed = points.find("pose") and joints.find("pose")
+    first, second = (beside, rest) if keyed else (rest, beside)
     try:
-        place(rest, joints, layout)
+        place(first, joints, layout)
     except DataError as error:
-        whole = points.emptied()
         try:
-            place(whole, joints, layout)
+            place(second, joints, layout)
         except DataError:
             raise DataError(f"{error} (left out as marked deleted: {points.where})") from None
-        return whole
-    return rest
+        return second
+    return first
 
 
 def labels_of(points: Reading) -> tuple[tuple[str, ...], Array]:

@@ -34,6 +34,7 @@ WORDS = {  # plain names that mean the same in any file
     "session": ("session",),
     "group": ("group",),
     "split": ("split",),
+    "set_aside": ("set_aside",),
 }
 SOME = 8  # lines that a notice names
 PLAIN = {word: meaning for meaning, words in WORDS.items() for word in words}
@@ -109,25 +110,24 @@ class Reading:
         found = (POINT_NAME.fullmatch(c.meaning) for c in self.columns)
         return tuple(sorted({int(m[1]) for m in found if m}))
 
-    def left_out(self) -> Reading:
-        """Without the rows that are marked deleted."""
+    def measured_again(self) -> Reading:
+        """Without the rows that are marked deleted, which have others in their place."""
         gone = set(self.deleted)
         kept = [i for i in range(len(self.line)) if i not in gone]
         columns = tuple(replace(c, cells=tuple(c.cells[i] for i in kept)) for c in self.columns)
         told = replace(self, columns=columns, line=self.line[kept], deleted=())
         return told.noticing(f"left out: {self.where}")
 
-    def emptied(self) -> Reading:
-        """With rows that are marked deleted as poses at which nothing was measured."""
+    def kept_beside(self) -> Reading:
+        """With rows that are marked deleted as points that are set aside."""
         gone = set(self.deleted)
         columns = tuple(
-            replace(c, cells=tuple("" if i in gone else cell
-                                   for i, cell in enumerate(c.cells)))
-            if c.family in ("smr", "u95") else c
+            replace(c, cells=tuple("" if i in gone else cell for i, cell in enumerate(c.cells)))
+            if c.family == "u95"
+            else c
             for c in self.columns
-        )  # fmt: skip
-        told = replace(self, columns=columns, deleted=())
-        return told.noticing(f"poses without a measurement: {self.where}")
+        )
+        return replace(self, columns=columns).noticing(f"set aside: {self.where}")
 
     @property
     def where(self) -> str:

@@ -1,0 +1,67 @@
+"""What no fit of a diagnosis counts: set aside before it, or faults of the data that it found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.diagnosing.gap import of_lines
+from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
+from minimax_cal.measuring.aside import TOOL, SetAside
+from minimax_cal.measuring.faults import Fault
+from minimax_cal.measuring.faults.nests import RESEAT
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.set_aside import set_aside
+from minimax_cal.modelling.cell import Cell
+
+WHY = {
+    "outliers": "is elsewhere, by its distances to the others or by the fit",
+    RESEAT: "the reflector was re-seated: the longest part of the file counts",
+}
+NO_POSE = "its row holds the points of no pose"
+
+
+def judged_with(
+    data: Measurements,
+    clean: Measurements,
+    left: Sequence[Fault],
+    held: Measurements,
+    cell: Cell,
+) -> tuple[tuple[SetAside, ...], WithThem | None]:
+    """The points that no fit counts, and the accuracy with them; None where there are none.
+
+    data: as asked.  clean: what the fits count.  left: what was found, by lines of the file.  held:
+    all held-out points, those that stand out among them.  cell: of the last step.
+    """
+    without = without_faults(data, clean, left)
+    aside = without.aside
+    if aside is None:
+        return without.set_aside, None
+    judges = of_lines(aside.line, held.line, held.seen)
+    aside = aside.with_y(np.where(judges[..., None], np.nan, aside.y))
+    aside = aside.take(np.asarray(aside.seen.any(axis=1)))
+    group = np.unique(clusters(held), return_inverse=True)[1].reshape(-1)
+    share = float(held.seen.sum() / data.seen.sum())
+    found = with_them(cell.error(held), group, errors_of(cell, aside), share)
+    return without.set_aside, found
+
+
+def without_faults(data: Measurements, clean: Measurements, left: Sequence[Fault]) -> Measurements:
+    """The measurements with those that no fit counts set aside, each with its reason."""
+    gone = data.seen & ~of_lines(data.line, clean.line, clean.seen)
+    why = np.full(gone.shape, NO_POSE, dtype=object)
+    for fault in left:
+        for line, target in points_of(fault):
+            why[data.line == line, target] = WHY[fault.effect]
+    lines, found = data.line, data
+    for reason in dict.fromkeys(why[gone].tolist()):
+        found = set_aside(found, (gone & (why == reason))[np.isin(lines, found.line)], reason, TOOL)
+    return found
+
+
+def points_of(fault: Fault) -> list[tuple[int, int]]:
+    """Line and target of the points of a fault."""
+    targets = np.broadcast_to(fault.targets, fault.rows.shape)
+    return list(zip(fault.rows.tolist(), targets.tolist(), strict=True))

@@ -1,0 +1,135 @@
+"""What was set aside for a fit, and how the arm does where those points count too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.crossed import intervals_of
+from minimax_cal.fitting.intervals import UNKNOWN, Interval
+from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.robust import SQUARE
+from minimax_cal.fitting.solve import Solved
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import finite
+from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.aside import TOOL, SetAside, counted
+from minimax_cal.measuring.grouping import grouped
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.set_aside import set_aside
+from minimax_cal.modelling.cell import Cell
+
+
+@dataclass(frozen=True)
+class WithThem:
+    """Accuracy on poses that no fit has seen, the points set aside among them.
+
+    No fit has seen these either.  Each weighs as the share of the other points that is held out, so
+    that they count as they would among all.  rms, largest: 95 % intervals [m].
+    """
+
+    accuracy: Accuracy
+    rms: Interval = UNKNOWN
+    largest: Interval = UNKNOWN
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, in millimetres."""
+        ends = {"rms_ci95_mm": self.rms, "max_ci95_mm": self.largest}
+        return self.accuracy.to_dict() | {
+            key: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
+            for key, interval in ends.items()
+        }
+
+
+def with_them(
+    error: Array, group: Array, aside: Array, share: float = 1.0, seed: int = 0
+) -> WithThem:
+    """Accuracy and intervals with the points set aside.
+
+    error: (k, h, 3) at poses that judge, group: (h,) of them.  aside: (k, a, 3) at the points set
+    aside, NaN elsewhere [m].  share: of all other points that judge.
+    """
+    both = np.concatenate([error, aside], axis=1)
+    found = accuracy(both)
+    seen, gone = (int(np.isfinite(part[..., 0]).sum()) for part in (error, aside))
+    if not (seen and gone):
+        share = 1.0
+    even = (seen + gone) / max(seen + share * gone, 1e-300)
+    root = np.sqrt(np.repeat([even, even * share], [error.shape[1], aside.shape[1]]))
+    weighed = accuracy(root[:, None] * both)
+    size = np.linalg.norm(both, axis=-1)
+    means = [1e3 * float(np.nansum(root**2 * row)) for row in size]
+    counts = found.counts
+    whole = Accuracy(
+        rms_mm=weighed.rms_mm,
+        max_mm=found.max_mm,
+        mean_mm=sum(means) / max(sum(counts), 1) if sum(counts) else math.nan,
+        poses=found.poses,
+        sse_mm2=weighed.sse_mm2,
+        counts=counts,
+    )
+    if not sum(counts):
+        return WithThem(whole)
+    last = int(group.max(initial=-1)) + 1
+    every = np.concatenate([group, last + np.arange(aside.shape[1])])
+    rms, _ = intervals_of(root[:, None] * both, every, seed)
+    _, largest = intervals_of(both, every, seed)
+    return WithThem(whole, rms, largest)
+
+
+def with_trimmed(data: Measurements, held: Array, solved: Solved, options: Options) -> Measurements:
+    """The measurements without the training points that the fit gave no weight.
+
+    held: (m,) True where held out.
+    """
+    gone = np.zeros(data.seen.shape, dtype=bool)
+    gone[~held] = (solved.robust.weights == 0.0).T & data.seen[~held]
+    why = f"trim {options.trim:g}" if options.trim else f"loss {options.loss}"
+    told = options.trim or options.loss != SQUARE
+    return set_aside(data, gone, f"stands out from the fit ({why})", TOOL) if told else data
+
+
+def judged_with(
+    data: Measurements,
+    held: Array,
+    cell: Cell,
+    error: Array,
+    crossed: Array,
+    solved: Solved,
+    options: Options,
+) -> tuple[tuple[SetAside, ...], WithThem | None]:
+    """The points set aside for a fit, and the accuracy with them; None where there are none.
+
+    data: all poses.  held: (m,).  error: (k, m, 3) of the fit; crossed: of every pose by a fit
+    without it, or empty [m].
+    """
+    trimmed = with_trimmed(data, held, solved, options)
+    if not trimmed.set_aside:
+        return (), None
+    group = np.unique(grouped(data, options.holdout_by), return_inverse=True)[1].reshape(-1)
+    if crossed.size:  # which holds what was trimmed, by fits that trim anew
+        found = with_them(crossed, group, errors_of(cell, data.aside), seed=options.seed)
+        return trimmed.set_aside, found
+    share = float(data.seen[held].sum() / max(int(trimmed.seen.sum()), 1))
+    aside = errors_of(cell, trimmed.aside)
+    return trimmed.set_aside, with_them(error[:, held], group[held], aside, share, options.seed)
+
+
+def errors_of(cell: Cell, aside: Measurements | None) -> Array:
+    """(k, a, 3) errors of a cell at the points set aside, none where there are none [m]."""
+    if aside is None:
+        return np.zeros((len(cell.target_names), 0, 3))
+    return cell.error(aside)
+
+
+def aside_sentence(points: Sequence[SetAside], found: WithThem | None) -> str:
+    """How many points were set aside, by whom, and the error with them."""
+    them = "it" if len(points) == 1 else "them"
+    if found is None:
+        return f"{counted(points)}."
+    seen = found.accuracy
+    return f"{counted(points)}; with {them} RMS {seen.rms_mm:.3f} mm, largest {seen.max_mm:.3f} mm."

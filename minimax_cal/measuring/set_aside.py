@@ -1,0 +1,194 @@
+"""Points that were measured and take no part: who set them aside, and why.
+
+A file of measurements holds them as all others, with the reason in a column `set_aside`; the reader
+keeps them beside the points that count (`Measurements.aside`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.ground.words import one_line
+from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
+from minimax_cal.measuring.measurements import Measurements
+
+COLUMN = "set_aside"
+POINT = re.compile(r"(\d+)(?::(smr\d+))?")
+# a cell holds one of these for each target, or one for the whole pose
+ENTRY = re.compile(rf"(?:(smr\d+)\s*:)?\s*(.*?)\s*(?:\[({USER}|{FILE}|{TOOL})\])?")
+NO_REASON = "no reason was given"
+MOST_LETTERS = 200  # of a reason
+NAMED = 5  # points that a notice names
+
+
+def set_aside(data: Measurements, points: Array, why: str, by: str) -> Measurements:
+    """The measurements with some points beside those that count.
+
+    points: (m, k) True for those.  why: the reason.  by: USER, FILE or TOOL.
+    """
+    points = points & data.seen
+    if not points.any():
+        return data
+    every = np.union1d(data.line, data.aside.line if data.aside else data.line)
+    new = tuple(
+        SetAside(
+            int(data.line[row]),
+            int(np.searchsorted(every, data.line[row])) + 1,
+            data.target_names[target],
+            why,
+            by,
+        )
+        for row, target in np.argwhere(points)
+    )
+    shown = np.where(points[..., None], data.y, np.nan)
+    aside = replace(data, y=shown, aside=None, set_aside=(), notices=())
+    aside = aside.take(np.asarray(points.any(axis=1)))
+    rest = data.with_y(np.where(points[..., None], np.nan, data.y))
+    rest = rest.take(np.asarray(rest.seen.any(axis=1)))
+    aside = merged(data.aside, aside) if data.aside else aside
+    return replace(rest, aside=aside, set_aside=(*data.set_aside, *new))
+
+
+def merged(one: Measurements, other: Measurements) -> Measurements:
+    """The points of two parts of one file, by line; rows that both have come once.
+
+    Columns are those of the first; rows of the second that lack one know nothing there.
+    """
+    both = np.isin(other.line, one.line)
+    y = one.y.copy()
+    at = np.searchsorted(one.line, other.line[both], sorter=np.argsort(one.line))
+    rows = np.argsort(one.line)[at]
+    y[rows] = np.where(np.isfinite(y[rows]), y[rows], other.y[both])
+    more = other.take(~both)
+    whole = replace(
+        one,
+        q=np.concatenate([one.q, more.q]),
+        y=np.concatenate([y, more.y]),
+        line=np.concatenate([one.line, more.line]),
+        columns={name: joined(column, more.columns.get(name), more.poses)
+                 for name, column in one.columns.items()},
+        unknown={name: joined(column, more.unknown.get(name), more.poses)
+                 for name, column in one.unknown.items()},
+    )  # fmt: skip
+    return whole.take(np.argsort(whole.line, kind="stable"))
+
+
+def joined(column: Array, more: Array | None, count: int) -> Array:
+    """A column with rows of another part, which know nothing where they lack it."""
+    if more is None:
+        text = column.dtype.kind in "US"
+        more = np.full(count, "") if text else np.full(count, np.nan)
+    return np.concatenate([column, more])
+
+
+def whole(data: Measurements) -> Measurements:
+    """All points, those set aside too, with the reasons in the column `set_aside`."""
+    if data.aside is None:
+        return data
+    every = merged(replace(data, aside=None, set_aside=()), data.aside)
+    cells = {int(line): "" for line in every.line}
+    for point in data.set_aside:
+        if point.row in cells:
+            who = "" if point.by == USER else f" [{point.by}]"
+            entry = f"{point.target}: {point.why}{who}"
+            cells[point.row] += f"; {entry}" if cells[point.row] else entry
+    return replace(every, columns={**every.columns, COLUMN: np.array(list(cells.values()))})
+
+
+def from_column(data: Measurements) -> Measurements:
+    """The measurements without the points that their column `set_aside` names.  Raises DataError.
+
+    A cell holds the reason, for the whole pose or after a target's name, as ``smr2: nest knocked``;
+    several with semicolons.  ``[file]`` at its end says that the tracker's file marks the point.
+    """
+    cells = data.columns.get(COLUMN)
+    if cells is None:
+        return data
+    data = replace(data, columns={k: v for k, v in data.columns.items() if k != COLUMN})
+    groups: dict[tuple[str, str], Array] = {}
+    for row, cell in enumerate(cells):
+        for target, why, by in entries(str(cell)):
+            if target and target not in data.target_names:
+                raise DataError(
+                    f"{data.source}:{data.line[row]}: column {COLUMN}: no target {target}; there "
+                    f"are {', '.join(data.target_names)}"
+                )
+            points = groups.setdefault((why, by), np.zeros(data.seen.shape, dtype=bool))
+            points[row] |= [target in ("", name) for name in data.target_names]
+    lines = data.line
+    for (why, by), points in groups.items():
+        kept = np.isin(lines, data.line)  # rows of which nothing was left are gone
+        data = set_aside(data, points[kept], why, by)
+    return sound(data)
+
+
+def entries(cell: str) -> list[tuple[str, str, str]]:
+    """Target ('' for the whole pose), reason and who, of each entry of a cell."""
+    out = []
+    for part in filter(None, map(str.strip, cell.split(";"))):
+        found = ENTRY.fullmatch(part)
+        target, why, by = found.groups() if found else (None, part, None)
+        out.append((target or "", why or NO_REASON, by or USER))
+    return out
+
+
+def sound(data: Measurements) -> Measurements:
+    """The data, without targets of which no point counts.  Raises DataError where none does."""
+    seen = np.asarray(data.seen.any(axis=0))
+    if not seen.any():
+        raise DataError(f"{data.source}: every measured point is set aside")
+    return data if seen.all() else data.keep(seen)
+
+
+def left_out(data: Measurements, points: Iterable[str]) -> Measurements:
+    """The measurements with points set aside by the user.
+
+    points: each as 12:smr2 (of the pose in line 12 of the file), or 12 for all of that pose;
+    several with commas; with the reason after an equals sign, as ``12:smr2,40=nest knocked``.
+    Raises OptionError.
+    """
+    groups: dict[str, Array] = {}
+    lines = data.line
+    for text in points:
+        named, _, why = text.partition("=")
+        why = reason(why)
+        for name in filter(None, map(str.strip, named.split(","))):
+            chosen = groups.setdefault(why, np.zeros(data.seen.shape, dtype=bool))
+            chosen |= of_name(data, name)
+    count = len(data.set_aside)
+    for why, chosen in groups.items():
+        data = set_aside(data, chosen[np.isin(lines, data.line)], why, USER)
+    new = data.set_aside[count:]
+    if not new:
+        return data
+    listed = " ".join(f"{point.row}:{point.target}" for point in new[:NAMED])
+    more = f" and {len(new) - NAMED} more" if len(new) > NAMED else ""
+    said = f"{len(new)} points set aside: {listed}{more}"
+    return sound(replace(data, notices=(*data.notices, said)))
+
+
+def reason(text: str) -> str:
+    """A reason as a file can hold it."""
+    return one_line(text).replace(";", ",").strip()[:MOST_LETTERS] or NO_REASON
+
+
+def of_name(data: Measurements, name: str) -> Array:
+    """(m, k) True for the points of a name, as 12:smr2 or 12.  Raises OptionError."""
+    found = POINT.fullmatch(name)
+    if not found:
+        raise OptionError(f"leave out {name!r}: write LINE:TARGET, as 12:smr2, or LINE")
+    rows = data.line == int(found[1])
+    if not rows.any():
+        lines = f"{data.line.min()} to {data.line.max()}" if data.poses else "none"
+        raise OptionError(f"leave out {name}: no pose stands in line {found[1]} (but {lines})")
+    if found[2] and found[2] not in data.target_names:
+        known = ", ".join(data.target_names)
+        raise OptionError(f"leave out {name}: no such target; there are {known}")
+    targets = np.array([not found[2] or found[2] == target for target in data.target_names])
+    return np.asarray(rows[:, None] & targets)
