@@ -42,7 +42,7 @@ KEPT = 16  # results in memory
 WHAT = {
     SCRIPT: "all that was done here, as command lines",
     POSES: "the measurements, as they were understood",
-    USED: "the measurements without the points that were left out",
+    USED: "the measurements, with the points that were set aside and why",
     UNDERSTOOD: "what was understood of the files",
     FIT: "the calibration",
     DIAGNOSIS: "the diagnosis",
@@ -216,8 +216,8 @@ def points_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:
 
     shown = sorted(found, key=order)[: MOST_POINTS + len(left)]
     over = [p for p in found if chosen.most and p.after > chosen.most and p.key not in left]
-    return {"points": shown, "left": left, "limit": chosen.most, "over": len(over),
-            "more": len(found) - len(shown), "count": len(found)}  # fmt: skip
+    return {"points": shown, "left": left, "why": chosen.reasons, "limit": chosen.most,
+            "over": len(over), "more": len(found) - len(shown), "count": len(found)}  # fmt: skip
 
 
 def ladder_panel(at: Session, chosen: Choices, job: Job | None) -> Panel | None:

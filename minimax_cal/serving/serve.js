@@ -221,7 +221,11 @@
     const field = event.target;
     if (field.dataset.point) {
       const left = now.choices.left_out.filter((key) => key !== field.dataset.point);
-      choose({ left_out: field.checked ? left : [...left, field.dataset.point] });
+      const id = `why-${field.dataset.point.replace(":", "-")}`; // where the reason is asked for
+      choose({ left_out: field.checked ? left : [...left, field.dataset.point] })
+        .then(() => document.getElementById(id)?.focus());
+    } else if (field.dataset.why) {
+      choose({ reasons: { ...now.choices.reasons, [field.dataset.why]: field.value } });
     } else if (field.dataset.joints !== undefined) {
       choose({ joints: field.checked ? field.dataset.joints : "" });
     } else if (field.name in now.choices) {
@@ -241,7 +245,7 @@
       const at = cell?.arms.poses.findIndex((pose) => pose.line === Number(button.dataset.show)) ?? -1;
       if (at >= 0) { byId("pose").value = at; drawCell(); byId("cell").scrollIntoView({ block: "center" }); }
     } else if (button.id === "cancel") tell("POST", "/cancel", "");
-    else if (button.id === "all-back") choose({ left_out: [] });
+    else if (button.id === "all-back") choose({ left_out: [], reasons: {} });
   });
 
   // ---- charts ------------------------------------------------------------------------------------

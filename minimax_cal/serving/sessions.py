@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.files import json_of, json_text, read_raw, write_whole
 from minimax_cal.ground.words import one_line, visible
-from minimax_cal.measuring.set_aside import POINT
+from minimax_cal.measuring.set_aside import MOST_LETTERS, POINT
 from minimax_cal.robots.robot import builtin_robots
 
 GIVEN, LOG = "given", "log"  # folders of a session: what people dropped, how each step ended
@@ -32,14 +32,15 @@ SESSION = re.compile(r"[a-z0-9][a-z0-9-]{0,59}")
 
 Limit = Annotated[float, Field(gt=0.0, le=1e6)] | None
 Word = Annotated[str, Field(max_length=2000, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Reason = Annotated[str, Field(max_length=MOST_LETTERS, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 class Choices(BaseModel):
     """What people chose on the page.
 
     robot: a built-in name, or a file that was dropped.  measured, targets: such files; joints: that
-    of them which holds joint values.  left_out: points, as `--leave-out` names them.  rms, most:
-    what is required [mm].
+    of them which holds joint values.  left_out: points, as `--leave-out` names them; reasons: why,
+    by point.  rms, most: what is required [mm].
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -53,6 +54,7 @@ class Choices(BaseModel):
     layout: Literal["", "pose", "target"] = ""
     decimal: Literal["", "point", "comma"] = ""
     left_out: tuple[Annotated[str, Field(pattern=f"^{POINT.pattern}$", max_length=40)], ...] = ()
+    reasons: dict[Annotated[str, Field(max_length=40)], Reason] = {}
     objective: Literal["minimax", "sum", "point"] = "minimax"
     effects: bool = False
     quick: bool = False

@@ -67,8 +67,14 @@ def subject(at: Session, chosen: Choices) -> tuple[tuple[Command, ...], str, str
     robot = chosen.robot if chosen.robot in builtin_robots() else f"{GIVEN}/{chosen.robot}"
     if not chosen.left_out:
         return (), robot, POSES
-    points = ",".join(chosen.left_out)
-    return (Command(("import", POSES, f"--leave-out={points}", "-o", USED)),), robot, USED
+    by_reason: dict[str, list[str]] = {}
+    for point in chosen.left_out:
+        by_reason.setdefault(chosen.reasons.get(point, "").strip(), []).append(point)
+    left = [
+        f"--leave-out={','.join(points)}" + (f"={why}" if why else "")
+        for why, points in by_reason.items()
+    ]
+    return (Command(("import", POSES, *left, "-o", USED)),), robot, USED
 
 
 def fitting(at: Session, chosen: Choices) -> tuple[Command, ...]:

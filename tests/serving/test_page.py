@@ -189,6 +189,10 @@ def test_a_point_can_be_unticked_and_taken_back(fitted: Any) -> None:
     line, target = unticked(driver)
     assert f"--leave-out={line}:{target} -o used.csv" in one(driver, "[data-said=fit]").text
     assert one(driver, "#points tr.out").get_attribute("id") == f"point-{line}-{target}"
+    why = one(driver, f"#why-{line}-{target}")
+    why.send_keys("nest knocked\t")
+    reason = f"'--leave-out={line}:{target}=nest knocked'"
+    until(lambda: reason in one(driver, "[data-said=fit]").text, "the reason did not arrive")
     click(driver, "#all-back")
     until(lambda: state(driver, "fit") == "done", "the choice did not arrive")
     assert severe(driver) == []

@@ -37,6 +37,16 @@ def everything(at: Session) -> None:
     )  # fmt: skip
 
 
+def test_points_are_set_aside_with_their_reasons(at: Session) -> None:
+    everything(at)
+    at.choose({"left_out": ["3:smr1", "12:smr2", "40"],
+               "reasons": {"12:smr2": "nest, knocked", "40": "nest, knocked"}})  # fmt: skip
+    assert lines(at, "fit")[0] == (
+        "minimax-cal import poses.csv --leave-out=3:smr1 '--leave-out=12:smr2,40=nest, knocked' "
+        "-o used.csv"
+    )
+
+
 def test_the_lines_are_what_people_would_type(at: Session) -> None:
     everything(at)
     left = "minimax-cal import poses.csv --leave-out=12:smr2,40 -o used.csv"

@@ -92,7 +92,7 @@ def test_the_script_of_the_session_does_it_all_again(server: Served, fitted: str
 def test_a_point_that_is_unticked_is_out_of_the_next_fit(server: Served, fitted: str) -> None:
     worst = folder_of(server, fitted) / "fit.json"
     before = result(worst)
-    server.choose(fitted, left_out=["2:smr1", "5:smr2"])
+    server.choose(fitted, left_out=["2:smr1", "5:smr2"], reasons={"5:smr2": "knocked"})
     assert server.state(fitted)["steps"]["fit"]["state"] == "old"
     state = server.run(fitted, "fit")
     assert state["steps"]["fit"]["state"] == "done"
@@ -101,7 +101,11 @@ def test_a_point_that_is_unticked_is_out_of_the_next_fit(server: Served, fitted:
     rows = {line: row for row, line in enumerate(now["poses"]["line"])}
     assert now["poses"]["measured_mm"][rows[2]][0] == [None, None, None]
     assert now["poses"]["measured_mm"][rows[5]][1] == [None, None, None]
+    assert {(p["row"], p["target"], p["by"]) for p in now["set_aside"]} == {
+        (2, "smr1", "user"), (5, "smr2", "user")}  # fmt: skip
+    assert now["set_aside"][-1]["why"] == "knocked" or now["set_aside"][0]["why"] == "knocked"
     assert 'data-point="2:smr1"' in state["panels"]["points"]  # listed all the same
+    assert 'data-why="5:smr2"' in state["panels"]["points"]
     server.choose(fitted, left_out=[])
     assert server.state(fitted)["steps"]["fit"]["state"] == "old"
 

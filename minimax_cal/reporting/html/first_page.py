@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,12 +15,14 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.same_arm import wild
+from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.judging.tolerance import (
     KINDS,
     NOT_PASSED,
     PASSED,
+    Bound,
     Claim,
     Judgement,
     Limit,
@@ -29,6 +32,7 @@ from minimax_cal.judging.tolerance import (
     overall,
     within,
 )
+from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
@@ -42,6 +46,7 @@ from minimax_cal.robots.robot import Robot
 CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
 CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
 NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
+SHOWN_REASONS = 3  # why points were set aside
 NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
 
 
@@ -51,6 +56,8 @@ class Signed:
 
     wild: links that no whole arm changes so much, empty where there are none.  rows: of what leaves
     the house; row: that of them which is judged, None where the result itself is.
+    set_aside: points that take no part; with_them: the claim inside where they count, None without
+    any; judged_with: the requirements against their bounds.
     """
 
     model: str
@@ -59,6 +66,9 @@ class Signed:
     wild: str = ""
     rows: tuple[Row, ...] = ()
     row: Row | None = None
+    set_aside: tuple[SetAside, ...] = ()
+    with_them: Claim | None = None
+    judged_with: tuple[Judgement, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -76,6 +86,19 @@ class Signed:
         return f"Result and verdict hold for {self.row.name} ({self.model}){rest}."
 
     @property
+    def sentence(self) -> str:
+        """The verdict; where it is passed only without points set aside, that it is so."""
+        if self.verdict != PASSED or not self.judged_with or overall(self.judged_with) == PASSED:
+            return self.verdict
+        with_all = overall(self.judged_with)
+        worst = next(one for one in self.judged_with if one.verdict == with_all)
+        them = "it" if len(self.set_aside) == 1 else "them"
+        return (
+            f"{PASSED} without {counted(self.set_aside)}; with {them} "
+            f"{KINDS[worst.limit.kind]} {worst.bound.value:.3f} mm: {with_all}"
+        )
+
+    @property
     def besides(self) -> list[str]:
         """What a requirement that is passed should not hide: a claim above it, another arm."""
         pairs = ((one, claim) for one in self.judged for claim in self.claims)
@@ -87,10 +110,12 @@ class Signed:
     def lines(self) -> list[str]:
         """For a terminal."""
         said = [one.sentence() for one in self.judged]
+        aside = [aside_of(self)] if self.set_aside else []
         if not self.judged:
-            return []
+            return aside
         told = [self.holds_for] if self.row else []
-        return [self.verdict, *said, *told, *(row.line() for row in self.rows), *self.besides]
+        rows = [row.line() for row in self.rows]
+        return [self.sentence, *said, *aside, *told, *rows, *self.besides]
 
 
 def signed(
@@ -119,11 +144,57 @@ def signed(
     rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
     if row := governing(rows, bool(deliver)):
         model = with_effects(row.delivered.cell)
-        return Signed(model, row.claims, row.judged, odd, rows, row)
+        found = Signed(model, row.claims, row.judged, odd, rows, row)
+        return counting_all(found, sources, limits, which)
     chosen = next((claim for claim in claims if claim.name == which), None)
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
-    return Signed(model, claims, tuple(judge(limit, chosen) for limit in limits), odd)
+    found = Signed(model, claims, tuple(judge(limit, chosen) for limit in limits), odd)
+    return counting_all(found, sources, limits, which)
+
+
+def counting_all(
+    found: Signed, sources: Sources, limits: tuple[Limit, ...], which: str
+) -> Signed:
+    """The judgement beside that with the points that were set aside, where there are any.
+
+    which: inside or outside.
+    """
+    result = sources.fit or sources.gap
+    if result is None or not result.set_aside:
+        return found
+    inside = counting(found.claims[0], result.with_them)
+    chosen = next((claim for claim in found.claims if claim.name == which), inside)
+    also = replace(chosen, rms=inside.rms, largest=inside.largest)
+    with_all = tuple(judge(limit, also) for limit in limits) if result.with_them else ()
+    return replace(found, set_aside=result.set_aside, with_them=inside, judged_with=with_all)
+
+
+def counting(claim: Claim, found: WithThem | None) -> Claim:
+    """A claim inside, where the points that were set aside count."""
+    if found is None:
+        return claim
+    seen = found.accuracy
+    return replace(
+        claim,
+        rms=Bound(seen.rms_mm, 1e3 * found.rms.high),
+        largest=Bound(seen.max_mm, 1e3 * found.largest.high),
+    )
+
+
+def aside_of(found: Signed) -> str:
+    """How many points were set aside, by whom, why, and the error with them."""
+    reasons = Counter(point.why for point in found.set_aside).most_common()
+    why = "; ".join(f"{text} ({count})" for text, count in reasons[:SHOWN_REASONS])
+    more = f"; {len(reasons) - SHOWN_REASONS} more reasons" if len(reasons) > SHOWN_REASONS else ""
+    seen = found.with_them
+    them = "it" if len(found.set_aside) == 1 else "them"
+    errors = (
+        f"; with {them} RMS {seen.rms.value:.3f} mm, largest {seen.largest.value:.3f} mm"
+        if seen
+        else ""
+    )
+    return f"{counted(found.set_aside)}{errors}. Why: {why}{more}"
 
 
 def changed(before: Robot, after: Robot) -> str:
@@ -206,9 +277,11 @@ def claim_of_parts(sources: Sources) -> Claim:
 def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     """Verdict, table, and a few lines."""
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
-    banner = found.verdict[:1].upper() + found.verdict[1:] if found.verdict else NO_LIMIT
+    banner = found.sentence[:1].upper() + found.sentence[1:] if found.verdict else NO_LIMIT
+    kind = kind if found.sentence == found.verdict else "unstated"
     lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
     lines += [Note(f"{said}.", "warning") for said in found.besides]
+    lines += [Note(f"{aside_of(found)}.", "warning")] if found.set_aside else []
     lines += [text(found.holds_for)] if found.row else []
     lines += [result_table(sources, found), text(basis(found))]
     lines += [delivered_table(found.rows)] if found.rows else []
@@ -237,6 +310,12 @@ def result_table(sources: Sources, found: Signed) -> Table:
             which = f" ({claim.sets[i]})" if claim.sets[i] else ""
             rows.append((f"{KINDS[kind]}, {title}{which}", claim.before[i], bound.value, bound.high,
                          asked, one.verdict if one else ""))  # fmt: skip
+    if found.with_them:
+        for i, kind in enumerate(KINDS):
+            bound = found.with_them.bound(kind)
+            title = f"{KINDS[kind]}, inside, with {len(found.set_aside)} points set aside"
+            before = found.with_them.before[i]
+            rows.append((title, before, bound.value, bound.high, math.nan, ""))
     rows += iso_rows(sources.fit) if sources.fit else ()
     header = ("error of position (on poses)", "before mm", "result mm", "95 % limit mm",
               "required mm", "verdict")  # fmt: skip
