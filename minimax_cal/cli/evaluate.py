@@ -10,10 +10,12 @@ import numpy as np
 from minimax_cal.cli.options import DATA, FIT, RUNG, InGroups, Output, result_options, show
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
+from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import read_measurements
 from minimax_cal.measuring.spans import narrow, outside, spans_in_words
 from minimax_cal.modelling.cell import strangers
@@ -61,7 +63,12 @@ def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int
             "joints": [span.joint for span in narrow(opened.spans)],
         },
         "accuracy": found.to_dict(),
+        "set_aside": [point.to_dict() for point in measured.set_aside],
     }
+    if measured.set_aside:
+        gone = with_them(error, groups(measured), errors_of(cell, measured))
+        content["accuracy"] = found.to_dict() | {"holdout_with_them": gone.to_dict()}
+        to.notice(aside_sentence(measured.set_aside, gone))
     if to.deliver(lambda: json_text(content)):
         name = cell.robot.name if rung is None else f"{cell.robot.name}, {content['rung']},"
         show(found.table(f"{name} on {data}", measured.target_names))

@@ -39,12 +39,12 @@ def judged_with(
     aside = without.aside
     if aside is None:
         return without.set_aside, None
-    judges = of_lines(aside.line, held.line, held.seen)
-    aside = aside.with_y(np.where(judges[..., None], np.nan, aside.y))
-    aside = aside.take(np.asarray(aside.seen.any(axis=1)))
+    judges = of_lines(aside.line, held.line, held.seen).T
+    error = np.where(judges[..., None], np.nan, errors_of(cell, without))
+    error = error[:, np.isfinite(error).any(axis=(0, 2))]
     group = np.unique(clusters(held), return_inverse=True)[1].reshape(-1)
     share = float(held.seen.sum() / data.seen.sum())
-    found = with_them(cell.error(held), group, errors_of(cell, aside), share)
+    found = with_them(cell.error(held), group, error, share)
     return without.set_aside, found
 
 

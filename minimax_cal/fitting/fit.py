@@ -58,7 +58,6 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
 )
-WITH_THEM = "holdout_with_them"  # the key of the accuracy with the points set aside
 DOUBTED = 0.5  # a point of less weight tells no distance between targets
 ROUGH = 1e-6  # a QP answered worse than this is told
 NOT_IDENTIFIED = "not identified because"
@@ -531,12 +530,11 @@ class Fit:
 
         As they are told to people: open above where the poses tell no upper end.
         """
-        more = {WITH_THEM: (self.with_them.rms, self.with_them.largest)} if self.with_them else {}
         if self.stated is not None:
-            return {**self.stated, **more}
+            return self.stated
         rng = np.random.default_rng(self.options.seed)
         group = grouped(self.data, self.options.holdout_by)[self.held]
-        return more | {
+        return {
             key: (
                 told(rms_interval(self.errors[key], group, rng=rng), 1e-3 * seen.rms_mm),
                 told(max_interval(self.errors[key], group, rng=rng), 1e-3 * seen.max_mm),

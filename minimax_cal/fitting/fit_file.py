@@ -257,6 +257,7 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         "parameters": [p.to_dict() for p in fit.parameters],
         "accuracy": {
             **{key: value.to_dict() | ends(fit, key) for key, value in fit.accuracy.items()},
+            **({"holdout_with_them": fit.with_them.to_dict()} if fit.with_them else {}),
             "holdout_trusted": fit.trusted.to_dict(),
             "beyond": fit.beyond.to_dict(),
             **({"cv": crossed_to_dict(fit)} if fit.error_crossed.size else {}),
@@ -461,10 +462,7 @@ def with_them_of(scores: ScoresPart | None) -> WithThem | None:
     """How it does with the points that were set aside, where there were any."""
     if scores is None:
         return None
-    rms, largest = (
-        Interval(*(1e-3 * end for end in ends)) for ends in (scores.rms_ci95_mm, scores.max_ci95_mm)
-    )
-    return WithThem(scores.accuracy(), rms, largest)
+    return WithThem(scores.accuracy(), scores.rms_ci95_mm, scores.max_ci95_mm)
 
 
 def check_settings(settings: Mapping[str, object]) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from minimax_cal.fitting.crossed import intervals_of
-from minimax_cal.fitting.intervals import UNKNOWN, Interval
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.robust import SQUARE
 from minimax_cal.fitting.solve import Solved
@@ -20,8 +19,11 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside, counted
 from minimax_cal.measuring.grouping import grouped
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.measuring.set_aside import set_aside
+from minimax_cal.measuring.set_aside import merged, set_aside
+from minimax_cal.measuring.stations import seen_from
 from minimax_cal.modelling.cell import Cell
+
+NO_ENDS = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -29,20 +31,17 @@ class WithThem:
     """Accuracy on poses that no fit has seen, the points set aside among them.
 
     No fit has seen these either.  Each weighs as the share of the other points that is held out, so
-    that they count as they would among all.  rms, largest: 95 % intervals [m].
+    that they count as they would among all.  rms_ends, max_ends: 95 % intervals [mm].
     """
 
     accuracy: Accuracy
-    rms: Interval = UNKNOWN
-    largest: Interval = UNKNOWN
+    rms_ends: tuple[float, float] = NO_ENDS
+    max_ends: tuple[float, float] = NO_ENDS
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON, in millimetres."""
-        ends = {"rms_ci95_mm": self.rms, "max_ci95_mm": self.largest}
-        return self.accuracy.to_dict() | {
-            key: [finite(1e3 * interval.low), finite(1e3 * interval.high)]
-            for key, interval in ends.items()
-        }
+        """For JSON."""
+        ends = {"rms_ci95_mm": self.rms_ends, "max_ci95_mm": self.max_ends}
+        return self.accuracy.to_dict() | {key: list(map(finite, two)) for key, two in ends.items()}
 
 
 def with_them(
@@ -78,7 +77,8 @@ def with_them(
     every = np.concatenate([group, last + np.arange(aside.shape[1])])
     rms, _ = intervals_of(root[:, None] * both, every, seed)
     _, largest = intervals_of(both, every, seed)
-    return WithThem(whole, rms, largest)
+    ends = [(1e3 * interval.low, 1e3 * interval.high) for interval in (rms, largest)]
+    return WithThem(whole, *ends)
 
 
 def with_trimmed(data: Measurements, held: Array, solved: Solved, options: Options) -> Measurements:
@@ -112,18 +112,25 @@ def judged_with(
         return (), None
     group = np.unique(grouped(data, options.holdout_by), return_inverse=True)[1].reshape(-1)
     if crossed.size:  # which holds what was trimmed, by fits that trim anew
-        found = with_them(crossed, group, errors_of(cell, data.aside), seed=options.seed)
+        found = with_them(crossed, group, errors_of(cell, data), seed=options.seed)
         return trimmed.set_aside, found
     share = float(data.seen[held].sum() / max(int(trimmed.seen.sum()), 1))
-    aside = errors_of(cell, trimmed.aside)
+    aside = errors_of(cell, trimmed)
     return trimmed.set_aside, with_them(error[:, held], group[held], aside, share, options.seed)
 
 
-def errors_of(cell: Cell, aside: Measurements | None) -> Array:
-    """(k, a, 3) errors of a cell at the points set aside, none where there are none [m]."""
-    if aside is None:
-        return np.zeros((len(cell.target_names), 0, 3))
-    return cell.error(aside)
+def errors_of(cell: Cell, data: Measurements) -> Array:
+    """(k, a, 3) errors of a cell at the points of data that were set aside [m].
+
+    With all poses, for these were visited between them; (k, 0, 3) where there are none.
+    """
+    if data.aside is None:
+        return np.zeros((len(data.target_names), 0, 3))
+    aside = seen_from(data.aside, data.frames)
+    every = merged(replace(data, aside=None, set_aside=()), aside)
+    rows = np.searchsorted(every.line, aside.line)
+    error = cell.error(every)[:, rows]
+    return np.where(aside.seen.T[..., None], error, np.nan)
 
 
 def aside_sentence(points: Sequence[SetAside], found: WithThem | None) -> str:

@@ -70,7 +70,8 @@ def seen_from(data: Measurements, frames: Frames) -> Measurements:
     """The data with all points in the first of some frames; as they are where there are none."""
     if not frames or frames is data.frames:
         return data
-    return replace(data, y=moved(data.y, shifts(data, frames)), frames=frames)
+    aside = seen_from(data.aside, frames) if data.aside else None
+    return replace(data, y=moved(data.y, shifts(data, frames)), frames=frames, aside=aside)
 
 
 def stood(data: Measurements) -> Array:

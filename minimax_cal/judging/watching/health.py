@@ -117,7 +117,7 @@ def counting_all(watched: Watched, placed: Placing, seed: int) -> WithThem:
     """The accuracy as placed, where the points that were set aside count too."""
     cell, error = watched.cell, grown(left(watched, placed), placed.used)
     now = Cell.of(cell.robot, placed.state, cell.target_names, cell.effects, cell.sessions)
-    return with_them(error, groups(watched.data), errors_of(now, watched.data.aside), seed=seed)
+    return with_them(error, groups(watched.data), errors_of(now, watched.data), seed=seed)
 
 
 def grown(error: Array, used: float) -> Array:

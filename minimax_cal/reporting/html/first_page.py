@@ -177,8 +177,8 @@ def counting(claim: Claim, found: WithThem | None) -> Claim:
     seen = found.accuracy
     return replace(
         claim,
-        rms=Bound(seen.rms_mm, 1e3 * found.rms.high),
-        largest=Bound(seen.max_mm, 1e3 * found.largest.high),
+        rms=Bound(seen.rms_mm, found.rms_ends[1]),
+        largest=Bound(seen.max_mm, found.max_ends[1]),
     )
 
 
