@@ -139,11 +139,17 @@ def entries(cell: str) -> list[tuple[str, str, str]]:
 
 
 def sound(data: Measurements) -> Measurements:
-    """The data, without targets of which no point counts.  Raises DataError where none does."""
+    """The data, if a point of each target counts.  Raises DataError."""
     seen = np.asarray(data.seen.any(axis=0))
     if not seen.any():
         raise DataError(f"{data.source}: every measured point is set aside")
-    return data if seen.all() else data.keep(seen)
+    if not seen.all():
+        name = data.target_names[int(np.argmin(seen))]
+        raise DataError(
+            f"{data.source}: {name} is measured at no pose, but for points that are set aside; "
+            "delete its columns"
+        )
+    return data
 
 
 def left_out(data: Measurements, points: Iterable[str]) -> Measurements:

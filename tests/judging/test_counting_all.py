@@ -72,6 +72,8 @@ def test_check_counts_with_them(arm: tuple[Path, Simulation]) -> None:
     assert content["accuracy"]["max_mm"] < 0.3
     assert_allclose(content["accuracy"]["holdout_with_them"]["max_mm"], 1.0, rtol=0.15)
     assert "3 points set aside by the user; with them RMS" in found.headline()
+    assert found.fit.set_aside == found.set_aside
+    assert "holdout_with_them" not in found.fit.to_dict()["accuracy"]  # none is held out
 
 
 def test_a_reseat_is_told_by_check_and_import(

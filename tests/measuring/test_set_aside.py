@@ -91,6 +91,10 @@ def test_the_column_names_targets_that_are_there(noisy: Simulation, tmp_path: Pa
     mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
     with pytest.raises(mc.DataError, match=r"poses.csv:3: column set_aside: no target smr9"):
         mc.read_measurements(path)
+    cells[:] = "smr3: all bad"
+    mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
+    with pytest.raises(mc.DataError, match="smr3 is measured at no pose, but for points"):
+        mc.read_measurements(path)
     cells[:] = "all bad"
     mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
     with pytest.raises(mc.DataError, match="every measured point is set aside"):

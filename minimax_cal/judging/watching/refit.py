@@ -82,6 +82,8 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         error_drawn_crossed=np.zeros((0, 0, 3)),
         reason="",
         stated_geometric=geometric_of(fit, cell, data) if cell.effects.causes else None,
+        set_aside=data.set_aside,
+        with_them=None,
     )
 
 

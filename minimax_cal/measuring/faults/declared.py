@@ -42,9 +42,9 @@ def noise(data: Measurements) -> tuple[Fault, ...]:
     if "u95" not in data.columns or not np.isfinite(data.columns["u95"].astype(float)).any():
         return ()
     declared = float(np.nanmedian(data.columns["u95"].astype(float)))
-    apart = between(data)
-    if len(apart.pairs):
-        seen, by = 1.96 * float(np.median(apart.sigma)) / np.sqrt(2.0), "the targets' distances"
+    known = noise_between(data)
+    if known:
+        seen, by = 1.96 * known[0], "the targets' distances"
     else:
         spread = revisit_scatter(data)
         if len(spread) < FEWEST:
