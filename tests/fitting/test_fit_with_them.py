@@ -110,7 +110,7 @@ def test_a_target_that_hardly_any_pose_shows_is_listed() -> None:
     y[2:, 2] = np.nan
     fit = mc.calibrate("irb120", data.with_y(y), "sum")
     assert [(p.row, p.target, p.by) for p in fit.set_aside] == [
-        (2, "smr3", TOOL), (3, "smr3", TOOL)]  # fmt: skip
+        (line, "smr3", TOOL) for line in data.line[:2]]  # fmt: skip
     assert fit.accuracy["holdout_with_them"].rms_mm == fit.accuracy["holdout"].rms_mm or (
         fit.error_crossed.size
     )

@@ -30,7 +30,7 @@ def later(sim: Simulation, poses: int = 30) -> Measurements:
     data = simulate("irb120", poses, 3, seed=77, truth=TRUTH).data
     y = sim.cell.predict(data.q) + TRUTH.noise * np.random.default_rng(5).normal(size=data.y.shape)
     y[6] += [0.6e-3, 0.0, 0.8e-3]
-    return data.with_y(y)
+    return replace(data.with_y(y), simulated=False, line=np.arange(poses) + 2)
 
 
 def test_evaluate_counts_with_them(

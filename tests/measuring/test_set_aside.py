@@ -11,12 +11,19 @@ from numpy.testing import assert_allclose, assert_array_equal
 import minimax_cal as mc
 from minimax_cal.measuring.aside import FILE, TOOL, USER, counted
 from minimax_cal.measuring.history import with_history
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.set_aside import NO_REASON, entries, left_out, set_aside, whole
 from minimax_cal.modelling.simulate import Simulation
 
 
-def test_only_the_named_points_are_gone(noisy: Simulation) -> None:
-    data, line = noisy.data, noisy.data.line
+@pytest.fixture
+def measured(noisy: Simulation) -> Measurements:
+    """Measurements whose file begins with its header."""
+    return replace(noisy.data, simulated=False, line=np.arange(noisy.data.poses) + 2)
+
+
+def test_only_the_named_points_are_gone(measured: Measurements) -> None:
+    data, line = measured, measured.line
     found = left_out(data, [f"{line[0]}:smr2=knocked", str(line[3])])
     assert [(p.row, p.pose, p.target, p.why, p.by) for p in found.set_aside] == [
         (line[0], 1, "smr2", "knocked", USER),
@@ -33,13 +40,13 @@ def test_only_the_named_points_are_gone(noisy: Simulation) -> None:
     assert_array_equal(whole(found).y, data.y)
 
 
-def test_nothing_named_changes_nothing(noisy: Simulation) -> None:
-    assert left_out(noisy.data, []) is noisy.data
-    assert whole(noisy.data) is noisy.data
+def test_nothing_named_changes_nothing(measured: Measurements) -> None:
+    assert left_out(measured, []) is measured
+    assert whole(measured) is measured
 
 
-def test_what_is_set_aside_twice_comes_once(noisy: Simulation) -> None:
-    data = left_out(noisy.data, ["2:smr1", "2:smr1=twice", "3"])
+def test_what_is_set_aside_twice_comes_once(measured: Measurements) -> None:
+    data = left_out(measured, ["2:smr1", "2:smr1=twice", "3"])
     assert [(p.row, p.target) for p in data.set_aside] == [
         (2, "smr1"), (3, "smr1"), (3, "smr2"), (3, "smr3")]  # fmt: skip
     mask = np.zeros(data.seen.shape, dtype=bool)
@@ -47,14 +54,14 @@ def test_what_is_set_aside_twice_comes_once(noisy: Simulation) -> None:
     more = set_aside(data, mask, "trimmed", TOOL)
     assert [(p.row, p.pose, p.target) for p in more.set_aside[4:]] == [
         (2, 1, "smr2"), (2, 1, "smr3")]  # fmt: skip
-    assert_array_equal(whole(more).y, noisy.data.y)
+    assert_array_equal(whole(more).y, measured.y)
 
 
 def test_a_file_keeps_them_with_the_reason_and_who_it_was(
-    noisy: Simulation, tmp_path: Path
+    measured: Measurements, tmp_path: Path
 ) -> None:
     first, second = tmp_path / "poses.csv", tmp_path / "used.csv"
-    mc.write_measurements(first, noisy.data)
+    mc.write_measurements(first, measured)
     assert run("import", first, "--leave-out", "2:smr1,5=nest, knocked; twice", "-o", second) == 0
     data = mc.read_measurements(second)
     assert 5 not in data.line
@@ -62,7 +69,7 @@ def test_a_file_keeps_them_with_the_reason_and_who_it_was(
     assert {(p.row, p.target) for p in data.set_aside} == {
         (2, "smr1"), (5, "smr1"), (5, "smr2"), (5, "smr3")}  # fmt: skip
     assert {(p.why, p.by) for p in data.set_aside} == {("nest, knocked, twice", USER)}
-    assert_allclose(whole(data).y, noisy.data.y, rtol=0, atol=1e-9)
+    assert_allclose(whole(data).y, measured.y, rtol=0, atol=1e-9)
     mask = np.zeros(data.seen.shape, dtype=bool)
     mask[7, 2] = True
     mc.write_measurements(second, set_aside(data, mask, "marked deleted", FILE))
@@ -85,26 +92,26 @@ def test_cells_of_the_column(cell: str, said: list[tuple[str, str, str]]) -> Non
     assert entries(cell) == said
 
 
-def test_the_column_names_targets_that_are_there(noisy: Simulation, tmp_path: Path) -> None:
+def test_the_column_names_targets_that_are_there(measured: Measurements, tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
-    cells = np.array(["", "smr9: x", *[""] * (noisy.data.poses - 2)])
-    mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
+    cells = np.array(["", "smr9: x", *[""] * (measured.poses - 2)])
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
     with pytest.raises(mc.DataError, match=r"poses.csv:3: column set_aside: no target smr9"):
         mc.read_measurements(path)
     cells[:] = "smr3: all bad"
-    mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
     with pytest.raises(mc.DataError, match="smr3 is measured at no pose, but for points"):
         mc.read_measurements(path)
     cells[:] = "all bad"
-    mc.write_measurements(path, replace(noisy.data, columns={"set_aside": cells}))
+    mc.write_measurements(path, replace(measured, columns={"set_aside": cells}))
     with pytest.raises(mc.DataError, match="every measured point is set aside"):
         mc.read_measurements(path)
 
 
-def test_poses_set_aside_were_visited(noisy: Simulation) -> None:
+def test_poses_set_aside_were_visited(measured: Measurements) -> None:
     """The moves of the other poses, and the clock, are those of the whole file."""
-    every = with_history(noisy.data)
-    found = with_history(left_out(noisy.data, ["9", "10:smr1", "20"]))
+    every = with_history(measured)
+    found = with_history(left_out(measured, ["9", "10:smr1", "20"]))
     kept = np.isin(every.line, found.line)
     for name, column in found.columns.items():
         assert_array_equal(column, every.columns[name][kept])
@@ -113,8 +120,8 @@ def test_poses_set_aside_were_visited(noisy: Simulation) -> None:
         assert_array_equal(column, every.columns[name][np.isin(every.line, [9, 10, 20])])
 
 
-def test_how_many_in_words(noisy: Simulation) -> None:
-    data = left_out(noisy.data, ["3:smr1"])
+def test_how_many_in_words(measured: Measurements) -> None:
+    data = left_out(measured, ["3:smr1"])
     assert counted(data.set_aside) == "1 point set aside by the user"
     mask = np.zeros(data.seen.shape, dtype=bool)
     mask[:2, 2] = True
@@ -127,10 +134,14 @@ def test_how_many_in_words(noisy: Simulation) -> None:
     [("x", "write LINE:TARGET"), ("900000", "no pose stands in line"), ("2:smr9", "smr1, smr2")],
 )
 def test_a_point_that_is_not_there(
-    points: str, said: str, noisy: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    points: str,
+    said: str,
+    measured: Measurements,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     path = tmp_path / "poses.csv"
-    mc.write_measurements(path, noisy.data)
+    mc.write_measurements(path, measured)
     assert run("import", path, "--leave-out", points, "-o", tmp_path / "out.csv") == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
