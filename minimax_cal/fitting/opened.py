@@ -279,6 +279,8 @@ def confirmed(content: Mapping[str, Any], known: Sequence[Term]) -> list[Term]:
     found = [
         (str(effect["effect"]), str(effect["place"]))
         for effect in content["effects"]
-        if effect.get("established", True) and effect["effect"] in EFFECTS
+        if effect.get("established", True)
+        and effect["effect"] in EFFECTS
+        and not effect.get("lines")  # a fault of the data
     ]
     return [term for key in found for term in [t for t in known if t.key == key] or [Term(*key)]]
