@@ -153,9 +153,7 @@ def signed(
     return counting_all(found, sources, limits, which)
 
 
-def counting_all(
-    found: Signed, sources: Sources, limits: tuple[Limit, ...], which: str
-) -> Signed:
+def counting_all(found: Signed, sources: Sources, limits: tuple[Limit, ...], which: str) -> Signed:
     """The judgement beside that with the points that were set aside, where there are any.
 
     which: inside or outside.
