@@ -10,6 +10,8 @@ from conftest import run, shared
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from experiments import one_session
+from experiments.one_session import Job, simulated
 from experiments.watch import SHIFT, Trial, seen_anew, shifted
 from experiments.watch import run as trial
 from minimax_cal.judging.watching import moved
@@ -105,26 +107,17 @@ def test_not_valid_and_not_decided(fit: mc.Fit, made: Simulation) -> None:
     assert close.confidence < 0.975
 
 
-def test_sigmas_of_the_search_are_those_of_many_runs(fit: mc.Fit, made: Simulation) -> None:
-    """z of joints that did not move spread by 1, once for a perfect calibration, once for one
-    that is off as its covariance says.
-    """  # fmt: skip
-    rng, found = np.random.default_rng(5), ([], [])
-    root = fit.known.root
-    for seed in range(30):
-        data = poses(made, 10, seed=100 + seed)
-        watched, _ = watched_of(fit, data, ())
-        noise = 10e-6 + 2.5e-6 * np.linalg.norm(data.y, axis=-1).mean()
-        off = root @ rng.normal(size=root.shape[1])
-        wrong = made.cell.robot.mdh + off[:30].reshape(5, 6).T
-        for kind, mdh, known in ((0, made.cell.robot.mdh, 0.0 * root), (1, wrong, root)):
-            cell = replace(watched.cell, robot=watched.cell.robot.with_mdh(mdh))
-            arm = replace(watched, cell=cell, known=known, variance=noise**2, jitter=0.0)
-            first = search(arm, np.zeros(arm.names.count, dtype=bool), None, 0).first.noise
-            by, sigma = first.scores(arm.zeros[1:5])
-            found[kind].append(by / sigma * first.scale)
-    for kind in found:
-        assert abs(np.sqrt(np.mean(np.square(kind))) - 1.0) < SIGMAS / np.sqrt(2 * 120)
+def test_sigmas_of_the_search_are_those_of_many_runs() -> None:
+    """z of joints that did not move spread by 1, where the model lacks something."""
+    z = []
+    for seed in range(12):
+        data, first, _, _ = simulated(Job("irb120", seed, "time"))
+        fit = mc.calibrate("irb120", data.take(first), "sum")
+        watched, _ = watched_of(fit, data.take(~first), ())
+        found = search(watched, np.zeros(watched.names.count, dtype=bool))
+        by, sigma, _ = found.first.scores(moved.NOTHING)
+        z.append(by / sigma)
+    assert abs(np.sqrt(np.mean(np.square(z))) - 1.0) < SIGMAS / np.sqrt(2 * np.size(z))
 
 
 def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
@@ -230,21 +223,6 @@ def test_a_correction_helps_the_poses_that_it_is_made_from(giving_way) -> None: 
         assert rms(found.fit, ten) < rms(fit, ten)
 
 
-def test_left_out_is_a_fit_without_each_pose(giving_way) -> None:  # type: ignore[no-untyped-def]
-    fit, seen = giving_way
-    watched, _ = watched_of(fit, seen(10), ())
-    placed = search(watched, np.zeros(watched.names.count, dtype=bool), None, 0).before
-    error, slope, _ = placed.blocks
-    square = 0.0
-    for pose in range(10):
-        rest = np.ones(len(placed.error), dtype=bool)
-        rest[9 * pose : 9 * pose + 9] = False
-        norm = np.linalg.norm(placed.matrix, axis=0)
-        found = np.linalg.lstsq(placed.matrix[rest] / norm, placed.error[rest])[0] / norm
-        square += float(((error[pose] - slope[pose] @ found) ** 2).sum())
-    assert_allclose(placed.left_out(np.arange(10)), square, rtol=1e-6)
-
-
 def test_one_rms_is_told(giving_way) -> None:  # type: ignore[no-untyped-def]
     fit, seen = giving_way
     found = mc.check(fit, seen(10, 2, 4e-3), "rms 1")
@@ -252,6 +230,40 @@ def test_one_rms_is_told(giving_way) -> None:  # type: ignore[no-untyped-def]
     assert verdict.value_mm == found.accuracy.rms_mm
     assert f"RMS {verdict.value_mm:.3f} mm, at most" in found.headline()
     assert f"RMS {verdict.value_mm:.3f} ->" in found.headline()
+
+
+# ---- one session ------------------------------------------------------------------------------
+
+
+CUTS = [("irb120", 7, "2"), ("ur10", 8, "2"), ("irb2600", 12, "3"), ("irb120", 28, "time")]
+
+
+@pytest.mark.parametrize(("arm", "seed", "way"), CUTS)
+def test_halves_of_a_session_whose_model_lacks_something_do_not_differ(
+    arm: str, seed: int, way: str
+) -> None:
+    found = one_session.run(Job(arm, seed, way))
+    assert found.compared == ()
+    assert found.checked == ()
+
+
+@pytest.mark.parametrize(("arm", "seed", "way"), [("irb2600", 0, "1"), ("irb120", 4, "time")])
+def test_a_joint_that_moved_between_halves_is_named_alone(arm: str, seed: int, way: str) -> None:
+    found = one_session.run(Job(arm, seed, way, one_session.DRAWN))
+    assert found.joint
+    assert found.compared == (found.joint,)
+    assert found.checked == (found.joint,)
+
+
+@pytest.mark.parametrize(("name", "way"), [("qkm_hl6", "q5"), ("irb120", "q2"), ("ur10_b", "q3")])
+def test_halves_of_a_real_session_do_not_differ(name: str, way: str) -> None:
+    robot, path = shared(name)
+    data = mc.read_measurements(path)
+    data = data.take(np.linspace(0, data.poses - 1, min(data.poses, 300)).astype(int))
+    first = one_session.halves(data, way[1:])
+    a, b = (mc.calibrate(robot, data.take(half), "sum") for half in (first, ~first))
+    assert mc.compare(a, b).changed == ()
+    assert mc.check(a, data.take(~first), "rms 1").moved == ()
 
 
 def test_ten_poses_of_a_session_name_nothing_in_it() -> None:

@@ -3,7 +3,8 @@
 Parameters that move the points alike (d1 and the base's z) can be traded for each other at no cost.
 Both arms are therefore told with the same ones kept at the drawing: x' = x - N N_g^-1 x_g, with N
 the motions of the links that base and reflectors imitate and g the parameters that are kept.  What
-is left can be compared, in sigmas of both covariances.
+is left can be compared, in sigmas of both covariances, of noise and of folds.  What changed is asked
+of the poses themselves (`moved.search`).
 """
 
 from __future__ import annotations
@@ -14,23 +15,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 from minimax_cal.fitting import identify
+from minimax_cal.fitting.beyond import needed, step_without
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.same_arm import wild
+from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.judging.watching.compared import Comparison, Difference
-from minimax_cal.judging.watching.moved import MOST, Moved, levels, picked
-from minimax_cal.judging.watching.opening import watched_of
+from minimax_cal.judging.watching.moved import Moved, search
+from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
+from minimax_cal.measuring.grouping import regions
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
-from minimax_cal.solvers.least_squares import solve_normal
 
 TINY = 1e-300  # in place of a zero
-SMALLEST = 1e-12  # share of a variance below which a sigma is rounding
 ALIKE = 1e-9  # two drawings are one to this [m, rad]
 
 
@@ -56,8 +57,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
     told = [told_by(fit, kept, n) for fit in fits]
     each = tuple(differences(one, value, np.asarray(covariance), kept, told))
-    free = np.flatnonzero([not d.reason for d in each])
-    found, same = explained(one, value[1] - value[0], np.asarray(covariance), free)
+    found, same = changed(one, other)
     return Comparison(
         names=(names[0], names[1]),
         robot=one.cell.robot.name,
@@ -110,9 +110,25 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
 
 
 def links_covariance(fit: Fit) -> Array:
-    """(5n, 5n) of the link parameters; zero where they were kept."""
+    """(5n, 5n) of the link parameters, by noise and by folds; zero where they were kept."""
     n = 5 * fit.cell.robot.joints
-    return np.nan_to_num(fit.known.covariance[:n, :n])
+    return np.nan_to_num(fit.known.covariance[:n, :n]) + folds_covariance(fit)[:n, :n]
+
+
+def folds_covariance(fit: Fit) -> Array:
+    """(p, p) of what fits without each region of the poses change: the jackknife over regions.
+
+    Zero where regions cannot be left out.
+    """
+    out = np.zeros((fit.known.names.count,) * 2)
+    if not fit.train.poses:
+        return out
+    poses, label = Poses.of(fit.estimator, fit.cell.state), regions(fit.train)
+    parts = [part for part in (label == one for one in np.unique(label)) if not needed(poses, part)]
+    active = np.flatnonzero(fit.estimator.model.active)
+    steps = np.array([step_without(poses, part) for part in parts]).reshape(-1, len(active))
+    out[np.ix_(active, active)] = (len(steps) - 1) / max(len(steps), 1) * steps.T @ steps
+    return out
 
 
 def told_by(fit: Fit, kept: Array, joints: int) -> Array:
@@ -146,53 +162,17 @@ def differences(
         )
 
 
-def explained(
-    fit: Fit, change: Array, covariance: Array, free: Array
-) -> tuple[tuple[Moved, ...], float]:
-    """Which parameters' changes explain all differences, the clearest first; chance of none.
+def changed(one: Fit, other: Fit) -> tuple[tuple[Moved, ...], float]:
+    """What moved from one calibration to the other, the clearest first; p-value of nothing.
 
-    free: (c,) those that can be compared.  A parameter counts by what it explains of the whole
-    [Rao 1948]; the level is shared among all, zero positions first.
+    The poses of the second are new ones of the first, or the reverse where only that has poses.
     """
-    names = fit.known.names
-    if not len(free):
-        return (), math.nan
-    sigma = np.sqrt(np.diag(covariance)[free])
-    inverse = np.linalg.pinv(
-        covariance[np.ix_(free, free)] / np.outer(sigma, sigma), rcond=SMALLEST, hermitian=True
-    )
-    off, is_zero = change[free] / sigma, np.isin(free, zero_positions(fit.cell.robot.prismatic))
-    total = float(off @ inverse @ off)
-    same = float(stats.chi2.sf(total, np.linalg.matrix_rank(inverse)))
-    chosen: list[int] = []
-    told: list[tuple[float, tuple[str, ...]]] = []
-    while len(chosen) < min(MOST, len(free)):
-        columns = inverse[:, chosen]
-        gram = inverse[np.ix_(chosen, chosen)]
-        rest = inverse - columns @ solve_normal(gram, columns.T)
-        score, size = rest @ off, np.diag(rest)
-        open_ = (size > SMALLEST * np.diag(inverse)) & ~np.isin(np.arange(len(free)), chosen)
-        square = np.where(open_, score**2 / np.where(open_, size, 1.0), -np.inf)
-        p_value = np.asarray(stats.chi2.sf(square, 1))
-        passed = p_value <= levels(is_zero)
-        if not passed.any():
-            break
-        pick, near = picked(square, passed, is_zero)
-        chosen.append(pick)
-        told.append((float(p_value[pick]), tuple(names.all[free[i]] for i in near)))
-    spread = np.linalg.inv(inverse[np.ix_(chosen, chosen)]) if chosen else np.zeros((0, 0))
-    by = (spread @ (inverse[chosen] @ off)) * sigma[chosen]
-    sure = np.sqrt(np.diag(spread)) * sigma[chosen]
-    return tuple(
-        Moved(
-            names.all[free[i]],
-            float(by[row]),
-            float(sure[row]),
-            names.units[free[i]],
-            *told[row],
-        )
-        for row, i in enumerate(chosen)
-    ), same
+    for fit, new, sign in ((one, other, 1.0), (other, one, -1.0)):
+        if new.data.poses:
+            watched, _ = watched_of(fit, replace(new.train, frames={}), ())
+            found = search(watched, in_names(fit, watched, fit.identification.active))
+            return tuple(replace(m, by=sign * m.by) for m in found.named), found.same
+    return (), math.nan
 
 
 def on_common(one: Fit, other: Fit) -> Iterator[tuple[str, Accuracy, Accuracy]]:
@@ -213,6 +193,11 @@ def on_common(one: Fit, other: Fit) -> Iterator[tuple[str, Accuracy, Accuracy]]:
 
 def remarks(one: Fit, other: Fit) -> Iterator[str]:
     """What the reader should know."""
+    if not (one.data.poses or other.data.poses):
+        yield (
+            "neither file holds its poses, so that no joint can be said to have changed; write "
+            "them again without --no-poses"
+        )
     if np.array_equal(one.data.y, other.data.y, equal_nan=True):
         yield (
             "both are fitted to the same measurements: what differs is the way of fitting, and "

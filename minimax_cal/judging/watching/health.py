@@ -20,8 +20,8 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
 from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
-from minimax_cal.judging.watching.moved import Search, search
-from minimax_cal.judging.watching.opening import in_names, own_poses, watched_of
+from minimax_cal.judging.watching.moved import Search, search, sized
+from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.judging.watching.placing import Placing
 from minimax_cal.judging.watching.prospects import hidden, prospects
 from minimax_cal.judging.watching.refit import refit
@@ -71,7 +71,7 @@ def check(
     watched, said = watched_of(fit, data, known)
     check_arm(fit.cell.robot, watched.data)
     links = in_names(fit, watched, fit.identification.active)
-    found = search(watched, links, own_poses(fit, watched), seed)
+    found = search(watched, links)
     error, after_it = (left(watched, placed) for placed in (found.before, found.after))
     verdicts = tuple(
         verdict(limit, error, watched.data, found.before.used, seed) for limit in limits
@@ -81,7 +81,7 @@ def check(
     return Health(
         robot=fit.cell.robot.name,
         verdicts=verdicts,
-        moved=found.named,
+        moved=sized(watched, found.after, found.named),
         hidden=tuple(hidden(watched, found)),
         accuracy=accuracy(grown(error, found.before.used)),
         refitted=accuracy(grown(after_it, found.after.used)),
@@ -89,7 +89,7 @@ def check(
         sliding=frozenset(f"d{j + 1}" for j in np.flatnonzero(fit.cell.robot.prismatic)),
         enough=enough,
         asked=asked,
-        noise=math.sqrt(found.after.rows.mean_square),
+        noise=found.first.noise_ratio,
         poses=watched.data.poses,
         fit=replace(after, notices=(*after.notices, *said)),
         notices=(
@@ -168,14 +168,15 @@ def confidence(interval: Any, size: float, *, above: bool) -> float:
 
 def remarks(watched: Watched, found: Search) -> Iterator[str]:
     """What the reader should know."""
-    if found.after.rows.mean_square > 1.0 + NOISIER * math.sqrt(2.0 / found.after.rows.dof):
+    ratio, dof = found.first.noise_ratio, found.first.variances.dof
+    if ratio**2 > 1.0 + NOISIER * math.sqrt(2.0 / dof):
         yield (
-            f"what is left is {math.sqrt(found.after.rows.mean_square):.2g} times as large as the "
-            "calibration's noise: the instrument is noisier now, or more changed than is named"
+            f"the new poses are {ratio:.2g} times as noisy as the calibration: the instrument is "
+            "noisier now, or more changed than is named"
         )
-    wider = float(found.looked.wider.max(initial=1.0))
+    wider = found.first.widest()
     if wider > WIDE:
         yield (
-            f"the model lacks something: sigmas are widened, by up to {wider:.2g}, as the "
-            "calibration's own poses ask for; a diagnosis says what"
+            f"the model lacks something: sigmas are up to {wider:.2g} times what noise alone would "
+            "leave; a diagnosis says what"
         )

@@ -11,17 +11,16 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.own import Own
-from minimax_cal.judging.watching.rows import PLENTY, Both
+from minimax_cal.judging.watching.old import own_poses
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.checks import check_joints
+from minimax_cal.measuring.grouping import regions
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
 
 LEAST_FOOT = 3  # reflectors on the foot tell where it stands
-LEAST_OWN = 12  # poses of the calibration, half of which tell how scores spread
 NOBODY = np.zeros((0, 3))  # no reflector on the foot
 LEAST_NOISE = 1e-9  # of a coordinate: data that were computed, not measured [m]
 
@@ -60,6 +59,7 @@ def watched_of(
     ratio = usual_u95(data) / usual_u95(fit.data)
     variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
     variance = max(variance, LEAST_NOISE**2)
+    old = own_poses(fit)
     watched = Watched(
         cell=replace(
             cell,
@@ -72,21 +72,15 @@ def watched_of(
         known=known_by.root,
         names_old=known_by.names,
         variance=variance,
-        jitter=known_by.noise.jitter,
-        left=max(variance, mean_square(fit)),
+        jitter=old.jitter if old else known_by.noise.jitter,
+        old=old,
         frame=frame,
         tool=tool,
         foot=foot,
         foot_now=foot_now,
+        foot_variance=2.0 * variance + (foot_scatter(fit, data) if len(foot) else 0.0),
     )
     return watched, said if gone else ()
-
-
-def mean_square(fit: Fit) -> float:
-    """Of a coordinate of what the calibration left of its poses [m^2]."""
-    error = fit.error[np.isfinite(fit.error)]
-    dof = error.size - int(fit.identification.active.sum())
-    return float(error @ error) / max(dof, 1)
 
 
 def feet(fit: Fit, data: Measurements) -> tuple[Array, Array]:
@@ -132,22 +126,17 @@ def foot_of(data: Measurements) -> dict[str, Array]:
     return out
 
 
-def own_poses(fit: Fit, watched: Watched) -> Own | None:
-    """The calibration's own poses, with the same open; None where its file has none."""
-    if fit.data.poses < LEAST_OWN:
-        return None
-    everything = np.zeros(fit.known.names.count, dtype=bool)
-    some = np.linspace(0, fit.data.poses - 1, min(fit.data.poses, PLENTY)).astype(int)
-    data, state = fit.data.take(some), fit.cell.state
-    stood = watched.foot @ state.rotation.T + state.origin
-    own = replace(watched, cell=fit.cell, data=data, foot_now=stood)
-    found = own.both(everything, state)
-    rows = Both(*(replace(each, active=own.open) for each in (found.noise, found.alike)))
-    if not len(stood):
-        return Own(rows, np.zeros((data.poses, 0)))
-    seen = foot_of(data)
-    each = np.stack([seen[name] for name in names_of_foot(fit, watched.data)], axis=1)
-    return Own(rows, own.foot_error(each, state))
+def foot_scatter(fit: Fit, data: Measurements) -> float:
+    """Variance of a coordinate of the foot's reflectors, between means of then and now [m^2].
+
+    What stands still scatters by the noise; a foot that gives way, from region to region too.
+    """
+    seen, label = foot_of(fit.data), regions(fit.data)
+    both = names_of_foot(fit, data)
+    off = np.stack([seen[name] - usual(seen[name]) for name in both])
+    means = [off[:, label == one] for one in np.unique(label)]
+    between = float(np.nanmean([np.nanmean(part, axis=1) ** 2 for part in means]))
+    return max(between, float(np.nanmean(off**2)) / data.poses)
 
 
 def in_names(fit: Fit, watched: Watched, flags: Array) -> Array:

@@ -7,7 +7,7 @@ joints nor instrument are noisy, and there what the model lacks leads astray by 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.modelling.parameters import State
-from minimax_cal.solvers.least_squares import solve_normal
 
 TOLD = 1e-10  # share of the largest singular value below which a direction is not told
 
@@ -83,42 +82,15 @@ class Placing:
     def factor(self, root: Array) -> Array:
         """F (p, r + N) with FF' the covariance of all parameters there.
 
-        root: (p, r) of what is kept, before.
+        root: (p, r) of what is kept, before; what the model lacks stands after it.
         """
         rows, (_, _, half) = self.rows, self.blocks
         m, r, _ = half.shape
         poses, foot = np.split(self.inverse, [m * r], axis=1)
         coloured = np.einsum("fmr,mrs->fms", poses.reshape(-1, m, r), half) / self.size
         noise = np.concatenate([coloured.reshape(poses.shape), foot], axis=1)
-        out = np.concatenate([root, np.zeros((len(root), noise.shape[1]))], axis=1)
-        out[rows.active, : root.shape[1]] += noise @ rows.latent
-        out[rows.active, root.shape[1] :] = rows.scale * noise
+        known = np.pad(root, ((0, 0), (0, rows.latent.shape[1] - root.shape[1])))
+        known[rows.active] += noise @ rows.latent
+        out = np.concatenate([known, np.zeros((len(root), noise.shape[1]))], axis=1)
+        out[rows.active, known.shape[1] :] = rows.scale * noise
         return out
-
-    def left_out(self, group: Array) -> float:
-        """Sum of squared errors of poses that others place [m^2].
-
-        group: (m,) poses that are left out at once.  What the others do not tell stays as it is.
-        """
-        error, slope, _ = self.blocks
-        norm = np.linalg.norm(self.matrix, axis=0)
-        scaled = self.matrix / np.where(norm > 0.0, norm, 1.0)
-        whole, right = scaled.T @ scaled, scaled.T @ self.error
-        parts = scaled[: error.size].reshape(*slope.shape)
-        own = np.zeros((int(group.max()) + 1, *whole.shape))
-        np.add.at(own, group, np.swapaxes(parts, 1, 2) @ parts)
-        told = np.zeros((len(own), len(right)))
-        np.add.at(told, group, np.einsum("mrf,mr->mf", parts, error / self.size))
-        found = solve_normal(whole - own, (right - told)[..., None], rescale=False)[group]
-        return float(((error - self.size * (parts @ found)[..., 0]) ** 2).sum())
-
-
-def predicts(rows: Rows, column: int, group: Array) -> bool:
-    """Whether a parameter's change brings poses nearer that it was not estimated from.
-
-    rows: with what is free so far.  group: (m,) poses that are left out at once.
-    """
-    active = rows.active.copy()
-    active[column] = True
-    with_it = Placing(replace(rows, active=active)).left_out(group)
-    return with_it < Placing(rows).left_out(group)

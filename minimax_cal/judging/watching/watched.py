@@ -1,8 +1,8 @@
 """New measurements of a calibrated arm as rows of a linear problem, in units of their noise.
 
 The new errors e of a calibrated arm are J_n x + J_k u + noise.  x is open: where the instrument
-stands now, where the reflectors sit, and what has moved.  u is what the calibration did not know,
-with its covariance; the noise is that of its instrument and joints [evidence.noise].
+stands now, where the reflectors sit, and what has moved.  u is what the calibration did not know
+and what its model lacks; the noise is that of its instrument and joints [evidence.noise].
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.rows import Both, Rows
+from minimax_cal.judging.watching.old import Old, noise_root
+from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import names_of
@@ -33,9 +34,10 @@ class Watched:
 
     cell: as calibrated, with the targets of the data.  known: (p_old, r) root of the calibration's
     covariance, p_old its parameters by `names_old`.  variance, jitter: of its noise [m^2, rad].
-    left: mean square of a coordinate that its fit left [m^2].
+    old: its own poses, None where its file has none.
     frame, tool: whether the instrument stands, and the reflectors sit, where they did.
-    foot: (f, 3) reflectors of the foot in the base as calibrated, and foot_now: as seen now [m].
+    foot: (f, 3) reflectors of the foot in the base as calibrated, and foot_now: as seen now [m];
+    foot_variance: of a coordinate of their difference [m^2].
     """
 
     cell: Cell
@@ -44,11 +46,12 @@ class Watched:
     names_old: Names
     variance: float
     jitter: float
-    left: float
+    old: Old | None
     frame: bool
     tool: bool
     foot: Array
     foot_now: Array
+    foot_variance: float
 
     @cached_property
     def names(self) -> Names:
@@ -73,6 +76,15 @@ class Watched:
         rows = np.array([old.get(name, -1) for name in self.names.all])
         kept = np.where((rows >= 0)[:, None], self.known[rows], 0.0)
         return np.where(self.open[:, None], 0.0, kept)
+
+    @cached_property
+    def held(self) -> Array:
+        """(p, l) the same of what the calibration's own poses do not tell; all without them."""
+        if self.old is None:
+            return self.root
+        kept = np.array(self.names_old.all)[self.old.kept]
+        some = np.isin(self.names.all, kept)
+        return np.where(some[:, None], self.root, 0.0)[:, : self.old.latent.shape[2]]
 
     @property
     def zeros(self) -> Array:
@@ -103,41 +115,40 @@ class Watched:
                 state = nearby(model, state).x.take(np.array(0))
         return model, state
 
-    def both(self, active: Array, state: State) -> Both:
-        """The errors linear about the best fit with some parameters free, weighed either way."""
-        return Both(*(self.rows(active, state, alike=alike) for alike in (False, True)))
-
-    def rows(self, active: Array, state: State, *, alike: bool = False) -> Rows:
-        """The same by the noises, or with every coordinate alike, as the fit left them."""
+    def rows(self, active: Array, state: State) -> Rows:
+        """The errors linear about the best fit with some parameters free, by their noises."""
         model, state = self.fitted(active, state)
         every = model.only(np.ones(model.names.count, dtype=bool))
         poses = Poses.of(Estimator(every, np.ones(len(model.y))), state)
         m, r, p = poses.jacobian.shape
-        wide = self.jitter**2 * poses.arm @ np.swapaxes(poses.arm, 1, 2)
-        noise = wide + self.variance * np.eye(r)
-        half = np.linalg.cholesky(
-            np.broadcast_to(self.left * np.eye(r), noise.shape) if alike else noise
-        )
-        whole = np.concatenate([poses.error[..., None], poses.jacobian], axis=2)
-        white = np.linalg.solve(half, whole).reshape(m * r, p + 1)
-        jacobian = white[:, 1:]
-        error, latent = white[:, 0], -jacobian @ self.root
+        half = noise_root(poses, self.variance, self.jitter)
+        whole = [poses.error[..., None], poses.jacobian, poses.arm]
+        white = np.linalg.solve(half, np.concatenate(whole, axis=2))
+        error = white[..., 0].reshape(-1)
+        jacobian = white[..., 1 : 1 + p].reshape(m * r, p)
+        latent = -jacobian @ self.root
         row = np.repeat(np.arange(m), r)
         if len(self.foot):
             more, columns = self.of_foot(state)
-            n = self.cell.robot.joints
-            past = self.known[5 * n : 5 * n + 6]
+            base = self.base
             error = np.concatenate([error, more])
-            latent = np.concatenate([latent, columns[:, 5 * n : 5 * n + 6] @ past])
+            latent = np.concatenate([latent, columns[:, base] @ self.known[base]])
             jacobian = np.concatenate([jacobian, columns])
             row = np.concatenate([row, np.full(len(more), -1)])
         count = 3 * int(model.counts.sum()) + 3 * len(self.foot)
-        return Rows(error, jacobian, latent, active, state, count, row, half)
+        arm = white[..., 1 + p :]
+        return Rows(error, jacobian, latent, active, state, count, row, half, arm)
+
+    @property
+    def base(self) -> slice:
+        """The parameters of the base, in the calibration as now."""
+        n = self.cell.robot.joints
+        return slice(5 * n, 5 * n + 6)
 
     def of_foot(self, state: State) -> tuple[Array, Array]:
         """What the reflectors on the foot say of the base, in units of their noise: errors, slope.
 
-        Each was seen once by then and once by now.
+        Each is a mean of then and a mean of now.
         """
         n, f = self.cell.robot.joints, len(self.foot)
         error = self.foot_error(self.foot_now, state)
@@ -145,9 +156,9 @@ class Watched:
         slope[..., 5 * n : 5 * n + 3] = np.eye(3)
         turned = np.cross(np.eye(3)[None], self.foot[:, None])  # (f, turn, 3)
         slope[..., 5 * n + 3 : 5 * n + 6] = np.swapaxes(turned, 1, 2)
-        return error, slope.reshape(3 * f, -1) / np.sqrt(2.0 * self.variance)
+        return error, slope.reshape(3 * f, -1) / np.sqrt(self.foot_variance)
 
     def foot_error(self, place: Array, state: State) -> Array:
         """(..., 3f) how far the foot's reflectors (..., f, 3) are from where they were, as rows."""
         off = (place - state.origin) @ state.rotation - self.foot
-        return np.asarray(off.reshape(*off.shape[:-2], -1) / np.sqrt(2.0 * self.variance))
+        return np.asarray(off.reshape(*off.shape[:-2], -1) / np.sqrt(self.foot_variance))

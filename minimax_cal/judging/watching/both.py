@@ -1,0 +1,278 @@
+"""The poses of a calibration and new ones in one linear problem, by products of its columns.
+
+The errors of both are J x + F u + noise.  x, free: base, links and effects of the calibration, and
+where instrument and reflectors stand now.  u, random: what the model lacks (`lack`), the same
+functions in both, so that poses alike in both tell of a change what poses unlike cannot.  How large
+u and the noise are is found by restricted maximum likelihood [Patterson and Thompson 1971].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotri
+
+from minimax_cal.ground.arrays import Array
+
+ROUNDS = 40  # of the fixed point that finds the variances, at most
+SETTLED = 0.02  # share of every variance by which a last round may change it
+RIDGE = 1e-10  # of a column's own square: what no pose tells stays where it is
+LEAST = 1e-8  # of the noise's variance, in its own unit
+SMALL = 1e-4  # of a factor's variance: a turn of a microradian tells nothing
+OLD, NEW, FOOT = range(3)  # where rows come from
+KNOWN = -1  # component of factors whose variance is 1
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Rows of some poses: products (q, q) of their columns, the error last; how many were measured.
+
+    source: OLD, NEW or FOOT.
+    """
+
+    gram: Array
+    count: int
+    source: int
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """Of what is random.  noise: (3,) by source, in units of what it was.  factor: (l,) of u.
+
+    dof: of the noise of the new poses.  deviance: -2 log restricted likelihood, less a constant.
+    """
+
+    noise: Array
+    factor: Array
+    dof: float
+    deviance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Both:
+    """Products of the columns x, u, candidates and error, part by part.
+
+    free, random: how many columns each.  component: (random,) which factors share a variance, KNOWN
+    for those whose variance is 1.  column: (c,) parameters that the candidates are; zero: (c,) True
+    for zero positions, which are free while the variances are sought.  near: variances of some of
+    the factors, the first, from which these are sought.
+    """
+
+    parts: tuple[Part, ...]
+    free: int
+    random: int
+    component: Array
+    column: Array
+    zero: Array
+    near: Array
+    found: Variances | None = None
+
+    @cached_property
+    def variances(self) -> Variances:
+        """The likeliest, or those that are given."""
+        return self.found or likeliest(self)
+
+    @property
+    def noise_ratio(self) -> float:
+        """By how much the new poses are noisier than those of the calibration were."""
+        noise = self.variances.noise
+        return float(np.sqrt(noise[NEW] / noise[OLD]))
+
+    def total(self, noise: Array) -> Array:
+        """(q, q) products of all parts, each by its noise."""
+        return np.asarray(sum(part.gram / noise[part.source] for part in self.parts))
+
+    @cached_property
+    def whole(self) -> Array:
+        """The same by the noises found."""
+        return self.total(self.variances.noise)
+
+    @property
+    def candidates(self) -> Array:
+        """(c,) their columns."""
+        return self.free + self.random + np.arange(len(self.column))
+
+    def ridge(self, fitted: Array) -> Array:
+        """(f,) what is known of columns before any pose.  fitted: (f,) which columns."""
+        known = np.zeros(len(self.whole))
+        known[self.free : self.free + self.random] = 1.0 / self.variances.factor
+        return np.asarray(known[fitted])
+
+    def fitted(self, chosen: Array) -> Array:
+        """(f,) columns that are fitted: x, u and some candidates."""
+        return np.append(np.arange(self.free + self.random), self.candidates[chosen])
+
+    def left(self, fitted: Array) -> Array:
+        """(c + 1, c + 1) products of candidates and error less what fitted columns explain."""
+        asked = np.append(self.candidates, len(self.whole) - 1)
+        across = self.whole[np.ix_(fitted, asked)]
+        gram = self.whole[np.ix_(fitted, fitted)] + np.diag(self.ridge(fitted))
+        return np.asarray(self.whole[np.ix_(asked, asked)] - across.T @ solve(gram, across))
+
+    def scores(self, chosen: Array) -> tuple[Array, Array, Array]:
+        """Each candidate's change beside chosen ones, its sigma, its degrees of freedom: (c,) each.
+
+        The variance is part noise, of many degrees of freedom, and part of what the model lacks,
+        which is known from as many places as poses stand in [Satterthwaite 1946].
+        """
+        fitted = self.fitted(chosen)
+        every, alone = (self.left(some) for some in (fitted, fitted[self.is_known(fitted)]))
+        size, noise = (np.maximum(np.diag(one)[:-1], 1e-300) for one in (every, alone))
+        by_noise = np.minimum(size / noise, 1.0)  # share of the variance
+        places = max(sum(part.source != FOOT for part in self.parts) - 1, 1)
+        dof = 1.0 / (by_noise**2 / self.variances.dof + (1.0 - by_noise) ** 2 / places)
+        return every[:-1, -1] / size, 1.0 / np.sqrt(size), dof
+
+    def is_known(self, fitted: Array) -> Array:
+        """(f,) True for columns that are not what the model lacks."""
+        lacking = np.zeros(len(self.whole), dtype=bool)
+        lacking[self.free : self.free + self.random] = self.component >= 0
+        return ~lacking[fitted]
+
+    def widest(self) -> float:
+        """By how much what the model lacks widens the least sure sigma."""
+        none = np.zeros(0, dtype=int)
+        fitted = self.fitted(none)
+        every, alone = (
+            np.diag(self.left(some))[:-1] for some in (fitted, fitted[self.is_known(fitted)])
+        )
+        return float(np.sqrt(np.max(alone / np.maximum(every, 1e-300), initial=1.0)))
+
+    def scatter(self, chosen: Array, more: int) -> float:
+        """Sigma of one more candidate's change by fits without each part: the jackknife."""
+        fitted, at = self.fitted(chosen), int(self.candidates[more])
+        parts = [part for part in self.parts if part.source != FOOT]
+        without = [self.whole - part.gram / self.variances.noise[part.source] for part in parts]
+        found = np.array([self.slope(gram, fitted, at) for gram in without])
+        known = found[np.isfinite(found)]
+        off = known - self.slope(self.whole, fitted, at)
+        return float(np.sqrt((len(known) - 1) / max(len(known), 1) * np.sum(off**2)))
+
+    def slope(self, gram: Array, fitted: Array, at: int) -> float:
+        """A candidate's change beside fitted columns; NaN where nothing tells it."""
+        asked = np.array([at, len(gram) - 1])
+        across = gram[np.ix_(fitted, asked)]
+        own = gram[np.ix_(fitted, fitted)] + np.diag(self.ridge(fitted))
+        left = gram[np.ix_(asked, asked)] - across.T @ solve(own, across)
+        told = left[0, 0] > RIDGE * gram[at, at] > 0.0
+        return float(left[0, 1] / left[0, 0]) if told else np.nan
+
+    def gains(self, chosen: Array, more: int) -> Array:
+        """(g,) by how much new poses come nearer, each part left out in its turn, with one more."""
+        new = [part for part in self.parts if part.source == NEW]
+        before, after = (self.fitted(some) for some in (chosen, np.append(chosen, more)))
+        return np.array([self.square(part, before) - self.square(part, after) for part in new])
+
+    def square(self, part: Part, fitted: Array) -> float:
+        """Squared errors of a part that the others predict, in units of its noise."""
+        own = part.gram / self.variances.noise[part.source]
+        rest = self.whole - own
+        gram = rest[np.ix_(fitted, fitted)] + np.diag(self.ridge(fitted))
+        step = solve(gram, rest[fitted, -1:])[:, 0]
+        pull = own[fitted, -1]
+        return float(own[-1, -1] - 2.0 * step @ pull + step @ own[np.ix_(fitted, fitted)] @ step)
+
+    def change(self, chosen: Array) -> tuple[Array, Array]:
+        """(d,) of chosen candidates, all of them together, and (d,) sigmas."""
+        fitted = self.fitted(chosen)
+        gram = self.whole[np.ix_(fitted, fitted)] + np.diag(self.ridge(fitted))
+        right = np.concatenate([self.whole[fitted, -1:], np.eye(len(fitted))], axis=1)
+        found = solve(gram, right)
+        variance = np.maximum(np.diag(found[:, 1:]), 0.0)
+        at = np.arange(len(fitted) - len(chosen), len(fitted))
+        return found[at, 0], np.sqrt(variance[at])
+
+    def lacking(self) -> Array:
+        """(free, random) by how much u moved the x of the calibration: minus its share of it."""
+        none = np.zeros((len(self.whole), len(self.whole)))
+        old = sum((part.gram for part in self.parts if part.source == OLD), start=none)
+        x, u = np.arange(self.free), self.free + np.arange(self.random)
+        return -solve(old[np.ix_(x, x)], old[np.ix_(x, u)])
+
+    def again(self, other: Both) -> Both:
+        """Another of the same sessions with the variances of this one."""
+        return replace(other, found=self.variances)
+
+
+def solve(gram: Array, right: Array) -> Array:
+    """Solutions of a positive semi-definite system in columns of any unit."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size = np.where(size > 0.0, size, 1.0)[:, None]
+    unit = gram / size / size.T + RIDGE * np.eye(len(gram))
+    try:
+        found = cho_solve(cho_factor(unit, check_finite=False), right / size, check_finite=False)
+    except np.linalg.LinAlgError:  # no better than rounding allows
+        found = np.linalg.pinv(unit, rcond=RIDGE, hermitian=True) @ (right / size)
+    return np.asarray(found / size)
+
+
+def inverse(gram: Array) -> Array:
+    """Of a positive semi-definite matrix, as `solve` takes it: a third of its work."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size = np.where(size > 0.0, size, 1.0)
+    root, failed = dpotrf(gram / np.outer(size, size) + RIDGE * np.eye(len(gram)))
+    if failed:  # no better than rounding allows
+        return solve(gram, np.eye(len(gram)))
+    half = np.triu(dpotri(root)[0])
+    return np.asarray((half + np.triu(half, 1).T) / np.outer(size, size))
+
+
+def likeliest(both: Both) -> Variances:
+    """Restricted maximum likelihood by its fixed point [Harville 1977].
+
+    The new poses are no less noisy than those of the calibration; those of the foot as is stated.
+    """
+    x = np.append(np.arange(both.free), both.candidates[both.zero])
+    f, r = len(x), both.random
+    rows = np.concatenate([x, both.free + np.arange(r), [len(both.parts[0].gram) - 1]])
+    grams = np.zeros((3, len(rows), len(rows)))
+    counts = np.zeros(3)
+    for part in both.parts:
+        grams[part.source] += part.gram[np.ix_(rows, rows)]
+        counts[part.source] += part.count
+    noise, factor = np.ones(3), np.append(both.near, np.ones(r))[:r]
+    kinds = [both.component == kind for kind in np.unique(both.component) if kind >= 0]
+    for _ in range(ROUNDS):
+        prior = np.append(np.zeros(f), 1.0 / factor)
+        gram = np.tensordot(1.0 / noise, grams, 1)
+        cover = inverse(gram[:-1, :-1] + np.diag(prior))
+        value = cover @ gram[:-1, -1]
+        left = [g[-1, -1] - 2.0 * value @ g[:-1, -1] + value @ g[:-1, :-1] @ value for g in grams]
+        square = np.maximum(left, 0.0)
+        paid = np.array([np.sum(cover * g[:-1, :-1]) for g in grams]) / noise
+        free = np.maximum(counts - paid, 0.5)
+        ratio = noise[NEW] / noise[OLD]
+        common = (square[OLD] + square[NEW] / ratio) / (free[OLD] + free[NEW])
+        common = max(float(common), LEAST if counts[OLD] else 1.0)
+        if counts[OLD] and counts[NEW]:
+            ratio = max(float(square[NEW] / free[NEW]) / common, 1.0)
+        before, noise = np.append(noise, factor), np.array([common, common * ratio, 1.0])
+        told = np.clip(1.0 - np.diag(cover)[f:] / factor, 1e-12, 1.0)
+        for some in kinds:
+            one = float(np.sum(value[f:][some] ** 2) / np.sum(told[some]))
+            factor[some] = max(one, SMALL)
+        if np.all(np.abs(np.log(np.append(noise, factor) / before)) < SETTLED):
+            break
+    deviance = (
+        float(counts @ np.log(noise) + np.log(factor).sum())
+        + log_determinant(np.tensordot(1.0 / noise, grams, 1)[:-1, :-1] + np.diag(prior))
+        + float(np.sum(square / noise) + np.sum(value[f:] ** 2 / factor))
+    )
+    return Variances(noise, factor, max(float(free[NEW]), 1.0), deviance)
+
+
+def log_determinant(gram: Array) -> float:
+    """Of a positive semi-definite matrix, as `solve` takes it."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size = np.where(size > 0.0, size, 1.0)
+    unit = gram / np.outer(size, size) + RIDGE * np.eye(len(gram))
+    return float(np.linalg.slogdet(unit)[1] + 2.0 * np.log(size).sum())
+
+
+def critical(level: Array, dof: Array) -> Array:
+    """Sigmas that chance exceeds, either way, with the probabilities given [Student]."""
+    return np.asarray(stats.t.isf(0.5 * level, dof))
