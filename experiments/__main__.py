@@ -114,6 +114,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.coverage",
         "Do 95 % intervals hold the truth: parameters, positions, held-out accuracy, bootstrap",
     ),
+    "one_session": (
+        "experiments.one_session",
+        "Is anything said to have moved within one session, and is a move found",
+    ),
     "watch": (
         "experiments.watch",
         "Is a shifted joint found by ten poses, and how often is one named that did not move",

@@ -11,12 +11,10 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from experiments import one_session
-from experiments.one_session import Job, simulated
+from experiments.one_session import Job
 from experiments.watch import SHIFT, Trial, seen_anew, shifted
 from experiments.watch import run as trial
 from minimax_cal.judging.watching import moved
-from minimax_cal.judging.watching.moved import search
-from minimax_cal.judging.watching.opening import watched_of
 from minimax_cal.modelling.effects import EFFECTS
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
 from minimax_cal.robots.sampling import random_poses
@@ -105,19 +103,6 @@ def test_not_valid_and_not_decided(fit: mc.Fit, made: Simulation) -> None:
     assert close.valid is None
     assert [v.valid for v in close.verdicts] == [None, None]  # ten poses tell no maximum
     assert close.confidence < 0.975
-
-
-def test_sigmas_of_the_search_are_those_of_many_runs() -> None:
-    """z of joints that did not move spread by 1, where the model lacks something."""
-    z = []
-    for seed in range(12):
-        data, first, _, _ = simulated(Job("irb120", seed, "time"))
-        fit = mc.calibrate("irb120", data.take(first), "sum")
-        watched, _ = watched_of(fit, data.take(~first), ())
-        found = search(watched, np.zeros(watched.names.count, dtype=bool))
-        by, sigma, _ = found.first.scores(moved.NOTHING)
-        z.append(by / sigma)
-    assert abs(np.sqrt(np.mean(np.square(z))) - 1.0) < SIGMAS / np.sqrt(2 * np.size(z))
 
 
 def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:

@@ -3,8 +3,8 @@
 Parameters that move the points alike (d1 and the base's z) can be traded for each other at no cost.
 Both arms are therefore told with the same ones kept at the drawing: x' = x - N N_g^-1 x_g, with N
 the motions of the links that base and reflectors imitate and g the parameters that are kept.  What
-is left can be compared, in sigmas of both covariances, of noise and of folds.  What changed is asked
-of the poses themselves (`moved.search`).
+is left can be compared, in sigmas of both covariances, of noise and of folds.  What changed is
+asked of the poses themselves (`moved.search`).
 """
 
 from __future__ import annotations

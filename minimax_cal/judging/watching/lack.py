@@ -18,6 +18,7 @@ from minimax_cal.robots.robot import Robot
 UNIT = 1e-4  # turn by a factor of 1, so that variances are numbers of ordinary size [rad]
 OWN = 2  # waves in a turn of the joint itself: gears err once and twice a turn
 WAVES = 2  # of the place in the session: a drift and a bow
+GONE_ON = float(np.sqrt(12.0))  # from one session's mean to the next, over the RMS of a drift
 
 
 def joint_units(robot: Robot) -> Array:
@@ -56,7 +57,7 @@ def by_time(robot: Robot, when: Array, arm: Array, growth: Array) -> tuple[Array
     """
     turned = UNIT * np.concatenate([joint_units(robot) * arm, growth[..., None]], axis=2)
     phase = np.pi * np.arange(WAVES + 1)[:, None] * when
-    size = np.where(np.arange(WAVES + 1) > 0, np.sqrt(2.0), 1.0)[:, None]
+    size = np.where(np.arange(WAVES + 1) > 0, np.sqrt(2.0), GONE_ON)[:, None]
     functions = size * np.cos(phase)
     kind = np.append(np.zeros(robot.joints, dtype=int), 1)
     return functions[:, :, None, None] * turned, kind
