@@ -195,8 +195,8 @@ def remarks(one: Fit, other: Fit) -> Iterator[str]:
     """What the reader should know."""
     if not (one.data.poses or other.data.poses):
         yield (
-            "neither file holds its poses, so that no joint can be said to have changed; write "
-            "them again without --no-poses"
+            "neither file holds its poses, so that no joint can be said to have changed; save "
+            "them with their poses"
         )
     if np.array_equal(one.data.y, other.data.y, equal_nan=True):
         yield (
