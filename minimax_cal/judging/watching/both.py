@@ -162,8 +162,8 @@ class Both:
         return float(left[0, 1] / left[0, 0]) if told else np.nan
 
     def gains(self, chosen: Array, more: int) -> Array:
-        """(g,) by how much new poses come nearer, each part left out in its turn, with one more."""
-        new = [part for part in self.parts if part.source == NEW]
+        """(g,) by how much each new part, left out in its turn, comes nearer with one more."""
+        new = [part for part in self.parts if part.source != OLD]
         before, after = (self.fitted(some) for some in (chosen, np.append(chosen, more)))
         return np.array([self.square(part, before) - self.square(part, after) for part in new])
 

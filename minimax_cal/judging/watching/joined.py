@@ -30,7 +30,7 @@ def joined(watched: Watched, rows: Rows, column: Array) -> Both:
 
 
 def new_parts(watched: Watched, rows: Rows, random: Array, column: Array) -> Iterator[Part]:
-    """Products of the new rows, region by region, the foot last."""
+    """Products of the new rows, region by region, and of each reflector on the foot."""
     kept = -rows.jacobian @ watched.held
     if rows.foot and watched.old is None:
         kept[rows.pose < 0] = rows.latent[rows.pose < 0]
@@ -40,6 +40,7 @@ def new_parts(watched: Watched, rows: Rows, random: Array, column: Array) -> Ite
     )
     region = regions(watched.data)
     label = np.append(region, -1)[rows.pose]
+    label[rows.pose < 0] = -1 - np.arange(rows.foot) // 3
     seen = (~np.isnan(watched.data.y)).sum(axis=(1, 2))
     for one in np.unique(label):
         part = whole[label == one]

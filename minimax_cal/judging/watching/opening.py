@@ -11,7 +11,6 @@ import numpy as np
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.judging.watching.old import own_poses
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.grouping import regions
@@ -59,7 +58,6 @@ def watched_of(
     ratio = usual_u95(data) / usual_u95(fit.data)
     variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)
     variance = max(variance, LEAST_NOISE**2)
-    old = own_poses(fit)
     watched = Watched(
         cell=replace(
             cell,
@@ -72,8 +70,7 @@ def watched_of(
         known=known_by.root,
         names_old=known_by.names,
         variance=variance,
-        jitter=old.jitter if old else known_by.noise.jitter,
-        old=old,
+        fit=fit,
         frame=frame,
         tool=tool,
         foot=foot,

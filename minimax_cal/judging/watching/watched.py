@@ -12,10 +12,11 @@ from functools import cached_property
 
 import numpy as np
 
+from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.uncertainty import Estimator, Poses
 from minimax_cal.ground.arrays import Array
-from minimax_cal.judging.watching.old import Old, noise_root
+from minimax_cal.judging.watching.old import Old, noise_root, own_poses
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell, still
@@ -33,8 +34,8 @@ class Watched:
     """New measurements of a calibrated arm, and what of it is open.
 
     cell: as calibrated, with the targets of the data.  known: (p_old, r) root of the calibration's
-    covariance, p_old its parameters by `names_old`.  variance, jitter: of its noise [m^2, rad].
-    old: its own poses, None where its file has none.
+    covariance, p_old its parameters by `names_old`.  variance: of its noise [m^2].
+    fit: the calibration.
     frame, tool: whether the instrument stands, and the reflectors sit, where they did.
     foot: (f, 3) reflectors of the foot in the base as calibrated, and foot_now: as seen now [m];
     foot_variance: of a coordinate of their difference [m^2].
@@ -45,8 +46,7 @@ class Watched:
     known: Array
     names_old: Names
     variance: float
-    jitter: float
-    old: Old | None
+    fit: Fit
     frame: bool
     tool: bool
     foot: Array
@@ -59,6 +59,16 @@ class Watched:
         robot, targets = self.cell.robot, self.cell.target_names
         scene = self.cell.scene(still(np.zeros((1, robot.joints)), targets, robot))
         return Names(robot.joints, targets, names_of(self.cell.effects.terms, scene)[0])
+
+    @cached_property
+    def old(self) -> Old | None:
+        """Its own poses, None where its file has none; looked at when they are first asked for."""
+        return own_poses(self.fit)
+
+    @property
+    def jitter(self) -> float:
+        """Noise of the joints [rad]."""
+        return self.old.jitter if self.old else self.fit.known.noise.jitter
 
     @cached_property
     def open(self) -> Array:
