@@ -183,7 +183,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
         progress(name_rung(step.name, step.holdout.rms_mm))
-    floor = floor_beneath(robot, clean.data, ladder.last)
+    floor = floor_beneath(robot, clean.data, ladder.last, steps[-1])
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
@@ -274,10 +274,12 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
     return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
 
 
-def floor_beneath(robot: Robot, data: Measurements, last: Joint) -> Floor:
-    """What noise alone would leave beneath the last rung."""
+def floor_beneath(robot: Robot, data: Measurements, last: Joint, step: Step) -> Floor:
+    """What noise alone would leave beneath the last rung, no more than that leaves held out."""
     error = last.cell.error(data)
-    return floor_of(data, error, robot.repeatability, noise_at_most(error, last.poses.left_free))
+    most = noise_at_most(error, last.poses.left_free)
+    judged = step.trusted if step.trusted.poses else step.train
+    return floor_of(data, error, robot.repeatability, most).beneath(judged.rms_mm)
 
 
 def steps_of(

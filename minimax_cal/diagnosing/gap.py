@@ -29,6 +29,7 @@ from minimax_cal.modelling.parameters import State
 
 SHAKY = 3.0  # times what the instrument alone would show between visits
 RESAMPLES = 1000
+NOTHING = 0.95  # width of the 95 % interval of a share of which nothing is known
 FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
 HELPS = 1e-6  # relative fall of the error by groups that is one
@@ -315,7 +316,15 @@ def closed(ladder: Ladder, judges: Judges, floor: Floor, seed: int) -> tuple[flo
     """Share of the gap that a ladder closes on held-out poses, and its 95 % interval."""
     before, after = (judges.errors(fit.cell) for fit in (ladder.fits[0], ladder.last))
     variance, rng = spared(ladder, judges, floor), np.random.default_rng(seed)
-    return closed_share(before, after, clusters(judges.held), floor, variance, rng)
+    return told(*closed_share(before, after, clusters(judges.held), floor, variance, rng))
+
+
+def told(share: float, ends: Ends) -> tuple[float, Ends]:
+    """The same between 0 and 1, without an interval that says nothing."""
+    low, high = np.clip(ends, 0.0, 1.0).tolist()
+    if not high - low < NOTHING:
+        low = high = float("nan")
+    return float(np.clip(share, 0.0, 1.0)), (low, high)
 
 
 def closed_share(

@@ -259,7 +259,7 @@ class Diagnosis:
     status: of the geometric fit.  verdict: one of VERDICTS.  findings: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
     sought anew without each.  floor: RMS that noise alone would leave.
-    closed: share of the gap closed, with its interval.
+    closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
     noise: of a coordinate [m].  jitter: of a joint [rad].
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
@@ -372,7 +372,7 @@ class Diagnosis:
                 "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
                 "noise_floor_from": self.floor.source,
                 "closed": finite(self.closed),
-                "closed_ci95": [finite(value) for value in self.closed_ci],
+                "closed_ci95": list(self.closed_ci) if self.has_interval else None,
                 "ladder": [
                     {
                         "step": step.name,
@@ -408,6 +408,11 @@ class Diagnosis:
     def frames(self) -> dict[str, Frame]:
         """Where base and tool stand with all effects, and the corrections: `frames_of`."""
         return frames_of(self.cells[-1], self.nominal) if self.cells else {}
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether anything is known of how sure the share closed is."""
+        return math.isfinite(self.closed_ci[0])
 
     def rungs(self) -> tuple[tuple[str, Cell], ...]:
         """Every arm with its name: nominal, geometric, then with each effect."""

@@ -153,7 +153,7 @@ class GapPart(Part):
     noise_floor_range_mm: Ends = UNKNOWN
     noise_floor_from: str = ""
     closed: Number = math.nan
-    closed_ci95: Ends = UNKNOWN
+    closed_ci95: Ends | None = None
     ladder: Annotated[tuple[RungPart, ...], Field(min_length=2)]
     beyond: BeyondPart = Field(default_factory=lambda: BeyondPart(reason=EARLIER))
 
@@ -264,7 +264,7 @@ def assembled(
             part.gap.noise_floor_mm, *part.gap.noise_floor_range_mm, part.gap.noise_floor_from
         ),
         closed=part.gap.closed,
-        closed_ci=part.gap.closed_ci95,
+        closed_ci=part.gap.closed_ci95 or UNKNOWN,
         beyond=part.gap.beyond.beyond(),
         noise=1e-3 * part.noise.instrument_mm,
         jitter=1e-3 * part.noise.joint_jitter_mrad,

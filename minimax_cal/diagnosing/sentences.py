@@ -116,14 +116,17 @@ def shrunk(found: Diagnosis) -> str:
     if len(found.ladder) < 3:
         return f"{text}."
     text += f", whole model {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm{without_far(found)})"
-    if not math.isfinite(found.closed):
-        return f"{text}."
+    return f"{text}; {closed_words(found)}." if math.isfinite(found.closed) else f"{text}."
+
+
+def closed_words(found: Diagnosis) -> str:
+    """How much of the gap to the noise is closed, for people, and how sure that is."""
     low, high = (100.0 * end for end in found.closed_ci)
-    ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
+    ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if found.has_interval else ""
     share = f"{100.0 * found.closed:.0f} %"
     if not (found.floor.certain or share == "100 %"):  # told as if noise alone left nothing
         share = f"at least {share}"
-    return f"{text}; {share} of the gap to the noise is closed{ends}."
+    return f"{share} of the gap to the noise is closed{ends}"
 
 
 def without_far(found: Diagnosis) -> str:

@@ -6,7 +6,7 @@ Where neither is known, the distances between targets tell the instrument's nois
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -55,6 +55,15 @@ class Floor:
     def least(self) -> float:
         """The floor to take off where the gap is not to be told too small [mm]."""
         return self.value if self.certain else 0.0
+
+    def beneath(self, error: float) -> Floor:
+        """The same where a model errs by no more than so much [mm]: noise is part of that."""
+        return replace(
+            self,
+            value=min(self.value, error),
+            low=min(self.low, error),
+            high=min(self.high, error),
+        )
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
         """(count,) values that it may have [mm]."""

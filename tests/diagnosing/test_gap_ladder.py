@@ -434,6 +434,22 @@ def test_few_draws_with_a_gap_give_no_interval(
     assert np.isfinite(ends).tolist() == [told, told]
 
 
+@pytest.mark.parametrize(
+    ("share", "ends", "expected"),
+    [
+        (1.5, (0.9, 1.8), (1.0, (0.9, 1.0))),
+        (0.6, (-0.4, 0.7), (0.6, (0.0, 0.7))),
+        (-0.2, (-0.6, 0.3), (0.0, (0.0, 0.3))),
+        (0.5, (-3.0, 4.0), (0.5, (np.nan, np.nan))),
+        (np.nan, (np.nan, np.nan), (np.nan, (np.nan, np.nan))),
+    ],
+)
+def test_a_share_is_between_nothing_and_all(
+    share: float, ends: tuple[float, float], expected: tuple[float, tuple[float, float]]
+) -> None:
+    assert_allclose(np.hstack(gap.told(share, ends)), np.hstack(expected))
+
+
 def test_what_other_training_poses_would_close_is_a_jackknife(play: Study) -> None:
     """Against fits made anew without each tenth."""
     fits = (joint(play, ()), joint(play, (PLAY,)))

@@ -21,6 +21,7 @@ from minimax_cal.diagnosing.result import (
     in_words,
     of_curve,
 )
+from minimax_cal.diagnosing.sentences import closed_words
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.measuring.accuracy import Accuracy
@@ -191,6 +192,15 @@ def test_the_file_holds_every_number(made: Diagnosis) -> None:
         "nominal", "geometric", "+ backlash J2", "+ joint_compliance J3"]  # fmt: skip
     assert len(said["poses"]["line"]) == 30
     assert replace(made, nominal=None).rungs() == ()
+
+
+def test_an_interval_that_says_nothing_is_null(made: Diagnosis) -> None:
+    unsure = replace(made, closed_ci=(math.nan, math.nan))
+    said = json.loads(unsure.json())
+    assert said["gap"]["closed_ci95"] is None
+    assert "95 % interval" not in closed_words(unsure)
+    assert "95 % interval 80 to 95 %" in closed_words(made)
+    assert not Diagnosis.from_dict(said).has_interval
 
 
 def test_errors_and_curves_are_those_of_the_cells(made: Diagnosis) -> None:

@@ -62,6 +62,11 @@ def test_without_visits_or_promises_the_fit_tells_at_most(rng: np.random.Generat
     assert told.low < told.value
 
 
+def test_no_floor_is_above_what_a_model_leaves() -> None:
+    assert Floor(1.79, 0.0, 1.79, AT_MOST).beneath(0.273) == Floor(0.273, 0.0, 0.273, AT_MOST)
+    assert Floor(0.1, 0.05, 0.4, REPEATS).beneath(0.3) == Floor(0.1, 0.05, 0.3, REPEATS)
+
+
 def test_repeatability_is_mean_and_three_deviations(rng: np.random.Generator) -> None:
     distance = np.linalg.norm(rng.normal(size=(400_000, 3)), axis=1)
     promise = distance.mean() + 3.0 * distance.std()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.diagnosing.sentences import closed_words
 from minimax_cal.ground.records import reading
 from minimax_cal.reporting.html.content import Block, Blocks, missing, text
 from minimax_cal.reporting.html.more_charts import curve_chart, waterfall
@@ -28,9 +29,7 @@ def closing(gap: Diagnosis) -> str:
     """How much of the gap closed, and how the model does on parts left out."""
     out = "Each step is judged on held-out poses; the noise floor is what noise alone would leave."
     if math.isfinite(gap.closed):
-        low, high = (100.0 * end for end in gap.closed_ci)
-        ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if math.isfinite(low) else ""
-        out += f" The steps after geometry close {100.0 * gap.closed:.0f} % of the gap{ends}."
+        out += f" With the steps after geometry {closed_words(gap)}."
     if gap.beyond.worst:
         out += f" {gap.beyond.sentence()} Geometry alone: {gap.beyond.geometric_typical_mm:.3f} mm."
     return out
