@@ -60,9 +60,10 @@ EXACT = 1e-9  # an error below is rounding: data that were computed, not measure
 HOPELESS = 10.0 * POOR_FIT  # worst errors above this share of the reach: no calibration, so that
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
 # Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
-# by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Random arms whose
-# angles are off by up to 0.5 rad need 2e-2 (`experiments random_arms`).
+# by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
+# whose angles are off by up to 0.5 rad some need 2e-2 (`experiments random_arms`).
 GROWN = 1e-2
+PAYS = 0.5  # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
 GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
@@ -166,11 +167,13 @@ class Task:
             resolution=self.options.resolution,
         )
 
-    def grown(self, model: Model, state: State, known: Identification) -> Identification | None:
+    def grown(
+        self, model: Model, state: State, known: Identification, least: float
+    ) -> Identification | None:
         """What the poses tell besides, where a fit ended; None where it is nothing.
 
         Axes that the drawing has parallel or coaxial may stand well apart in the arm.  What was
-        identified stays so, and what joins must be told clearly (`GROWN`).
+        identified stays so.  least: relative singular value of what joins.
         """
         if not (self.allowed & ~known.active).any():
             return None
@@ -182,7 +185,7 @@ class Task:
             allowed=self.allowed,
             reference=self.reference,
             known=np.isfinite(self.sigma),
-            resolution=max(self.options.resolution, GROWN),
+            resolution=max(self.options.resolution, least),
         )
         more = found.active.sum() > known.active.sum()
         return found if more and found.active[known.active].all() else None
@@ -363,13 +366,15 @@ def geometry(task: Task, progress: Progress) -> Stage:
     if wide is not robust.fit:
         robust = task.robust(robust.plain, wide)
     for _ in range(GROWTHS):
-        state = robust.fit.x.take(np.array(0))
-        more = task.grown(task.base.emphasise(task.share), state, identification)
+        at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
+        clear = task.grown(*at, GROWN)
+        more = clear or task.grown(*at, 0.0)
         if more is None:
             break
-        identification = more
-        model, squares = task.squares(robust.plain.only(more.active), state)
-        robust = task.robust(model, squares)
+        model, squares = task.squares(robust.plain.only(more.active), at[1])
+        if clear is None and squares.cost[0] > PAYS * robust.fit.cost[0]:
+            break
+        identification, robust = more, task.robust(model, squares)
     return Stage(task.base, identification, robust, robust.fit, notices=notices)
 
 

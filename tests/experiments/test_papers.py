@@ -36,6 +36,14 @@ def test_an_erratum_is_shown_by_its_counter_example(one: errata.Erratum) -> None
     assert errata.stands(one)
 
 
+def test_what_was_withdrawn_is_shown_too() -> None:
+    """The printed iteration ends at the optimum, x = 1, from multipliers above and below."""
+    ends = errata.WITHDRAWN[0].numbers()
+    assert_allclose(ends, 1.0, atol=1e-4)
+    assert len(errata.ERRATA) == 13
+    assert not {one.where for one in errata.ERRATA} & {one.where for one in errata.WITHDRAWN}
+
+
 def test_no_entries_of_table_3_give_the_percentages_of_the_text() -> None:
     columns = np.array(list(PAPER.values())).T
     pairs = np.array([(a, b) for column in columns for a, b in permutations(column, 2)])

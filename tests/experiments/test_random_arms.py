@@ -10,6 +10,11 @@ from experiments.random_arms import KINDS, Job, at_noise, count, drawn, end_of, 
 from minimax_cal.fitting import solve
 
 
+def test_axes_hardly_apart_join_where_the_fit_needs_them() -> None:
+    """Two of the arms that a threshold on what shows alone leaves at 0.14 and 0.15 mm."""
+    assert all(at_noise(end_of(Job("coaxial neighbours", seed))) for seed in (54, 60))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_random_arm_reaches_the_noise(kind: str) -> None:
     found = {job: end_of(job) for job in (Job(kind, 0), Job(kind, 3))}
@@ -30,7 +35,7 @@ def test_identification_is_asked_again_at_the_answer(monkeypatch: pytest.MonkeyP
 
 def test_what_was_identified_stays_so_and_the_rest_stays_as_drawn() -> None:
     job = Job("coaxial neighbours", 1)
-    fit = mc.calibrate(drawn(job), measured(job, drawn(job)), "sum")
+    fit = mc.calibrate(drawn(job), measured(job, drawn(job)), "sum", allow_large_changes=True)
     rest = [p for p in fit.parameters if not p.identifiable]
     assert rest
     assert all(p.value == p.nominal for p in rest)
@@ -43,4 +48,4 @@ def test_whole_arms_gain_nothing(robot: mc.Robot) -> None:
     model = task.base.emphasise(task.share)
     known = task.identified(model, task.frame.state)
     _, squares = task.squares(model.only(known.active), task.frame.state)
-    assert task.grown(model, squares.x.take(np.array(0)), known) is None
+    assert task.grown(model, squares.x.take(np.array(0)), known, solve.GROWN) is None
