@@ -258,8 +258,8 @@ ERRATA = (
         "M eq. 20, 22, 25, 27", "one active index I instead of the variable D_Δxφ of eq. 13, 18",
         "the epigraph QP: min ½ΔᵀHΔ + v with F_i + ∇F_iᵀΔ − φ ≤ v",
         "Rows (∇F_i − ∇F_I)ᵀΔ + F_i − φ ≤ 0 force F_I to stay the largest: a restriction. "
-        "F = (1, 0.99), slopes (1, 0.5), H = 1: the steps, and the best on a fine grid. Algorithm 1 "
-        "comes near the optimum all the same (`experiments algorithm_1`).",
+        "F = (1, 0.99), slopes (1, 0.5), H = 1: the steps, and the best on a fine grid. "
+        "Algorithm 1 comes near the optimum all the same (`experiments algorithm_1`).",
         restriction,
     ),
     Erratum(
