@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from experiments import splits
+from experiments import algorithm_1, splits
 from experiments.conditions import PAPER, ROBOTS, Errors, Outcome
 from experiments.measuring_loop import Found as Loops
 from experiments.measuring_loop import Job as Loop
@@ -14,7 +16,7 @@ from experiments.methods import MINIMAX, PARTS, PRINTED, SINGLE, Studies, figure
 from experiments.methods import POSE as POSE_FIT
 from experiments.qp_cases import recorded
 from experiments.splits import Held
-from experiments.verdicts import HOLDS, NO, Verdict, hardware, listed, told
+from experiments.verdicts import HOLDS, NO, Verdict, hardware, listed, near, told
 from minimax_cal.ground.arrays import rms
 from qp_backends import accuracy
 from qp_backends.subgradient import solve
@@ -38,14 +40,16 @@ def condition_3(found: Found) -> list[Verdict]:
         out.append(
             Verdict(f"M Table 3, Fig. 5, condition {number}: {name}", "conditions",
                     f"{listed(sums)}; {phi:.3f}", " · ".join(ours), told(*right),
-                    "F_1 / F_2 / F_3 mm²; RMSE(φ) mm; training. " + CLAIM[name])
+                    "F_1 / F_2 / F_3 mm²; RMSE(φ) mm; training. " + CLAIM[name],
+                    "reproduced: on every arm; in part: on some", len(found))
         )  # fmt: skip
     ended = [outcomes["minimax"].status for outcomes in found.values()]
     out.append(
         Verdict("M Algorithm 1 from eq. 32: the minimax search converges", "conditions", "yes",
                 f"{ended.count('converged')} of {len(ended)} arms",
                 told(*(status == "converged" for status in ended)),
-                "SQP on the epigraph QP, with a line search, from the fit of the sum")
+                "SQP on the epigraph QP, with a line search, from the fit of the sum",
+                "reproduced: every arm; in part: some", len(ended))
     )  # fmt: skip
     return out
 
@@ -80,9 +84,10 @@ def best_of(name: str, errors: dict[str, Errors]) -> bool:
 
 def improvements(found: Found) -> list[Verdict]:
     """Fig. 2-4 and 6: how much less the errors are, training (held out)."""
-    one = (
-        "no table gives the printed figure; ours: RMS, training (held out); reproduced: less on "
-        "all, and on one arm by half the printed figure at least"
+    one = "no table gives the printed figure; ours: RMS, training (held out)"
+    rule = (
+        "reproduced: the median arm within 25 % of the printed figure, both ways, in training and "
+        "held out, and less on all arms; in part: one of the three"
     )
     out = []
     for item, paper, kind, before in (
@@ -94,16 +99,17 @@ def improvements(found: Found) -> list[Verdict]:
         ("M Fig. 6: AO, one SMR to minimax", "22.30", "ao", SMR),
         ("M Fig. 6: AP, pose to minimax", "14.36", "ap", ("pose",)),
     ):  # fmt: skip
-        words, better, largest = [], [], 0.0
+        words, every = [], []
         for robot, outcomes in found.items():
             train, held = (less(outcomes, kind, before, part) for part in ("train", "held"))
             words.append(f"{ROBOTS[robot][0]} {train:.1f} ({held:.1f})")
-            better += [train > 0.0, held > 0.0]
-            largest = max(largest, train)
-        better.append(largest > 0.5 * float(paper.split()[0]))
+            every.append((train, held))
+        middle = np.median(every, axis=0)
+        better = [*(near(one_of, float(paper.split()[0])) for one_of in middle), np.min(every) > 0]
         out.append(
             Verdict(f"{item}, % less", "conditions", paper, "; ".join(words), told(*better),
-                    one + ("; median of three single fits" if before == SMR else ""))
+                    one + ("; median of three single fits" if before == SMR else ""), rule,
+                    len(found))
         )  # fmt: skip
     ratios = [
         size(o["minimax"].train, "ao_angle") / size(o["pose"].train, "ao_angle")
@@ -115,11 +121,12 @@ def improvements(found: Found) -> list[Verdict]:
     out += [
         Verdict("M Fig. 6, text: orientation slightly inferior to the pose fit", "conditions",
                 "yes; Table 4: 2.6 / 2.5 mrad", "AO' ratio " + paired(names, ratios),
-                told(*(0.98 < ratio < 1.2 for ratio in ratios)), "minimax over pose, training"),
+                told(*(0.98 < ratio < 1.2 for ratio in ratios)), "minimax over pose, training",
+                "reproduced: between 0.98 and 1.2 on every arm; in part: on some", len(ratios)),
         Verdict("M Fig. 2, 3, eq. 4, 5: Euler angles near their singularity", "conditions",
                 "75th point", "largest AO / AO' " + paired(names, over, ".1f"),
                 told(max(over) > 3.0), "AO' is the angle itself; AO exceeds it without bound near "
-                "gimbal lock"),
+                "gimbal lock", "above 3 on one arm", len(over)),
     ]  # fmt: skip
     return out
 
@@ -158,6 +165,8 @@ def worst(found: Found) -> Verdict:
         told(*lower),
         "largest error mm with sum / minimax / point, training (held out): minimax is of the worst "
         "sum of squares; objective point, ours, of the worst point",
+        "largest error with minimax at most 0.9 of the sum's, in training; in part: on some arms",
+        len(found),
     )
 
 
@@ -192,13 +201,17 @@ def tables_1_4(studies: Studies) -> list[Verdict]:
     ]
     return [
         Verdict("M Table 1: the methods compared", "methods", "7 kinds of method",
-                f"{len(COMPARED)} run: {', '.join(COMPARED)}", told(*ended)),
+                f"{len(COMPARED)} run: {', '.join(COMPARED)}", told(*ended), "",
+                "reproduced: every fit converges; in part: some", len(present)),
         Verdict("M Table 1: MDH against product of exponentials", "methods", "told apart",
                 f"held-out RMS differs by {100.0 * apart:.2f} % at most",
-                HOLDS if apart < 0.05 else NO, "pose fits; both free the same directions"),
+                HOLDS if apart < 0.05 else NO, "pose fits; both free the same directions",
+                "within 5 % of each other", len(present)),
         Verdict("M Table 4: RMSE(φ), minimax over single SMR and over pose", "methods",
                 f"IRB 2600 {listed(paper, '.3f')}", "; ".join(words), told(*better),
-                "training (held out); single: median of three"),
+                "training (held out); single: median of three",
+                "reproduced: below 1 on every arm, in training and held out; in part: somewhere",
+                len(present)),
         hardware("M Table 4: SR10", "0.206 / 0.207 mm", "an SR10 arm; other real arms above"),
     ]  # fmt: skip
 
@@ -216,9 +229,25 @@ def many_splits(found: dict[splits.Job, Held]) -> list[Verdict]:
                         f"{s.wins} of {s.splits}; largest error {worst_of.median:.3f}, wins "
                         f"{worst_of.wins}",
                         told(s.high < 1.0, s.median < 1.0),
-                        "held-out RMSE(φ), minimax over sum; in part: wins at the median, not at "
-                        "the quartile")
+                        "held-out RMSE(φ), minimax over sum", "reproduced: below 1 at the upper "
+                        "quartile; in part: at the median", s.splits)
             )  # fmt: skip
+    return out
+
+
+def to_the_letter(found: Mapping[algorithm_1.Job, algorithm_1.Course]) -> list[Verdict]:
+    """Algorithm 1 as printed, and with a line search."""
+    out = []
+    for way in algorithm_1.WAYS:
+        ends = [algorithm_1.reached(course.ways[way], 10) for course in found.values()]
+        words = "; ".join(f"{job.arm} {end:.0e}" for job, end in zip(found, ends, strict=True))
+        out.append(
+            Verdict(f"M Algorithm 1, to the letter, {way}", "algorithm_1", "converges", words,
+                    told(*(end <= algorithm_1.GOOD for end in ends)),
+                    "RMSE(φ) over the optimum, minus one, after ten outer steps",
+                    f"reproduced: at most {algorithm_1.GOOD:g} on every arm; in part: on some",
+                    len(ends))
+        )  # fmt: skip
     return out
 
 
@@ -237,9 +266,10 @@ def subproblems(quick: bool) -> list[Verdict]:
         Verdict("M section III-D: the primal-dual subgradient method converges quickly", "papers",
                 "yes", f"accuracy after {RAW_STEPS} steps {worst['raw']:.0e}, on the eliminated "
                 f"form {worst['eliminated']:.0e}; restarted averaged PDHG {worst['restarted']:.0e}",
-                told(worst["raw"] < 1e-6),
+                told(worst["raw"] < 1e-6, worst["eliminated"] < 1e-6),
                 f"median of {len(cases)} QPs; subgradient:raw is the paper's, subgradient is PDHG "
-                "(Chambolle-Pock) restarted and averaged as in PDLP"),
+                "(Chambolle-Pock) restarted and averaged as in PDLP", "relative KKT residual below "
+                "1e-6; in part: on one form", len(cases)),
     ]  # fmt: skip
 
 
@@ -260,7 +290,7 @@ def measuring(found: dict[Loop, Loops]) -> list[Verdict]:
                 told(saved["random"] > 0.0),
                 f"until the predicted sigma is {goal:g} µm, medians of {len(found)} arms; the loop "
                 f"saves {saved['random']:.0f} % against random, {saved['one plan']:.0f} % against "
-                "one plan"),
+                "one plan", "fewer poses than random ones, in the median", len(found)),
     ]  # fmt: skip
 
 

@@ -21,7 +21,21 @@ from experiments.index import tables_of
 from experiments.measuring_loop import Job
 from experiments.off_starts import grid
 from experiments.splits import Held
-from experiments.verdicts import HEADER, MISSING, NO, PARTLY, VERDICTS, YES, told
+from experiments.verdicts import (
+    HEADER,
+    HOLDS,
+    MISSING,
+    NO,
+    PARTLY,
+    TOO_FEW,
+    VERDICTS,
+    YES,
+    Verdict,
+    near,
+    of_quick,
+    table_of,
+    told,
+)
 from experiments.verdicts_m import FIVE, best_of
 
 PAGE = ROOT / "docs" / "papers.md"
@@ -62,6 +76,22 @@ def test_the_list_on_the_page_is_what_the_command_writes() -> None:
 
 def test_verdicts_follow_from_their_parts() -> None:
     assert [told(True, True), told(True, False), told(False)] == [YES, PARTLY, NO]
+
+
+def test_a_quick_run_says_nothing_on_few_cases() -> None:
+    made = {n: Verdict("x", "splits", "1", "1", YES, cases=n) for n in (0, 2, 19, 20)}
+    assert [of_quick(v).verdict for v in made.values()] == [YES, TOO_FEW, TOO_FEW, YES]
+
+
+def test_rules_are_two_sided_and_printed() -> None:
+    assert [near(x, 67.34) for x in (-15.7, 50.0, 51.0, 84.0, 85.0)] == [
+        False, False, True, True, False,
+    ]  # fmt: skip
+    rule = "within 25 %"
+    rows = table_of([Verdict("x", "splits", "1", "1", YES, rule=rule)]).rows
+    assert rows[0][-1] == f"rule: {rule}"
+    bare = table_of([Verdict("x", "y", "1", "1", v) for v in (YES, HOLDS)]).rows
+    assert all(str(row[-1]).startswith("rule: ") for row in bare)
 
 
 def errors(*sums: float) -> Errors:
