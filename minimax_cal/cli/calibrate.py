@@ -70,12 +70,12 @@ def calibrate_command(
             from minimax_cal.judging.bootstrap import bootstrap
 
             more = (bootstrap(fit, replicates, chosen["seed"], progress),)
-    to.notice(*fit.notices)
+    to.notice(*(notice for notice in fit.notices if notice != fit.reason))
     if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
         tables = (*fit.tables(), *(found.table() for found in more))
         options.show(*tables, headline=fit.headline())
     to.draw(save_errors, fit)
-    return options.exit_code(fit.status)
+    return options.exit_code(fit.status, fit.reason)
 
 
 def text_of(fit: Fit, *more: Bootstrap, poses: bool = True) -> str:

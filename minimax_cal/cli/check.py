@@ -41,16 +41,27 @@ ASKED = "What is asked"
         group=ASKED,
     ),
     seed=Option("The seed of samples behind the intervals.", group=ASKED),
+    simulated=Option(
+        "The points are of a simulation and may be exact; a file that begins with # simulated says "
+        "so itself.",
+        group=ASKED,
+    ),
 )
 @result_options("the calibration with what moved refitted (JSON)")
 def check_command(
-    fit: Path, data: Path, tolerance: str, known: tuple[str, ...], seed: int, to: Output
+    fit: Path,
+    data: Path,
+    tolerance: str,
+    known: tuple[str, ...],
+    seed: int,
+    simulated: bool,
+    to: Output,
 ) -> int:
     """Whether the calibration FIT is still valid, and what moved, by a few new poses in DATA.
 
     Instrument and reflectors may stand anew.  Ends with 0 where it is valid, else with 1.
     """
-    found = check(fit, data, tolerance, known=known, seed=seed)
+    found = check(fit, data, tolerance, known=known, seed=seed, simulated=simulated)
     to.notice(*found.notices)
     if to.path:
         found.save(to.path)

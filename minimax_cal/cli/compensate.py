@@ -65,6 +65,10 @@ HOW = "How targets are corrected"
         group=HOW,
     ),
 )
+@options_of(
+    compensate,
+    keep_anyway=Option("Also where the calibrated arm is no better than the drawn one.", group=HOW),
+)
 @plain_option(
     HOW,
     "--tool",

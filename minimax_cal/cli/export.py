@@ -57,6 +57,9 @@ FORMAT = "The format"
     experimental=Option(
         "Agree to a format whose frames its maker does not document (moc).", group=FORMAT
     ),
+    keep_anyway=Option(
+        "Also where the calibrated arm is no better than the drawn one.", group=FORMAT
+    ),
 )
 @RUNG
 @JSON

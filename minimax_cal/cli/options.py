@@ -369,9 +369,14 @@ def drawable(path: Path | None) -> None:
             raise OptionError(NEEDED)
 
 
-def exit_code(status: Status) -> int:
-    """Of how the numbers ended, with a line of error where they did not work out."""
+def exit_code(status: Status, reason: str = "") -> int:
+    """Of how the numbers ended, with a line of error where they did not work out.
+
+    reason: why, of this result; the advice for all such results unless given.
+    """
     if status is Status.CONVERGED:
         return 0
-    tell("error", f"{status}: {status.advice}", exit_code=FAILED)
+    at = click.get_current_context(silent=True)
+    said = in_flags(reason, at.command) if at and reason else reason or status.advice
+    tell("error", f"{status}: {said}", exit_code=FAILED)
     return FAILED

@@ -14,7 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.correcting.deliverable import COMPENSATED, Delivered, Figures, delivered
+from minimax_cal.correcting.deliverable import (
+    COMPENSATED,
+    Delivered,
+    Figures,
+    check_kept,
+    delivered,
+)
 from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -177,6 +183,7 @@ def compensate(
     lever: float = np.nan,
     clock: float = np.nan,
     rung: int | None = None,
+    keep_anyway: bool = False,
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
 
@@ -189,14 +196,15 @@ def compensate(
     the moment of the calibration's session, 0 to 1, that the arm is in: what follows that session's
     time is then corrected as it was at that moment, and not at all where NaN.  rung: of a
     diagnosis, the last unless given, of which the confirmed effects count.  The arm is fitted again
-    for exactly the effects that joints can correct (`deliver`).  Raises CalibrationError for wrong
-    input.
+    for exactly the effects that joints can correct (`deliver`).  keep_anyway: also where the
+    calibrated arm is no better than the drawn one.  Raises CalibrationError for wrong input.
 
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)
     nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
     known = open_result(fit, rung)
+    check_kept(known, keep_anyway)
     made = delivered(known, COMPENSATED, None if np.isnan(clock) else clock)
     cell, drawn = made.cell, made.nominal if known.placed else None
     robot = made.nominal.robot if made.nominal else None

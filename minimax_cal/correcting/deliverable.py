@@ -178,6 +178,15 @@ def deliver(
     return delivered(open_result(fit, rung), to, clock, progress)
 
 
+def check_kept(known: Opened, keep_anyway: bool) -> None:
+    """Raise OptionError for a calibrated arm that is no better than the drawn one."""
+    if known.status is Status.NO_BETTER and known.number and not keep_anyway:
+        raise OptionError(
+            f"{known.source}: {known.status.advice}; with keep_anyway=True the calibrated one is "
+            "taken all the same"
+        )
+
+
 def delivered(
     known: Opened, to: str, clock: float | None = None, progress: Progress = silent
 ) -> Delivered:

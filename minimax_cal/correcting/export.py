@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.correcting.deliverable import Delivered, block, delivered
+from minimax_cal.correcting.deliverable import Delivered, block, check_kept, delivered
 from minimax_cal.correcting.exporters import table
 from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_source
 from minimax_cal.fitting.opened import Result
@@ -48,6 +48,7 @@ def export(
     tip: str = "",
     experimental: bool = False,
     rung: int | None = None,
+    keep_anyway: bool = False,
     notify: Callable[[str], object] = warnings.warn,
 ) -> str:
     """The robot of a calibration in a format that other programs load.
@@ -59,7 +60,8 @@ def export(
     written to as well, where given.  urdf: a file whose joint origins are corrected, all else left
     as it is; mjcf: one whose bodies, gains and springs are.  tip: last link of the chain in that
     file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of
-    a diagnosis, the last unless given.  notify: called with what the format cannot hold and other
+    a diagnosis, the last unless given.  keep_anyway: also where the calibrated arm is no better
+    than the drawn one.  notify: called with what the format cannot hold and other
     notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong
     input.
 
@@ -69,8 +71,9 @@ def export(
         check_writable(path)
     place = None if path is None else Path(path)
     made = exported(
-        fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental, rung=rung
-    )
+        fit, to, place, urdf=urdf, mjcf=mjcf, tip=tip, experimental=experimental, rung=rung,
+        keep_anyway=keep_anyway,
+    )  # fmt: skip
     written(made.file, place)
     for notice in made.notices:
         notify(notice)
@@ -87,6 +90,7 @@ def exported(
     tip: str = "",
     experimental: bool = False,
     rung: int | None = None,
+    keep_anyway: bool = False,
 ) -> Exported:
     """The bytes of the file, its notices, and what it delivers; arguments as of `export`."""
     table.exporter(to)
@@ -94,6 +98,7 @@ def exported(
     if isinstance(source, Job):
         job = source
     else:
+        check_kept(source, keep_anyway)
         found = delivered(source, to)
         q = source.train.q if source.data.poses else None
         job = job_of(source.source, found.cell, found.nominal, q)

@@ -10,6 +10,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.intervals import UNKNOWN, Interval, chance_of_larger
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.measuring.accuracy import Accuracy
+from minimax_cal.solvers.status import Status
 
 PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"
 CLAIMS = ("inside", "outside")  # the measured poses
@@ -45,6 +46,7 @@ class Claim:
     themselves.  where: in words.  reason: why there is no claim, if there is none.  open: what
     could not be judged, so that nothing is passed by the rest; empty where all was.  sets:
     the poses of RMS and of the largest in two words, for a table.
+    refused: why nothing is passed, whatever the numbers; empty where it may be.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Claim:
     reason: str = ""
     open: str = ""
     sets: tuple[str, str] = ("", "")
+    refused: str = ""
 
     def bound(self, kind: str) -> Bound:
         """Of rms or max."""
@@ -167,6 +170,12 @@ def open_of(found: Beyond) -> str:
     return f"only {found.judged} could be judged, not {named}{more}, which the fit needs"
 
 
+REFUSED = {  # ends of a calibration of which nothing is passed, whatever its numbers
+    Status.FAILED: "the calibration failed",
+    Status.NO_BETTER: "the calibrated arm is no better than the drawn one",
+}
+
+
 def judge(limit: Limit, claim: Claim) -> Judgement:
     """A requirement against a claim.
 
@@ -194,6 +203,8 @@ def judge(limit: Limit, claim: Claim) -> Judgement:
             "few, or too unlike each other, to tell one",
         )
     seen = f"{bound.value:.3f} mm seen, 95 % limit {bound.high:.3f} mm"
+    if bound.high < limit.size_mm and claim.refused:
+        return told(NOT_PASSED, f"{seen}, but {claim.refused}")
     if bound.high < limit.size_mm and claim.open:
         return told(NOT_STATED, f"{seen}, but {claim.open}")
     if bound.high < limit.size_mm:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.fitting.computed import computed, residual
 from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.fitting.intervals import Interval, chance_of_larger, max_interval, rms_interval
 from minimax_cal.fitting.options import listed
@@ -19,7 +20,7 @@ from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
-from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, Limit, limits_of
+from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, REFUSED, Limit, limits_of
 from minimax_cal.judging.watching.moved import Search, search, sized
 from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.judging.watching.placing import Placing
@@ -47,6 +48,7 @@ def check(
     *,
     known: str | Sequence[str] = (),
     seed: int = 0,
+    simulated: bool = False,
 ) -> Health:
     """Whether a calibration is still valid, and what has moved, from a few new poses.
 
@@ -54,7 +56,8 @@ def check(
     is required of the error, in mm, as "rms 0.2, max 0.5".  known: what is where it was at the
     calibration: frame (the instrument), targets (the reflectors); reflectors on the foot, columns
     base1_x_mm ... of both, tell the frame too.  All else is placed anew.  seed: of samples behind
-    the intervals.  Raises CalibrationError for wrong input.
+    the intervals.  simulated: the new points may be exact.  Raises CalibrationError for wrong
+    input.
 
     >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
     """
@@ -76,6 +79,16 @@ def check(
     verdicts = tuple(
         verdict(limit, error, watched.data, found.before.used, seed) for limit in limits
     )
+    refused = REFUSED.get(fit.status, "") or computed(
+        replace(data, simulated=data.simulated or simulated),
+        residual(error, found.before.used),
+        (math.sqrt(3.0 * fit.known.noise.variance), "the calibration's noise"),
+        "the calibrated arm",
+    )
+    if refused:
+        verdicts = tuple(
+            replace(one, valid=False, confidence=STATED[1], why=refused) for one in verdicts
+        )
     after = refit(fit, watched, found)
     spread, enough, asked = prospects(watched, found)
     return Health(
@@ -138,7 +151,7 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
     found = accuracy(larger)
     value = found.rms_mm if rms else found.max_mm
     ends = interval(2.0 * SURE - 1.0)
-    low, high = 1e3 * ends.low, 1e3 * ends.high
+    low, high = 1e3 * ends.low, max(1e3 * ends.high, value)
     poses = len(np.unique(group))
     told = partial(Verdict, limit, value, low, high)
     seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"

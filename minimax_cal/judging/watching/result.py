@@ -99,7 +99,10 @@ class Health:
 
     def headline(self) -> str:
         """The result in a few sentences."""
-        said = [f"The calibration of {self.robot} is {self.word}", *(v.why for v in self.verdicts)]
+        said = [
+            f"The calibration of {self.robot} is {self.word}",
+            *dict.fromkeys(v.why for v in self.verdicts),
+        ]
         text = f"{said[0]} ({'; '.join(said[1:])}; confidence {100 * self.confidence:.1f} %). "
         if self.moved:
             joints = ", ".join(dict.fromkeys(m.joint for m in self.moved))

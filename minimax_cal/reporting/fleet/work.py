@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from minimax_cal.fitting.fit import Fit, load_fit
 from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.parallel import in_parallel
-from minimax_cal.judging.tolerance import judge, limits_of, overall, within
+from minimax_cal.judging.tolerance import REFUSED, judge, limits_of, overall, within
 from minimax_cal.judging.watching.comparison import compare
 from minimax_cal.judging.watching.health import check
 from minimax_cal.reporting.fleet.cells import Job
@@ -82,12 +82,12 @@ def calibrated(job: Job) -> Row:
         seed=told.seed, effects=told.effects, fix=told.fix,
     )  # fmt: skip
     if fit.status is Status.FAILED:
-        return without(
-            job, f"the fit failed: {fit.status.advice}", fit.cell.robot.name, fit.notices
-        )
+        why = f"the fit failed: {fit.reason or fit.status.advice}"
+        return without(job, why, fit.cell.robot.name, fit.notices)
     found = fit.within
     ends = found.rms, found.largest
     claim = within(found.where, found.before, found.after, ends, found.poses, found.missed)
+    claim = replace(claim, refused=REFUSED.get(fit.status, ""))
     judged = tuple(judge(limit, claim) for limit in limits_of(told.tolerance))
     changed: tuple[str, ...] = ()
     said, notices = [one.sentence() for one in judged], fit.notices

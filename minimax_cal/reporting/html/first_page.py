@@ -22,6 +22,7 @@ from minimax_cal.judging.tolerance import (
     KINDS,
     NOT_PASSED,
     PASSED,
+    REFUSED,
     Bound,
     Claim,
     Judgement,
@@ -42,6 +43,7 @@ from minimax_cal.reporting.html.delivered import Row, delivered_table, governing
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
 from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.status import Status
 
 CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
 CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
@@ -139,7 +141,8 @@ def signed(
         model, claims = claims_at(sources.gap, rung)
     else:
         model, claims = "calibration without coordinates", (claim_of_parts(sources),)
-    fit = sources.fit
+    own, fit = sources.fit or sources.gap or sources.relative, sources.fit
+    claims = refused(claims, own.status) if own else claims
     odd = changed(fit.before.robot, fit.cell.robot) if fit else ""
     rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
     if row := governing(rows, bool(deliver)):
@@ -195,6 +198,11 @@ def aside_of(found: Signed) -> str:
     return f"{counted(found.set_aside)}{errors}. Why: {why}{more}"
 
 
+def refused(claims: tuple[Claim, ...], status: Status) -> tuple[Claim, ...]:
+    """The claims of a result, of which nothing is passed where it has failed or is no better."""
+    return tuple(replace(claim, refused=REFUSED.get(status, "")) for claim in claims)
+
+
 def changed(before: Robot, after: Robot) -> str:
     """Links that no whole arm changes so much; empty where there are none."""
     change = links_of(after.mdh - before.mdh)
@@ -228,7 +236,7 @@ def claims_of(fit: Fit) -> tuple[Claim, ...]:
     if not held:
         inside = Claim("inside", inside.rms, inside.largest, 0, seen.where, inside.before,
                        "no pose was held out, and training errors are too small")  # fmt: skip
-    return inside, beyond(fit.beyond)
+    return refused((inside, beyond(fit.beyond)), fit.status)
 
 
 def claims_at(gap: Diagnosis, rung: int | None) -> tuple[str, tuple[Claim, ...]]:

@@ -74,7 +74,7 @@ def fit_warnings(fit: Fit) -> tuple[Note, ...]:
         notes.append(
             Note("On poses not used for the fit, the calibration is no improvement.", "warning")
         )
-    return (*notes, *trouble(fit.status, fit.status.advice))
+    return (*notes, *trouble(fit.status, fit.reason or fit.status.advice))
 
 
 def how(fit: Fit) -> Note:
@@ -91,6 +91,8 @@ def trouble(status: str, advice: str) -> tuple[Note, ...]:
     """A warning where the numbers did not work out."""
     if status == "converged":
         return ()
+    if status == "no_better":
+        return (Note(f"{advice}.", "warning"),)
     tail = f": {advice}." if advice else "."
     return (Note(f"The fit did not converge ({status.replace('_', ' ')}){tail}", "warning"),)
 
