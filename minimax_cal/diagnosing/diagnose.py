@@ -31,11 +31,11 @@ from minimax_cal.diagnosing.gap import (
     climbed,
     closed,
     of_lines,
-    shaky,
     valued,
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.last_question import answered, known_noise
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Step
@@ -191,8 +191,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes, study, ladder, rest)
     noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
-    if verdict == "none" and shaky(floor, noise, steps[-1]):
-        verdict = "not_repeatable"
+    known = known_noise(ladder, last, floor, clean.data, robot.repeatability)
+    verdict, unexplained = answered(verdict, structure_left[0], findings, known)
     beyond = NOT_ASKED
     if not options.quick:
         beyond = beyond_of(study, causes, judges, options.holdout_by, progress)
@@ -219,7 +219,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         noise=float(np.sqrt(noise.variance)),
         jitter=noise.jitter,
         structure=structure_left[1],
-        structure_in=structure_left[0],
+        structure_in=unexplained,
         where=located(study).to_dict(),
         not_testable=causes.untestable,
         notices=(*told, *study.fit.notices, *foot_notices(ladder.last, clean.data), *alarming),
@@ -232,6 +232,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         remainder=rest,
         set_aside=gone,
         with_them=counted,
+        meets_floor=known.meets_floor,
     )
 
 

@@ -11,14 +11,13 @@ from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.limits import FOLDS
-from minimax_cal.evidence.noise import Noise
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.faults import mended, standing_out
 from minimax_cal.measuring.faults.nests import RESEAT
-from minimax_cal.measuring.floor import REPEATS, Floor
+from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
@@ -27,7 +26,7 @@ from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.parameters import State
 
-SHAKY = 3.0  # times what the instrument alone would show between visits
+MINOR = 0.05  # of the squared held-out error that geometry leaves: less makes a cause minor
 RESAMPLES = 1000
 NOTHING = 0.95  # width of the 95 % interval of a share of which nothing is known
 FEWEST = 100  # of them that show a gap
@@ -288,6 +287,7 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
     out, at = [], 1
     of_data = [f for f in findings if f.rows or f.term.effect not in EFFECTS]
     mendable = [f for f in of_data if f.term.effect in FAULTS]
+    geometric = steps[2 if mendable else 1].trusted.rms_mm ** 2
     for found in findings:
         fault = found in mendable
         if not fault and found.term.effect == "readback":
@@ -297,16 +297,9 @@ def with_shares(findings: Sequence[Finding], steps: Sequence[Step], floor: float
         before, after = steps[low - 1].trusted.rms_mm, steps[low].trusted.rms_mm
         at = low if not fault or found is mendable[-1] else at
         share = (before**2 - after**2) / gap / (len(mendable) if fault else 1)
-        out.append(replace(found, before=before, after=after, share=share))
+        minor = not fault and before**2 - after**2 < MINOR * geometric
+        out.append(replace(found, before=before, after=after, share=share, minor=minor))
     return sorted(out, key=lambda f: -f.share if np.isfinite(f.share) else -np.inf)
-
-
-def shaky(floor: Floor, noise: Noise, last: Step) -> bool:
-    """Whether what is left is mostly that the arm does not come back to the same place."""
-    if floor.source != REPEATS:
-        return False
-    instrument = 1e3 * float(np.sqrt(3.0 * noise.variance))
-    return floor.value > max(SHAKY * instrument, last.trusted.rms_mm / SHAKY)
 
 
 # ---- how much is closed ------------------------------------------------------------------------

@@ -109,7 +109,8 @@ class Finding:
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
     told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
     was found again; NaN where poses are too few to ask.  dwarfed: whether it may be what the
-    law of a far larger effect lacks.
+    law of a far larger effect lacks.  minor: whether it is below 5 % of the squared held-out error
+    that geometry leaves.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
@@ -130,6 +131,7 @@ class Finding:
     motion: tuple[float, ...] = ()
     again: float = 1.0
     dwarfed: bool = False
+    minor: bool = False
     curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
     shown: tuple[Term, ...] = ()
 
@@ -210,7 +212,8 @@ class Finding:
             "effect": self.term.effect,
             "place": self.term.place,
             "established": self.established,
-            "found_again": finite(self.again),
+            "minor": self.minor,
+            "frequency": finite(self.again),
             "why_tentative": self.why_tentative or None,
             "share": finite(self.share),
             "lambda": finite(self.size),
@@ -264,8 +267,9 @@ class Diagnosis:
     structure: probability that what remains is unrelated to pose and time.
     where: see `where.Where.to_dict`.  data: as it was fitted, faults mended; held: (m,) True where
     held out.  cells: geometric, then with each effect.  nominal: before, None in an old file.
-    remainder: what free functions still predict, None in an old file.
     set_aside: points that no fit counts; with_them: how the last step does where they count.
+    remainder: what free functions still predict, None in an old file.  meets_floor: whether the
+    remaining error is down to the known noise, None where that is not known.
     stated_errors, stated_curves: as they stand in the file that the diagnosis was read from.
     """
 
@@ -296,6 +300,7 @@ class Diagnosis:
     remainder: Remainder | None = None
     set_aside: tuple[SetAside, ...] = ()
     with_them: WithThem | None = None
+    meets_floor: bool | None = None
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.robot}: {self.verdict}. {self.headline()}>"
@@ -311,6 +316,13 @@ class Diagnosis:
         from minimax_cal.diagnosing.sentences import reasons
 
         return reasons(self)
+
+    @cached_property
+    def next(self) -> str | None:
+        """The one measurement to make next, as a sentence; None where none is worth it."""
+        from minimax_cal.diagnosing.sentences import proposal
+
+        return proposal(self) or None
 
     @property
     def by_rung(self) -> list[Finding]:
@@ -355,6 +367,9 @@ class Diagnosis:
             "robot": self.robot,
             "status": str(self.status),
             "verdict": self.verdict,
+            "floor_known": self.floor.certain,
+            "meets_floor": self.meets_floor,
+            "next": self.next,
             "reasons": list(self.reasons),
             "effects": [finding.to_dict() for finding in self.findings],
             "set_aside": [point.to_dict() for point in self.set_aside],

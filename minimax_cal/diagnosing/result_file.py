@@ -74,7 +74,8 @@ class FindingPart(Part):
     alternatives: tuple[Recorded[Alternative], ...] = ()
     lines: tuple[int, ...] = ()
     established: bool = True
-    found_again: Number = math.nan
+    minor: bool = False
+    frequency: Number = math.nan
     why_tentative: str | None = None
     curve: dict[str, list[Number]] = Field(default_factory=dict)
 
@@ -83,8 +84,8 @@ class FindingPart(Part):
         """How often it was found again, so that what was tentative stays so."""
         if self.established:
             return 1.0
-        every_time = self.found_again >= FIRM and self.why_tentative != DWARFED
-        return BELOW if every_time else self.found_again
+        every_time = self.frequency >= FIRM and self.why_tentative != DWARFED
+        return BELOW if every_time else self.frequency
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -106,6 +107,7 @@ class FindingPart(Part):
             rows=self.lines,
             again=self.again,
             dwarfed=self.why_tentative == DWARFED,
+            minor=self.minor,
             curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )
 
@@ -228,6 +230,7 @@ class DiagnosisPart(Part):
     curves: dict[str, CurvePart] = Field(default_factory=dict)
     notices: tuple[str, ...] = ()
     seconds: Number = math.nan
+    meets_floor: bool | None = None
     provenance: Provenance
 
 
@@ -281,6 +284,7 @@ def assembled(
         remainder=part.remainder.remainder() if part.remainder else None,
         set_aside=part.set_aside,
         with_them=with_them_of(part.accuracy.holdout_with_them),
+        meets_floor=part.meets_floor,
         stated_errors=errors,
         stated_curves={name: curve.curve() for name, curve in part.curves.items()},
     )

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.solvers.status import Status
 
 NOTHING_MM = 5e-4  # of a length that is told to three digits
 SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
+REVISIT = "Next measurement: visit 10 poses twice, to know the measurement noise."
 NO_CHANCE = f"below {STRUCTURE:g} is no accident"
 CONTRADICTED = (
     "Verdict: unknown. The best fit contradicts the measurements: this is no calibration of this "
@@ -46,7 +48,7 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
             shrunk(found),
             remaining(found),
             away(found),
-            next_measurement(causes),
+            proposal(found),
             listed("Tentative, and no cause yet", tentative),
         )
         if sentence
@@ -61,6 +63,11 @@ def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
     text = VERDICTS[found.verdict]
     if found.verdict != "unknown":
         return text
+    if found.structure_in in (ABOVE_NOISE, ONLY_MINOR):
+        left = found.ladder[-1].trusted.rms_mm
+        noise = f"{found.floor.high:.3f} mm ({found.floor.source})"
+        said = found.structure_in[:1].upper() + found.structure_in[1:]
+        return f"{text} {said}: {left:.3f} mm against {noise} at most."
     what = "the causes below leave" if causes else "geometry leaves"
     guess = "these names are a best guess" if causes else "the cause is unknown"
     if not found.structure < STRUCTURE:  # it is the names that do not hold
@@ -168,6 +175,12 @@ def away(found: Diagnosis) -> str:
             "that the effects do not carry over to places that were not measured."
         )
     return text
+
+
+def proposal(found: Diagnosis) -> str:
+    """The one measurement to make next: what settles causes, else what tells the noise."""
+    settles = next_measurement([f for f in found.by_rung if f.established])
+    return settles or ("" if found.floor.certain else REVISIT)
 
 
 def next_measurement(causes: Sequence[Finding]) -> str:

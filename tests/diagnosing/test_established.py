@@ -61,7 +61,7 @@ def test_poses_too_few_to_ask_leave_an_effect_tentative_and_in_the_model() -> No
     assert one.term.key == ("joint_compliance", "J2")
     assert np.isnan(one.again)
     assert not one.established
-    assert told.to_dict()["effects"][0]["found_again"] is None
+    assert told.to_dict()["effects"][0]["frequency"] is None
     geometric, last = told.ladder[1].holdout, told.ladder[-1].holdout
     assert last.rms_mm < 0.2 * geometric.rms_mm
 

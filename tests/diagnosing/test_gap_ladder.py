@@ -27,7 +27,6 @@ from minimax_cal.diagnosing.gap import (
     ends_of,
     folds,
     motions,
-    shaky,
     share_of,
     spared,
     sums,
@@ -38,10 +37,9 @@ from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.limits import FOLDS
-from minimax_cal.evidence.noise import Noise
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
-from minimax_cal.measuring.floor import AT_MOST, REPEATS, Floor
+from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.modelling.effects.maps import curve_of, usual
 from minimax_cal.modelling.effects.table import Term
@@ -359,24 +357,6 @@ def test_faults_that_are_mended_share_the_first_rung() -> None:
     assert_allclose((alone.before, alone.after, alone.share), (1.0, 0.8, 0.36))
     exact = with_shares([more[0]], (*STEPS[:2], STEPS[3]), 1.0)  # no gap: nothing is divided by 0
     assert np.isfinite(exact[0].share)
-
-
-@pytest.mark.parametrize(
-    ("source", "floor", "deviation", "trusted", "expected"),
-    [
-        (REPEATS, 1.0, 1e-4, 2.9, True),
-        (AT_MOST, 1.0, 1e-4, 2.9, False),
-        (REPEATS, 1.0, 1e-4, 3.1, False),  # most of what is left is something else
-        (REPEATS, 1.0, 1.9e-4, 0.1, True),  # 3 sqrt(3) times 0.19 mm is a little less than 1 mm
-        (REPEATS, 1.0, 2.0e-4, 0.1, False),
-    ],
-)
-def test_an_arm_is_shaky_whose_visits_differ_by_more_than_the_instrument(
-    source: str, floor: float, deviation: float, trusted: float, expected: bool
-) -> None:
-    noise = Noise(0.0, deviation**2, 0.0)
-    last = rung("b", 1.0, 9.0, trusted)
-    assert shaky(Floor(floor, 0.5, 1.5, source), noise, last) == expected
 
 
 # ---- how much is closed ------------------------------------------------------------------------

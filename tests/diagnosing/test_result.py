@@ -182,7 +182,7 @@ def test_the_file_holds_every_number(made: Diagnosis) -> None:
     assert said["structure"] == {"p": 0.25, "in": "pose"}
     assert said["not_testable"] == [{"effect": "thermal", "needs": "temperatures"}]
     soft, play, fault = said["effects"]
-    assert (play["effect"], play["place"], play["established"], play["found_again"]) == (
+    assert (play["effect"], play["place"], play["established"], play["frequency"]) == (
         "backlash", "J2", False, 0.8)  # fmt: skip
     assert (soft["share"], soft["lambda"], soft["chance"]) == (0.6, 50.0, 1e-9)
     assert soft["holdout_rms_mm"] == {"before": 0.84, "after": 0.5}

@@ -188,7 +188,7 @@ def test_what_is_tentative_stays_so_in_a_file(
     two_orders: mc.Diagnosis, again: float | None, why: str
 ) -> None:
     said = json.loads(two_orders.json())
-    told = {"established": False, "found_again": again, "why_tentative": why}
+    told = {"established": False, "frequency": again, "why_tentative": why}
     said["effects"][0] |= told
     kept = json.loads(mc.Diagnosis.from_dict(said).json())["effects"][0]
     assert {key: kept[key] for key in told} == told
@@ -196,7 +196,7 @@ def test_what_is_tentative_stays_so_in_a_file(
 
 def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None:
     said = json.loads(two_orders.json())
-    del said["effects"][0]["established"], said["effects"][0]["found_again"], said["remainder"]
+    del said["effects"][0]["established"], said["effects"][0]["frequency"], said["remainder"]
     again = mc.Diagnosis.from_dict(said)
     assert all(found.established for found in again.findings)
     assert again.remainder is None

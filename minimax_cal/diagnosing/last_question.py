@@ -1,0 +1,136 @@
+"""The last question before a verdict is spoken: does the final model meet the noise that is known?
+
+Evidence says which causes are there.  Whether they are the whole story is asked of what the tool
+knows besides: repeated poses, the distances between targets, what is declared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from minimax_cal.diagnosing.gap import Judges, Ladder
+from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.diagnosing.remainder import joint_units
+from minimax_cal.diagnosing.result import Finding
+from minimax_cal.fitting.intervals import rms_interval
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.faults import noise_between
+from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate
+from minimax_cal.measuring.grouping import clusters
+from minimax_cal.measuring.measurements import Measurements
+
+MAX_JOINT_REPEATABILITY = 1.5e-5  # of a sound joint, where no data sheet says [rad]: 5 to 15 urad
+MAX_OVER_NOISE = 1.1  # error, or scatter of visits, over the noise that may be: less is no matter
+ABOVE_NOISE = "the remaining error is above the known noise"
+ONLY_MINOR = "every confirmed cause is minor, and the remaining error is above the known noise"
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the noise beneath a final model, as RMS distances [mm].
+
+    highest: that instrument, visits and sound joints may add up to; NaN where nothing tells.
+    remaining: lower 95 % limit of the model's error on new poses, less what the choice of training
+    poses adds.  visits: lower 97.5 % limit of the scatter of repeated poses, NaN without.
+    expected: what instrument and sound joints would show there, NaN where the instrument is not
+    known.
+    """
+
+    highest: float
+    remaining: float
+    visits: float
+    expected: float
+
+    @property
+    def meets_floor(self) -> bool | None:
+        """Whether the model is down to the noise; None where that is not known."""
+        if not math.isfinite(self.highest):
+            return None
+        return self.remaining <= MAX_OVER_NOISE * self.highest
+
+    @property
+    def is_repeatable(self) -> bool:
+        """False where visits to one pose scatter more than instrument and sound joints do."""
+        return not self.visits > MAX_OVER_NOISE * self.expected
+
+
+def known_noise(
+    ladder: Ladder, judges: Judges, floor: Floor, data: Measurements, repeatability: float
+) -> Known:
+    """What is known of the noise beneath the last step.
+
+    data: without faults.  repeatability: of the arm by its data sheet, NaN unknown [m].
+    """
+    last = ladder.last
+    joints = 0.0 if math.isfinite(repeatability) else usual_scatter(last)
+    between = noise_between(data)
+    instrument = of_coordinate(between[0]) if between else math.nan
+    repeats = floor.source == REPEATS
+    highest = floor.high if repeats else math.hypot(floor.high, joints)
+    return Known(
+        highest=highest if floor.certain else math.nan,
+        remaining=remaining_mm(last, judges),
+        visits=least_visits(data, last.cell.error(data)) if repeats else math.nan,
+        expected=math.hypot(instrument, usual_scatter(last)),
+    )
+
+
+def usual_scatter(last: Joint) -> float:
+    """RMS distance by which sound joints miss their place at these poses, at most [mm]."""
+    scene = last.study.scene
+    arm = scene.jacobian * joint_units(scene)[:, None, None, None]
+    return 1e3 * MAX_JOINT_REPEATABILITY * float(np.sqrt((arm**2).sum(axis=(0, 2)).mean()))
+
+
+def least_visits(data: Measurements, error: Array) -> float:
+    """Lower 97.5 % limit of the RMS distance by which visits to one pose differ [mm].
+
+    By the mean of the squares, which sees a scatter of two peaks where a median does not; a pose
+    counts as one number, for what joints do moves all of its points.  error: (k, m, 3) [m].
+    """
+    again = least_scatter(data, error)
+    if again is None:
+        return math.nan
+    square, group = again
+    free = float(len(np.unique(group)))
+    return 1e3 * math.sqrt(float(square.mean()) * free / float(chdtri(free, 0.025)))
+
+
+def remaining_mm(last: Joint, judges: Judges) -> float:
+    """Lower 95 % limit of the RMS distance that the last step leaves on new poses [mm].
+
+    Without what its parameters err by: with n numbers and p parameters the mean square on new poses
+    is (n + p) / n times that of the noise.
+    """
+    error = judges.errors(last.cell)
+    group = clusters(judges.held)
+    low = rms_interval(error, group, rng=np.random.default_rng(0)).low
+    count = 3.0 * float(np.count_nonzero(last.study.data.seen))
+    taken = max(count - last.poses.left_free, 0.0)
+    return 1e3 * float(np.nan_to_num(low)) * math.sqrt(count / (count + taken))
+
+
+def answered(
+    verdict: str, where: str, findings: Sequence[Finding], known: Known
+) -> tuple[str, str]:
+    """The verdict, and what is unexplained, once all that is known has been asked.
+
+    verdict, where: by the evidence.
+    """
+    if not known.is_repeatable and verdict in ("none", "unknown"):
+        return "not_repeatable", where
+    sure = [found for found in findings if found.established]
+    carry = [found for found in sure if not found.minor]
+    meets = known.meets_floor
+    if verdict in ("named", "one_of") and not carry:
+        return ("unknown", ONLY_MINOR) if meets is False else ("none", where)
+    if verdict != "unknown" and meets is False:
+        return "unknown", ABOVE_NOISE
+    if verdict in ("named", "one_of"):
+        return ("one_of" if any(found.alternatives for found in carry) else "named"), where
+    return verdict, where

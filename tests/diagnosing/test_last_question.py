@@ -1,0 +1,90 @@
+"""Before a verdict is spoken it is asked whether the model meets the noise that is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_verdict import finding
+
+import minimax_cal as mc
+from experiments.gap_cases import Cause
+from experiments.machines import Asked, make
+from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR, Known, answered
+from minimax_cal.diagnosing.result import Finding
+
+NAN = float("nan")
+QUIET = Known(highest=0.05, remaining=0.04, visits=NAN, expected=NAN)
+LOUD = replace(QUIET, remaining=0.14)
+UNKNOWN = replace(LOUD, highest=NAN)
+
+
+@pytest.mark.parametrize(
+    ("known", "meets"), [(QUIET, True), (LOUD, False), (UNKNOWN, None)], ids=str
+)
+def test_a_model_meets_the_noise_where_that_is_known(known: Known, meets: bool | None) -> None:
+    assert known.meets_floor is meets
+
+
+@pytest.mark.parametrize(
+    ("verdict", "known", "expected"),
+    [
+        ("none", QUIET, "none"),
+        ("none", LOUD, "unknown"),  # a model at 0.14 mm beside a noise of 0.05 mm
+        ("none", UNKNOWN, "none"),
+        ("named", QUIET, "named"),
+        ("named", LOUD, "unknown"),
+        ("named", UNKNOWN, "named"),
+        ("unknown", QUIET, "unknown"),
+    ],
+)
+def test_the_verdict_reads_the_noise(verdict: str, known: Known, expected: str) -> None:
+    found = [sure(minor=False)] if verdict == "named" else []
+    assert answered(verdict, "", found, known)[0] == expected
+
+
+def sure(*, minor: bool) -> Finding:
+    """A confirmed cause."""
+    return replace(finding("gear_error", "J2"), minor=minor)
+
+
+@pytest.mark.parametrize(
+    ("known", "expected"), [(QUIET, "none"), (UNKNOWN, "none"), (LOUD, "unknown")]
+)
+def test_minor_causes_alone_carry_no_verdict(known: Known, expected: str) -> None:
+    verdict, why = answered("named", "", [sure(minor=True)], known)
+    assert verdict == expected
+    assert (why == ONLY_MINOR) == (expected == "unknown")
+
+
+def test_the_causes_that_carry_the_error_make_the_verdict() -> None:
+    """An ambiguous minor one does not."""
+    large, small = sure(minor=False), replace(sure(minor=True), alternatives=("any",))  # type: ignore[arg-type]
+    assert answered("one_of", "", [large, small], QUIET)[0] == "named"
+    assert answered("named", "", [large], LOUD) == ("unknown", ABOVE_NOISE)
+
+
+@pytest.mark.parametrize(("visits", "repeatable"), [(0.1, True), (0.2, False), (NAN, True)])
+def test_an_arm_is_not_repeatable_whose_visits_scatter_more_than_it_may(
+    visits: float, repeatable: bool
+) -> None:
+    known = replace(QUIET, visits=visits, expected=0.1)
+    assert known.is_repeatable == repeatable
+    expected = "none" if repeatable else "not_repeatable"
+    assert answered("none", "", [], known)[0] == expected
+
+
+def test_a_joint_on_two_seats_is_not_repeatable() -> None:
+    """By its visits, beside what the distances between the targets say of the instrument."""
+    made = make(Asked("ur5e", "mechanism", (Cause("outside_seats", "J2", 5000.0),), seed=5))
+    found = mc.diagnose(made.robot, made.data, quick=True)
+    assert found.verdict == "not_repeatable"
+    said = found.to_dict()
+    assert said["floor_known"]
+    assert isinstance(said["meets_floor"], bool)
+
+
+def test_a_sound_arm_meets_its_noise() -> None:
+    made = make(Asked("ur5e", "sound", seed=6))
+    said = mc.diagnose(made.robot, made.data, quick=True).to_dict()
+    assert (said["verdict"], said["meets_floor"], said["floor_known"]) == ("none", True, True)
+    assert np.isfinite(said["gap"]["noise_floor_mm"])
