@@ -179,7 +179,7 @@ def test_effects_reach_the_fit(here: Path, capsys: pytest.CaptureFixture[str]) -
     content = json.loads(capsys.readouterr().out)
     asked = content["provenance"]["settings"]["effects"]
     assert asked == ["joint_compliance:J2", "backlash:J3", "joint_compliance:J3"]
-    fitted = [f"{entry['effect']}:{entry['place']}" for entry in content["effects"]]
+    fitted = [f"{entry['effect']}:{entry['place']}" for entry in content["cell"]["effects"]]
     assert fitted == asked
     plain = mc.calibrate("ur10", "gap.csv", objective="sum").accuracy["holdout"].rms_mm
     assert content["accuracy"]["holdout"]["rms_mm"] < plain
