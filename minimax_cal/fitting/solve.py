@@ -367,10 +367,11 @@ def geometry(task: Task, progress: Progress) -> Stage:
         robust = task.robust(robust.plain, wide)
     for _ in range(GROWTHS):
         at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
-        clear = task.grown(*at, GROWN)
-        more = clear or task.grown(*at, 0.0)
+        more = task.grown(*at, 0.0)
         if more is None:
             break
+        clear = task.grown(*at, GROWN)
+        more = clear or more
         model, squares = task.squares(robust.plain.only(more.active), at[1])
         if clear is None and squares.cost[0] > PAYS * robust.fit.cost[0]:
             break
