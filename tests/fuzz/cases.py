@@ -14,7 +14,7 @@ from minimax_cal.cli.running import cli
 
 from .known import FATAL, HARMLESS, with_known
 from .material import material
-from .mutations import VALUES, Rng, broken, pick
+from .mutations import VALUES, Rng, broken, misspelt, pick
 
 # Command lines that work, each word that names a file of the material one that may be broken.
 TEMPLATES = (
@@ -68,6 +68,7 @@ TEMPLATES = (
     "backends --json",
 )
 EACH = -1  # in place of a seed
+PLAIN = -2  # as well: the command lines of TEMPLATES as they are
 KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some changes is known
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
@@ -110,7 +111,10 @@ class Case:
 
 
 def case(seed: int, number: int) -> Case:
-    """The hostile run of that number.  seed: EACH for those of `each_option`."""
+    """The hostile run of that number.  seed: EACH for those of `each_option`, PLAIN for none."""
+    if seed == PLAIN:
+        words = tuple("irb120" if word == "ROBOT" else word for word in TEMPLATES[number].split())
+        return Case(number, seed, words, dict(material()), ("nothing",))
     if seed == EACH:
         words = each_option()[number]
         said = " ".join(words[len(words) - 2 :])[:60]
@@ -122,6 +126,9 @@ def case(seed: int, number: int) -> Case:
     files = dict(material())
     if "data.csv" in words and words[0] in KNOWN and rng.random() < 0.3:
         return known(seed, number, words, files, rng)
+    if "robot.json" in words and rng.random() < 0.2:
+        files["robot.json"], said = misspelt(files["robot.json"], rng)
+        return Case(number, seed, tuple(words), files, (said,), "noticed")
     broke = []
     inputs = [word for word in words if word in files]
     inputs += [name for word in inputs for name in NAMED.get(word, ())]

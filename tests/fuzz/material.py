@@ -71,6 +71,8 @@ def make() -> None:
     Path("robot.toml").write_text(toml(plain))
     few = ("simulate", "irb120", "--poses", str(POSES), "--seed", "3")
     done(*few, "-o", "data.csv", "--truth", "truth.json")
+    simulated = Path("data.csv")  # as a tracker's file: without the mark in its first line
+    simulated.write_text(simulated.read_text().partition("\n")[2])
     done("calibrate", "robot.json", "data.csv", "-o", "fit.json")
     sums = ("calibrate", "robot.json", "data.csv", "--objective", "sum")
     done(*sums, "--effects", "joint_compliance:all", "-o", "effects.json")
@@ -78,7 +80,7 @@ def make() -> None:
     done("export", "fit.json", "--to", "urdf", "-o", "robot.urdf")
     done("export", "fit.json", "--to", "mjcf", "-o", "arm.xml")
     Path("cells.toml").write_text(CELLS)
-    rows = list(csv.reader(Path("data.csv").read_text().splitlines()[1:]))  # below the mark
+    rows = list(csv.reader(Path("data.csv").read_text().splitlines()))
     bent = np.random.default_rng(1).uniform(0.3, 0.9, (12, 6))  # far from singular poses
     write("targets.csv", [[*rows[0][:6], "note"], *([*map(str, q), "a"] for q in bent)])
     Path("weld.mod").write_text(module(robot, bent[:3]))

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from minimax_cal.robots.robot import FREE
+
 MOST = 10**300  # a longer integer is no float
 Rng = np.random.Generator
 MARKUP = "<script>alert(1)</script>"
@@ -197,6 +199,18 @@ def changed(tree: Any, rng: Rng) -> Any:
 def json_tree(raw: bytes, rng: Rng) -> bytes:
     """JSON of another content; a NaN in it is no JSON."""
     return json.dumps(changed(json.loads(raw), rng)).encode()
+
+
+def misspelt(raw: bytes, rng: Rng) -> tuple[bytes, str]:
+    """JSON with one key of one object misspelt, and which; a key of a note's own is not spoilt."""
+    tree = json.loads(raw)
+    found = [(part, key) for part, key in places(tree) if isinstance(part, dict)]
+    found = [(part, key) for part, key in found if not str(key).startswith(FREE)]
+    part, key = found[int(rng.integers(len(found)))]
+    at = int(rng.integers(len(key)))
+    slip = str(pick(rng, (key + "s", key[:at] + "q" + key[at:], key.upper())))
+    part[slip] = part.pop(key)
+    return json.dumps(tree).encode(), f"key {key} as {slip}"
 
 
 def yaml_tree(raw: bytes, rng: Rng) -> bytes:

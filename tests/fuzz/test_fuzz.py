@@ -25,7 +25,7 @@ from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.robots.robot import robot_from_dict
 
 from .__main__ import lines
-from .cases import EACH, TEMPLATES, Case, case, each_option
+from .cases import EACH, PLAIN, TEMPLATES, Case, case, each_option
 from .known import FATAL, HARMLESS, disagreement, with_known
 from .material import material
 from .running import GOOD, Outcome, judged, outcomes
@@ -45,6 +45,13 @@ def test_hostile_runs_end_well() -> None:
     assert len(found) == CASES
     assert bad(found) == []
     assert {each.kind for each in found} >= {"ok", "refusal"}
+
+
+@pytest.mark.slow
+def test_command_lines_that_nobody_broke_work() -> None:
+    """A template that fails by itself would hide whatever is broken in it."""
+    found = list(outcomes(PLAIN, range(len(TEMPLATES))))
+    assert [(TEMPLATES[each.number], each.kind) for each in found if each.kind != "ok"] == []
 
 
 @pytest.mark.slow
