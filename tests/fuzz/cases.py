@@ -58,7 +58,7 @@ TEMPLATES = (
     "relative irb120 wires.csv -o out.json",
     "tradeoff irb120 data.csv --steps 2 --json",
     "diagnose irb120 data.csv --json",
-    "plan ROBOT --poses 4 --candidates 40 -o out.csv",
+    "plan ROBOT --poses 6 --candidates 40 -o out.csv",
     "plan irb120 --poses 4 --candidates 40 --fit fit.json --data data.csv --json",
     "simulate ROBOT --poses 8 -o out.csv --truth out.json",
     "effects ROBOT data.csv --json",

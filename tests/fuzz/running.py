@@ -36,6 +36,7 @@ KINDS = (
     "damage",
 )  # fmt: skip
 GOOD = ("ok", "refusal", "failure")
+EVENT = '{"event": "error", '  # how --progress json begins the line of an error
 INTERNALS = re.compile(
     r"operands could not|shapes? \(|ndarray|dtype|has no attribute|object is not|NoneType|KeyError|"
     r"IndexError|TypeError|ValueError|list index|out of bounds for|site-packages|\.py\b|<class"
@@ -120,7 +121,7 @@ def kind_of(code: int) -> str:
 
 def manners(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
     """What is wrong with how a command spoke, if anything."""
-    errors = [line for line in err.splitlines() if line.startswith("error: ")]
+    errors = [line for line in err.splitlines() if line.startswith(("error: ", EVENT))]
     added = [path.name for path in Path().iterdir() if path.name not in {*one.files, "loop"}]
     if code not in (0, 1, 2):
         return "crash", f"exit code {code!r}"
