@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
 from minimax_cal.evidence.limits import STRUCTURE
+from minimax_cal.measuring.floor import REPEATS
 from minimax_cal.solvers.status import Status
 
 NOTHING_MM = 5e-4  # of a length that is told to three digits
@@ -64,10 +65,12 @@ def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
     if found.verdict != "unknown":
         return text
     if found.structure_in in (ABOVE_NOISE, ONLY_MINOR):
-        left = found.ladder[-1].trusted.rms_mm
-        noise = f"{found.floor.high:.3f} mm ({found.floor.source})"
         said = found.structure_in[:1].upper() + found.structure_in[1:]
-        return f"{text} {said}: {left:.3f} mm against {noise} at most."
+        joints = "" if found.floor.source == REPEATS else ", and what sound joints add"
+        return (
+            f"{text} {said}: {found.ladder[-1].trusted.rms_mm:.3f} mm against "
+            f"{found.floor.high:.3f} mm at most ({found.floor.source}{joints})."
+        )
     what = "the causes below leave" if causes else "geometry leaves"
     guess = "these names are a best guess" if causes else "the cause is unknown"
     if not found.structure < STRUCTURE:  # it is the names that do not hold
