@@ -107,8 +107,9 @@ def measured(robot: mc.Robot, trial: Trial) -> mc.Measurements:
 
 
 def published(robot: mc.Robot, path: Path) -> None:
-    """The nominal model with gains of the size that published ones have."""
+    """The nominal model with gains of the size that published ones have, which gravity loads."""
     text = mc.export(robot, "mjcf", notify=lambda notice: None)
+    text = re.sub(r' (actuator)?gravcomp="[^"]*"', "", text)
     gains = iter(PUBLISHED)
     text = re.sub(r'kp="[^"]*"', lambda _: f'kp="{next(gains)}"', text)
     path.write_text(re.sub(r'kv="[^"]*"', 'kv="400"', text))
