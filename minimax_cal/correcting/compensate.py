@@ -18,8 +18,7 @@ from minimax_cal.correcting.deliverable import (
     COMPENSATED,
     Delivered,
     Figures,
-    check_kept,
-    delivered,
+    kept,
 )
 from minimax_cal.fitting.opened import Result, open_result
 from minimax_cal.ground.arrays import Array, rms
@@ -204,8 +203,7 @@ def compensate(
     check_choices(frame, tolerance, most_change, lever, clock)
     nominal = load_robot(nominal) if isinstance(nominal, str | Path) else nominal
     known = open_result(fit, rung)
-    check_kept(known, keep_anyway)
-    made = delivered(known, COMPENSATED, None if np.isnan(clock) else clock)
+    made = kept(known, COMPENSATED, keep_anyway, None if np.isnan(clock) else clock)
     cell, drawn = made.cell, made.nominal if known.placed else None
     robot = made.nominal.robot if made.nominal else None
     if nominal is not None and not (robot and same(nominal, robot)):

@@ -181,10 +181,26 @@ def deliver(
 def check_kept(known: Opened, keep_anyway: bool) -> None:
     """Raise OptionError for a calibrated arm that is no better than the drawn one."""
     if known.status is Status.NO_BETTER and known.number and not keep_anyway:
-        raise OptionError(
-            f"{known.source}: {known.status.advice}; with keep_anyway=True the calibrated one is "
-            "taken all the same"
-        )
+        raise kept_back(known.source, known.status)
+
+
+def kept_back(source: str, status: Status) -> OptionError:
+    """What is said where the drawn arm should be kept."""
+    return OptionError(
+        f"{source}: {status.advice}; with keep_anyway=True the calibrated one is taken all the same"
+    )
+
+
+def kept(known: Opened, to: str, keep_anyway: bool, clock: float | None = None) -> Delivered:
+    """As `deliver`; OptionError where the arm, or what of it is delivered, is no better than drawn.
+
+    keep_anyway: deliver it all the same.
+    """
+    check_kept(known, keep_anyway)
+    found = delivered(known, to, clock)
+    if found.fit is not None and found.fit.is_no_better and not keep_anyway:
+        raise kept_back(f"{known.source}: {to}, without {found.lacks}", found.fit.status)
+    return found
 
 
 def delivered(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.correcting.deliverable import Delivered, block, check_kept, delivered
+from minimax_cal.correcting.deliverable import Delivered, block, kept
 from minimax_cal.correcting.exporters import table
 from minimax_cal.correcting.exporters.job import Export, Job, job_of, read_source
 from minimax_cal.fitting.opened import Result
@@ -98,8 +98,7 @@ def exported(
     if isinstance(source, Job):
         job = source
     else:
-        check_kept(source, keep_anyway)
-        found = delivered(source, to)
+        found = kept(source, to, keep_anyway)
         q = source.train.q if source.data.poses else None
         job = job_of(source.source, found.cell, found.nominal, q)
     originals = () if urdf is None else (read_urdf(urdf),)

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import minimax_cal as mc
 from minimax_cal.cli.export import export_command
+from minimax_cal.correcting import deliverable
 from minimax_cal.correcting.deliverable import DELIVERABLES, Delivered
 from minimax_cal.correcting.export import exported
 from minimax_cal.correcting.exporters import EXPORTERS
@@ -22,6 +23,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.table import Fitted
 from minimax_cal.modelling.simulate import Truth, simulate
 from minimax_cal.robots.gravity import masses_of
+from minimax_cal.solvers.status import Status
 from tests.conftest import shared
 from tests.problems_deliverables import READERS, reached
 
@@ -280,3 +282,18 @@ def test_an_unknown_format_is_one_line(soft: mc.Fit) -> None:
         mc.deliver(soft, "step")
     assert set(EXPORTERS) < set(DELIVERABLES)
     assert isinstance(mc.deliver(soft, "json"), Delivered)
+
+
+def test_a_refit_that_is_no_better_than_the_drawing_is_not_delivered_unasked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The joint fit helps; what the file can hold of it does not."""
+    made = simulate(mc.load_robot("ur10"), 40, 3, seed=3, truth=Truth(compliance=3e-6))
+    joint = mc.calibrate("ur10", made.data, "sum", effects=EFFECTS)
+    refit = deliverable.fit_split
+    monkeypatch.setattr(
+        deliverable, "fit_split", lambda *a: replace(refit(*a), status=Status.NO_BETTER)
+    )
+    with pytest.raises(mc.CalibrationError, match=f"urdf, without {EFFECTS}.*keep"):
+        mc.export(joint, "urdf")
+    assert "<robot" in mc.export(joint, "urdf", keep_anyway=True, notify=lambda text: None)
