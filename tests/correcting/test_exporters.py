@@ -87,6 +87,9 @@ def job_of(robot: mc.Robot, nominal: mc.Robot | None = None) -> Job:
     return Job(robot, before, "fit.json", compliance, fitted=nominal is not None)
 
 
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+
+
 def offsets_of(text: str) -> np.ndarray:
     """The joints' offsets in a file of ros2-control."""
     return np.array(re.findall(r"<offset>(.*)</offset>", text), dtype=float)
@@ -463,6 +466,11 @@ def test_every_format_by_command(to: str, fit: tuple[Path, Simulation]) -> None:
     for other in (exported(fit[0], to).file.content.decode(), quiet.stdout):
         if to == "ros2-control":  # fitted each time, to rounding
             assert_allclose(offsets_of(other), offsets_of(result.stdout), rtol=0, atol=1e-12)
+        elif to == "mjcf":  # so are its springs
+            texts = (other, result.stdout)
+            assert len({NUMBER.sub("#", text) for text in texts}) == 1
+            ours, theirs = ([float(x) for x in NUMBER.findall(text)] for text in texts)
+            assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
         else:
             assert other == result.stdout
 
