@@ -131,6 +131,4 @@ def answered(
         return ("unknown", ONLY_MINOR) if meets is False else ("none", where)
     if verdict != "unknown" and meets is False:
         return "unknown", ABOVE_NOISE
-    if verdict in ("named", "one_of"):
-        return ("one_of" if any(found.alternatives for found in carry) else "named"), where
     return verdict, where
