@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from conftest import shared
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -9,6 +10,7 @@ import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import faults
 from minimax_cal.measuring.faults import Fault, find_faults, mended
+from minimax_cal.measuring.faults.nests import ranked
 from minimax_cal.measuring.history import moves
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
@@ -47,6 +49,13 @@ def pushes(sim: Simulation, data: Measurements) -> Array:
     step = 1e-6 * np.eye(data.q.shape[1])
     sides = [(sim.cell.predict(data.q + s), sim.cell.predict(data.q - s)) for s in step]
     return np.moveaxis(np.stack([(a - b) / 2e-6 for a, b in sides], axis=-1), 1, 0)
+
+
+def test_ranks_are_those_of_scipy_to_the_bit(rng: np.random.Generator) -> None:
+    for value in (rng.normal(size=80), rng.normal(size=81).round(1), np.ones(9)):
+        score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / len(value))
+        wanted = (score - score.mean()) / max(float(score.std()), 1e-12)
+        assert_array_equal(ranked(value), wanted)
 
 
 def test_good_data_are_left_alone(robot: mc.Robot) -> None:

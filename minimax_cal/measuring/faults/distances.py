@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, known_median
 from minimax_cal.measuring.measurements import Measurements
 
 FEWEST = 8  # distances that give a centre and a scatter
@@ -40,7 +40,7 @@ def between(data: Measurements) -> Between:
         distance = np.linalg.norm(data.y[:, a] - data.y[:, b], axis=-1)
         if np.isfinite(distance).sum() >= FEWEST:
             pairs.append((a, b))
-            centre.append(float(np.nanmedian(distance)))
+            centre.append(float(known_median(distance)))
             off.append(distance - centre[-1])
     deviation = np.array(off).reshape(len(pairs), data.poses)
     return Between(
@@ -52,5 +52,5 @@ def scatter(off: Array) -> Array:
     """(p,) robust standard deviation about the median of rows with NaN.  off: (p, m) [m]."""
     if not len(off):
         return np.zeros(0)
-    middle = np.nanmedian(off, axis=1, keepdims=True)
-    return np.asarray(np.maximum(NORMAL * np.nanmedian(np.abs(off - middle), axis=1), FAINT))
+    middle = known_median(off)[:, None]
+    return np.asarray(np.maximum(NORMAL * known_median(np.abs(off - middle)), FAINT))

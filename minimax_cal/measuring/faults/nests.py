@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import scipy
+from scipy.special import chdtri, ndtri
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, known_median
 from minimax_cal.measuring.faults.distances import Between, between, scatter
 from minimax_cal.measuring.faults.fault import Amount, Fault
 from minimax_cal.measuring.faults.limits import ALIKE, FALSE_ALARM
@@ -78,7 +78,7 @@ def find_step(off: Array, apart: Between, matters: float) -> Step | None:
         if len(known) >= 2 * SHORTEST:
             best[pair], first = scan(off[pair, known])
             place[pair] = known[first]
-    limit = float(scipy.stats.chi2.isf(FALSE_ALARM / max(2 * pairs * m, 1), 1))
+    limit = float(chdtri(1.0, FALSE_ALARM / max(2 * pairs * m, 1)))
     if not pairs or best.max() < limit:
         return None
     at = int(place[best.argmax()])
@@ -86,11 +86,11 @@ def find_step(off: Array, apart: Between, matters: float) -> Step | None:
     many = np.isfinite(before).sum(axis=1), np.isfinite(after).sum(axis=1)
     told = np.minimum(*many) >= 2
     change, sigma = np.zeros(pairs), np.full(pairs, np.inf)
-    change[told] = np.nanmedian(after[told], axis=1) - np.nanmedian(before[told], axis=1)
+    change[told] = known_median(after[told]) - known_median(before[told])
     inside = np.concatenate(
         [
-            before[told] - np.nanmedian(before[told], axis=1, keepdims=True),
-            after[told] - np.nanmedian(after[told], axis=1, keepdims=True),
+            before[told] - known_median(before[told])[:, None],
+            after[told] - known_median(after[told])[:, None],
         ],
         axis=1,
     )
@@ -115,7 +115,7 @@ def place_of(off: Array, change: Array, sigma: Array, at: int) -> int:
 
     off: (p, m) by visit [m].  change, sigma: (p,) of the step and of one distance [m].
     """
-    middle = np.nanmedian(off[:, :at], axis=1)
+    middle = known_median(off[:, :at])
     z = (off - middle[:, None]) / sigma[:, None]
     gain = np.clip(z**2, 0, 25.0) - np.clip((z - (change / sigma)[:, None]) ** 2, 0, 25.0)
     before = np.cumsum(np.nansum(gain, axis=0))  # lost by a later start
@@ -139,7 +139,10 @@ def first_of(found: tuple[float, int]) -> float:
 
 def ranked(value: Array) -> Array:
     """(m,) normal scores of the ranks, of mean 0 and variance 1."""
-    score = scipy.stats.norm.ppf((scipy.stats.rankdata(value) - 0.5) / len(value))
+    # as scipy.stats.rankdata gives them, of ties the mean
+    _, place, alike = np.unique(value, return_inverse=True, return_counts=True)
+    rank = (np.cumsum(alike) - 0.5 * (alike - 1))[place]
+    score = ndtri((rank - 0.5) / len(value))
     return np.asarray((score - score.mean()) / max(float(score.std()), 1e-12))
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.arrays import Array, known_median
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST, Between, between, scatter
 from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
 from minimax_cal.measuring.faults.limits import ALIKE
@@ -153,5 +153,5 @@ def level(apart: Between, data: Measurements, shifts: tuple[Fault, ...]) -> Betw
                 if amount.name == f"{a}-{b}":
                     off[pair, later] -= amount.value
     if len(off):
-        off -= np.nanmedian(off, axis=1, keepdims=True)
+        off -= known_median(off)[:, None]
     return replace(apart, off=off, sigma=scatter(off))
