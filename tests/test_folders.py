@@ -18,6 +18,7 @@ FOLDERS = (
     "fitting",
     "judging",
     "diagnosing",
+    "dynamics",
     "planning",
     "correcting",
     "simulators",

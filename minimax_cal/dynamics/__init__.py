@@ -1,0 +1,1 @@
+"""Torques along trajectories: logs of an arm in motion, and what they show of its drives."""

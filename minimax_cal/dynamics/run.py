@@ -1,0 +1,48 @@
+"""A run: joint values and torques of one trajectory, as a controller logged them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from minimax_cal.ground.arrays import Array
+
+TORQUE = "N m"  # of a revolute joint; N of one that slides
+CURRENT = "A"
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One trajectory of n joints at m times.
+
+    name: of the run, unique among those read together.  source: path of the file.
+    time: (m,) increasing, evenly spaced or not [s].
+    q: (m, n) joint values in the robot file's order, without jumps by whole turns [rad, m].
+    qd, qdd: (m, n) the controller's own derivatives, where it logged them [rad/s, rad/s^2].
+    torque: (m, n) measured at the joints or motors [unit].
+    unit: TORQUE or CURRENT.
+    payload: mass at the flange, where it was reported [kg].
+    temperature: (m, n), or (m,) of the whole arm [C].
+    notices: what the reader should know about the log.
+    """
+
+    name: str
+    source: str
+    time: Array
+    q: Array
+    qd: Array | None
+    qdd: Array | None
+    torque: Array
+    unit: str
+    payload: float | None = None
+    temperature: Array | None = None
+    notices: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[1])
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last [s]."""
+        return float(self.time[-1] - self.time[0])
