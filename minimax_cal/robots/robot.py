@@ -8,7 +8,7 @@ import math
 import tomllib
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -34,6 +34,7 @@ LEVER = 0.1  # of the reach: what a radian counts as
 TURNING = 1e-6  # how far a rotation may be from one
 LONGEST, TURNED = 1e3, 1e3  # no link is longer, no angle larger than this [m, rad]
 Vector = tuple[Finite, Finite, Finite]
+Inertia = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
 def turning(ratio: float) -> float:
@@ -88,6 +89,8 @@ class JointSchema(BaseModel):
     ratio: Annotated[Finite, AfterValidator(turning)] | None = None
     mass_kg: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None
     com_mm: Vector | None = None
+    inertia: Inertia | None = None
+    drive_gain: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
     name: str = ""
 
     @model_validator(mode="before")
@@ -137,6 +140,9 @@ class Robot:
     up: (3,) vertical in the base frame.
     repeatability: of its data sheet, by ISO 9283; NaN where unknown [m].
     rough: whether its geometry is no drawing but a first guess, from which it may be far.
+    inertia: (n, 6) xx, xy, xz, yy, yz, zz of each link about its centre of gravity, in the axes of
+    frame i, NaN where unknown; empty where no link's is known [kg m^2].
+    drive_gain: (n,) torque for one ampere, NaN where unknown; may be empty [N m/A, N/A].
     """
 
     name: str
@@ -151,6 +157,8 @@ class Robot:
     up: Array
     repeatability: float = math.nan
     rough: bool = False
+    inertia: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    drive_gain: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def joints(self) -> int:
@@ -221,6 +229,10 @@ class Robot:
             out |= {key: float(value) for key, value in optional.items() if np.isfinite(value)}
             if np.all(np.isfinite(self.com[i])):
                 out["com_mm"] = [float(c) * 1e3 for c in self.com[i]]
+            if len(self.inertia) and np.all(np.isfinite(self.inertia[i])):
+                out["inertia"] = [float(c) for c in self.inertia[i]]
+            if len(self.drive_gain) and np.isfinite(self.drive_gain[i]):
+                out["drive_gain"] = float(self.drive_gain[i])
             return out
 
         known = np.isfinite(self.repeatability)
@@ -299,6 +311,12 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     def optional(values: list[float | None], default: float) -> Array:
         return np.array([default if value is None else value for value in values], dtype=float)
 
+    def where_given(values: list[Any], unknown: Any) -> Array:
+        width = np.shape(unknown)
+        if all(value is None for value in values):
+            return np.zeros((0, *width))
+        return np.array([unknown if value is None else value for value in values], dtype=float)
+
     angles = np.array([[j.theta, j.alpha, j.beta] for j in joints])
     lower = optional([j.lower for j in joints], -np.inf)
     upper = optional([j.upper for j in joints], np.inf)
@@ -333,6 +351,8 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         up=up / np.linalg.norm(up),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
         rough=schema.nominal == "rough",
+        inertia=where_given([j.inertia for j in joints], [np.nan] * 6),
+        drive_gain=where_given([j.drive_gain for j in joints], np.nan),
     )
 
 

@@ -163,8 +163,11 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
 
 def centres(
     urdf: Urdf, moving: Sequence[Joint], frames: Mapping[str, Array], ends: Sequence[Array]
-) -> list[tuple[float, Array]]:
-    """Mass and centre of gravity, in frame i [m], of what joint i carries up to the next joint."""
+) -> list[tuple[float, Array, Array]]:
+    """Mass and centre of gravity, in frame i [m], of what joint i carries up to the next joint.
+
+    And its inertia (6,) about that centre in the axes of frame i; empty where a part has none.
+    """
     out = []
     for joint, end in zip(moving, ends, strict=True):
         body = rest_frames(urdf, joint.child, frames[joint.child], moving=False)
@@ -172,12 +175,22 @@ def centres(
         mass = sum(m for (m, _), _ in parts)
         at = sum((m * (pose[:3, :3] @ c + pose[:3, 3]) for (m, c), pose in parts), np.zeros(3))
         back = inverse(end)
-        out.append((mass, back[:3, :3] @ at / (mass or 1.0) + back[:3, 3]))
+        centre = at / (mass or 1.0)
+        inertia = np.zeros(0)
+        if mass and all(n in urdf.inertias for n in body if n in urdf.masses):
+            whole = np.zeros((3, 3))
+            for name in (n for n in body if n in urdf.masses):
+                (m, c), pose = urdf.masses[name], body[name]
+                arm = pose[:3, :3] @ c + pose[:3, 3] - centre
+                whole += pose[:3, :3] @ urdf.inertias[name] @ pose[:3, :3].T
+                whole += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            inertia = (back[:3, :3] @ whole @ back[:3, :3].T)[np.triu_indices(3)]
+        out.append((mass, back[:3, :3] @ centre + back[:3, 3], inertia))
     return out
 
 
 def joint_content(
-    joint: Joint, row: Array, sign: float, centre: tuple[float, Array]
+    joint: Joint, row: Array, sign: float, centre: tuple[float, Array, Array]
 ) -> dict[str, Any]:
     """A joint in the file schema."""
     out: dict[str, Any] = dict(zip(kinematics.MDH_NAMES, row.tolist(), strict=True))
@@ -186,9 +199,11 @@ def joint_content(
         out["type"] = "prismatic"
     if np.isfinite(joint.lower):
         out |= {"lower": joint.lower, "upper": joint.upper}
-    mass, com = centre
+    mass, com, inertia = centre
     if mass > 0.0:
         out |= {"mass_kg": mass, "com_mm": (com * 1e3).tolist()}
+    if inertia.size:
+        out["inertia"] = inertia.tolist()
     return out
 
 

@@ -73,7 +73,11 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A file.  masses: kg and centre of gravity in the link's frame [m], of links that have any."""
+    """A file.  masses: kg and centre of gravity in the link's frame [m], of links that have any.
+
+    inertias: (3, 3) about the centre of gravity in the link's axes, of links that have any
+    [kg m^2].
+    """
 
     source: str
     raw: bytes
@@ -81,6 +85,7 @@ class Urdf:
     root: str
     joints: tuple[Joint, ...]
     masses: Mapping[str, tuple[float, Array]]
+    inertias: Mapping[str, Array] = field(default_factory=dict)
 
     def from_link(self, name: str) -> list[Joint]:
         """The joints that hang on a link."""
@@ -163,7 +168,9 @@ def parse_urdf(raw: bytes, source: str = "URDF") -> Urdf:
     masses = {name: mass_of(element, name, source) for name, element in links.items()}
     known = {name: mass for name, mass in masses.items() if mass[0] > 0.0}
     name = top.attributes.get("name", "robot")
-    return Urdf(source, raw, name, root, tuple(joints.values()), known)
+    inertias = {link: inertia_of(links[link], link, source) for link in known}
+    given = {link: inertia for link, inertia in inertias.items() if inertia.any()}
+    return Urdf(source, raw, name, root, tuple(joints.values()), known, given)
 
 
 def walk(top: Element) -> list[Element]:
@@ -251,6 +258,21 @@ def mass_of(element: Element, name: str, source: str) -> tuple[float, Array]:
     if mass < 0.0:
         raise RobotError(f"{source}:{inertial.line}: {where}: a mass below zero")
     return mass, numbers(inertial.child("origin"), "xyz", (0.0, 0.0, 0.0), where, source)
+
+
+def inertia_of(element: Element, name: str, source: str) -> Array:
+    """Inertia (3, 3) about the centre of gravity in the link's axes [kg m^2]; 0 if not given."""
+    inertial, where = element.child("inertial"), f"link {name!r}"
+    found = None if inertial is None else inertial.child("inertia")
+    if inertial is None or found is None:
+        return np.zeros((3, 3))
+    xx, xy, xz, yy, yz, zz = (
+        float(numbers(found, key, (0.0,), where, source)[0])
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    rpy = numbers(inertial.child("origin"), "rpy", (0.0, 0.0, 0.0), where, source)
+    turned = from_rpy(np.zeros(3), rpy)[:3, :3]
+    return np.asarray(turned @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turned.T)
 
 
 def root_of(links: Mapping[str, Element], joints: tuple[Joint, ...], source: str) -> str:

@@ -1,0 +1,290 @@
+"""Rows of joint torque along trajectories, filtered alike on both sides, and their noise in time.
+
+Positions, speeds, accelerations and torques pass one zero-phase filter; what is computed of the
+motion then passes it once more, and the torques with it.  Otherwise what the filter did to one side
+alone is taken for compliant joints and delays.  Friction near rest and reversals is no function of
+the speed: these rows are predicted, and never fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import toeplitz
+from scipy.signal import butter, sosfiltfilt
+
+from minimax_cal.dynamics.regressor import Motion
+from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.arrays import Array
+
+SAMPLE_HZ = 100.0  # of what the columns are computed from
+ROW_HZ = 25.0  # of rows
+CUTOFF_HZ, FILTER_ORDER = 8.0, 4  # of the zero-phase filter [Butterworth]
+REVERSAL_S = 0.1  # about rest and reversals, without a fit
+REST = 0.01  # of the joint's largest speed: below it the joint is at rest
+SLOWEST = 2e-3  # below it a joint is at rest, however slow the log [rad/s, m/s]
+GAP_S = 0.1  # longer steps of time are gaps
+EDGE_S = 0.4  # at the ends and about gaps, where the filter has little to look at
+AR_ORDER = 4  # of the noise of a joint: rows that went before and matter
+QUARTERS = 4  # groups of a trajectory, which err together
+LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
+
+
+def smooth(values: Array, rate: float) -> Array:
+    """Values (m, ...) after the zero-phase filter.  rate: [Hz]."""
+    sections = butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos")
+    pad = min(len(values) - 1, int(rate))
+    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=pad))
+
+
+def slope(values: Array, rate: float) -> Array:
+    """Derivative in time of values (m, ...), to the fourth order of the step [1/s]."""
+    out = np.gradient(values, axis=0)
+    wide = (values[4:] - values[:-4]) / 4.0
+    out[2:-2] = (4.0 * out[2:-2] - wide) / 3.0
+    return np.asarray(out * rate)
+
+
+@dataclass(frozen=True, eq=False)
+class Logs:
+    """Trajectories on an even grid of SAMPLE_HZ, one after another, filtered once.
+
+    motion: (M, n).  torque: (M, n) [N m, N or A].  since: (M,) time since the run began [s].
+    payload: (M,) [kg], NaN where not given.  temperature: (M, n) [C], NaN where not given.
+    start: (r + 1,) where each run begins.  gap: (M,) True close to a gap or an end.
+    """
+
+    names: tuple[str, ...]
+    motion: Motion
+    torque: Array
+    since: Array
+    payload: Array
+    temperature: Array
+    start: Array
+    gap: Array
+    unit: str
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return int(self.torque.shape[1])
+
+    @property
+    def seconds(self) -> float:
+        """Length of all runs [s]."""
+        return float(len(self.since) / SAMPLE_HZ)
+
+    @cached_property
+    def picked(self) -> Array:
+        """(R,) samples that are rows."""
+        step = int(SAMPLE_HZ / ROW_HZ)
+        ends = zip(self.start[:-1], self.start[1:], strict=True)
+        return np.concatenate([np.arange(a, b, step) for a, b in ends])
+
+    @cached_property
+    def run(self) -> Array:
+        """(R,) which run a row is of."""
+        return np.asarray(np.searchsorted(self.start, self.picked, side="right") - 1)
+
+    @cached_property
+    def quarter(self) -> Array:
+        """(R,) which quarter, of all runs, a row is of."""
+        long = np.diff(self.start)[self.run]
+        part = QUARTERS * (self.picked - self.start[self.run]) // long
+        return np.asarray(QUARTERS * self.run + part)
+
+    @cached_property
+    def moving(self) -> Array:
+        """(R, n) True where a joint is neither at rest nor near a reversal."""
+        qd = self.motion.qd
+        still = np.abs(qd) < np.maximum(REST * np.abs(qd).max(axis=0), SLOWEST)
+        still[1:] |= qd[1:] * qd[:-1] < 0.0
+        out = np.empty((len(self.picked), self.joints), dtype=bool)
+        reach = int(REVERSAL_S * SAMPLE_HZ)
+        for a, b in zip(self.start[:-1], self.start[1:], strict=True):
+            count = np.cumsum(np.pad(still[a:b], ((reach + 1, reach), (0, 0))), axis=0)
+            rows = (self.run >= 0) & (self.picked >= a) & (self.picked < b)
+            out[rows] = (count[2 * reach + 1 :] == count[: -2 * reach - 1])[self.picked[rows] - a]
+        return out
+
+    @cached_property
+    def fitted(self) -> Array:
+        """(R, n) True for rows that are fitted: moving, and not close to a gap or an end."""
+        return self.moving & ~self.gap[self.picked, None]
+
+    @cached_property
+    def y(self) -> Array:
+        """(R, n) torques of the rows."""
+        return self.filtered(self.torque)
+
+    def filtered(self, columns: Array) -> Array:
+        """Rows (R, ...) of columns (M, ...), filtered."""
+        out = np.empty((len(self.picked), *columns.shape[1:]))
+        for number, (a, b) in enumerate(zip(self.start[:-1], self.start[1:], strict=True)):
+            out[self.run == number] = smooth(columns[a:b], SAMPLE_HZ)[:: int(SAMPLE_HZ / ROW_HZ)]
+        return out
+
+    def slope(self, values: Array) -> Array:
+        """Derivative in time (M, ...) of values (M, ...), each run for itself."""
+        ends = zip(self.start[:-1], self.start[1:], strict=True)
+        return np.concatenate([slope(values[a:b], SAMPLE_HZ) for a, b in ends])
+
+    def only(self, runs: Sequence[int]) -> Logs:
+        """The logs of some runs."""
+        keep = np.concatenate([np.arange(self.start[r], self.start[r + 1]) for r in runs])
+        motion = Motion(self.motion.q[keep], self.motion.qd[keep], self.motion.qdd[keep])
+        long = np.diff(self.start)[list(runs)]
+        return Logs(
+            tuple(self.names[r] for r in runs),
+            motion,
+            self.torque[keep],
+            self.since[keep],
+            self.payload[keep],
+            self.temperature[keep],
+            np.concatenate([[0], np.cumsum(long)]),
+            self.gap[keep],
+            self.unit,
+        )
+
+
+def even_grid(run: Run) -> tuple[Array, float]:
+    """Even times (m,) [s] of a run, at a whole multiple of SAMPLE_HZ, and the rate [Hz]."""
+    rate = 1.0 / float(np.median(np.diff(run.time)))
+    rate = SAMPLE_HZ * max(1, round(rate / SAMPLE_HZ))
+    return np.arange(run.time[0], run.time[-1], 1.0 / rate), rate
+
+
+def prepare_run(run: Run) -> Logs:
+    """One trajectory on the even grid."""
+    time, rate = even_grid(run)
+    every = int(rate / SAMPLE_HZ)
+
+    def even(values: Array) -> Array:
+        return np.asarray(CubicSpline(run.time, values)(time))
+
+    q = smooth(even(run.q), rate)
+    qd = slope(q, rate) if run.qd is None else smooth(even(run.qd), rate)
+    qdd = slope(qd, rate) if run.qdd is None else smooth(even(run.qdd), rate)
+    torque = smooth(even(run.torque), rate)
+    motion = Motion(q[::every], qd[::every], qdd[::every])
+    m, n = motion.q.shape
+    temperature = np.full((m, n), np.nan)
+    if run.temperature is not None:
+        given = run.temperature.reshape(len(run.time), -1)
+        each = [np.interp(time[::every], run.time, column) for column in given.T]
+        temperature = np.broadcast_to(np.array(each).T, (m, n))
+    wide = np.flatnonzero(np.diff(run.time) > GAP_S)
+    holes = [(run.time[0], run.time[0]), (run.time[-1], run.time[-1]),
+             *((run.time[i], run.time[i + 1]) for i in wide)]  # fmt: skip
+    gap = np.zeros(m, dtype=bool)
+    for begin, end in holes:
+        gap |= (time[::every] > begin - EDGE_S) & (time[::every] < end + EDGE_S)
+    return Logs(
+        (run.name,),
+        motion,
+        torque[::every],
+        time[::every] - run.time[0],
+        np.full(m, np.nan if run.payload is None else run.payload),
+        temperature,
+        np.array([0, m]),
+        gap,
+        run.unit,
+    )
+
+
+def prepare(runs: Sequence[Run]) -> Logs:
+    """All trajectories on the even grid, one after another."""
+    each = [prepare_run(run) for run in runs]
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(one, name) for one in each])
+
+    q, qd, qdd = (np.concatenate([getattr(one.motion, k) for one in each])
+                  for k in ("q", "qd", "qdd"))  # fmt: skip
+    return Logs(
+        tuple(one.names[0] for one in each),
+        Motion(q, qd, qdd),
+        joined("torque"),
+        joined("since"),
+        joined("payload"),
+        joined("temperature"),
+        np.concatenate([[0], np.cumsum([len(one.since) for one in each])]),
+        joined("gap"),
+        each[0].unit,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Which rows are fitted, and what makes their noise white: rows of all joints, joint by joint.
+
+    kept: (n, R) rows that are fitted.  place: (N,) how many rows of the same joint went before
+    without a gap, at most AR_ORDER.  weights: (n, AR_ORDER + 1, AR_ORDER + 1) of the rows before,
+    for each number of these, and last one over the standard deviation of what they do not predict.
+    """
+
+    kept: Array
+    place: Array
+    weights: Array
+
+    @cached_property
+    def joint(self) -> Array:
+        """(N,) which joint a row is of."""
+        return np.asarray(np.nonzero(self.kept)[0])
+
+    def white(self, rows: Array) -> Array:
+        """Rows (N, ...) with a noise of unit variance and no memory."""
+        shape = (-1, *(1,) * (rows.ndim - 1))
+        own = self.weights[self.joint, self.place]
+        out = rows.copy()
+        for lag in range(1, AR_ORDER + 1):
+            out[lag:] -= own[lag:, lag - 1].reshape(shape) * rows[:-lag]
+        return np.asarray(out * own[:, AR_ORDER].reshape(shape))
+
+
+def in_order(kept: Array, run: Array) -> Array:
+    """(N,) rows of the same joint and run that went before without a gap, at most AR_ORDER."""
+    out = np.zeros(kept.shape, dtype=int)
+    for i in range(1, kept.shape[1]):
+        out[:, i] = np.where(kept[:, i - 1] & (run[i] == run[i - 1]), out[:, i - 1] + 1, 0)
+    return np.asarray(np.minimum(out, AR_ORDER)[kept])
+
+
+def whitening(logs: Logs, rest: Array) -> Whitening:
+    """From what a fit leaves of the rows.  rest: (N,), joint by joint.
+
+    The prediction from the rows before is that of Yule and Walker, of every order up to AR_ORDER:
+    a row after a gap has fewer before it.
+    """
+    kept = logs.fitted.T
+    place = in_order(kept, logs.run)
+    joint = np.nonzero(kept)[0]
+    size = np.abs(logs.y).max(axis=0)
+    weights = np.zeros((logs.joints, AR_ORDER + 1, AR_ORDER + 1))
+    for j in range(logs.joints):
+        weights[j] = predictors(rest[joint == j], place[joint == j], LEAST_NOISE * size[j])
+    return Whitening(kept, place, weights)
+
+
+def predictors(rest: Array, place: Array, least: float) -> Array:
+    """Weights of `Whitening` for one joint.  rest, place: (k,).  least: of the noise."""
+    most = len(rest)
+    lagged = [float(rest @ rest) / max(most, 1) + least**2 + 1e-300]
+    for lag in range(1, AR_ORDER + 1):
+        here = np.flatnonzero(place >= lag)
+        lagged.append(float(rest[here] @ rest[here - lag]) / max(len(here), 1))
+    covariance = np.array(lagged)
+    values = np.linalg.eigvalsh(toeplitz(covariance))
+    lift = max(0.0, 1e-4 * covariance[0] - float(values[0]))  # few pairs may contradict each other
+    covariance[0] += lift
+    out = np.zeros((AR_ORDER + 1, AR_ORDER + 1))
+    for order in range(AR_ORDER + 1):
+        found = np.linalg.solve(toeplitz(covariance[:order]), covariance[1 : order + 1])
+        out[order, :order] = found
+        variance = covariance[0] - found @ covariance[1 : order + 1]
+        out[order, AR_ORDER] = 1.0 / np.sqrt(max(variance, least**2, 1e-300))
+    return out

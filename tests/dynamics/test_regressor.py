@@ -1,0 +1,165 @@
+"""The rigid body against Pinocchio, and against the arm's own energy where that is not there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.dynamics.regressor import (
+    Motion,
+    base_parameters,
+    inertial_parameters,
+    regressor,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.gravity import G
+
+EXACT = 1e-10  # of the largest torque
+
+
+def random_arm(seed: int, slides: tuple[int, ...] = ()) -> mc.Robot:
+    """An arm of six joints with links of any shape."""
+    rng = np.random.default_rng(seed)
+    spread = rng.normal(size=(6, 3, 3))
+    joints = []
+    for i in range(6):
+        about = spread[i] @ spread[i].T * 0.05
+        joints.append(
+            {
+                "a": rng.normal() * 0.3,
+                "d": rng.normal() * 0.3,
+                "theta": rng.normal(),
+                "alpha": rng.choice([0.0, 1.5, -1.5]) + 0.1 * rng.normal(),
+                "beta": 0.0 if i % 2 else 0.05,
+                "sign": int(rng.choice([-1, 1])),
+                "type": "prismatic" if i in slides else "revolute",
+                "mass_kg": rng.uniform(0.5, 9.0),
+                "com_mm": (rng.normal(size=3) * 100.0).tolist(),
+                "inertia": about[np.triu_indices(3)].tolist(),
+            }
+        )
+    up = rng.normal(size=3).tolist()
+    return robot_of({"name": "arm", "units": {"length": "m", "angle": "rad"}, "up": up,
+                     "joints": joints})  # fmt: skip
+
+
+def robot_of(content: dict) -> mc.Robot:  # type: ignore[type-arg]
+    from minimax_cal.robots.robot import robot_from_dict
+
+    return robot_from_dict(content)
+
+
+def motion(robot: mc.Robot, seed: int, count: int = 60) -> Motion:
+    q, qd, qdd = np.random.default_rng(seed).normal(size=(3, count, robot.joints)) * 1.5
+    return Motion(q, qd, qdd)
+
+
+def by_pinocchio(robot: mc.Robot, moved: Motion) -> Array:
+    """Torques (m, n) by another's recursion."""
+    pin = pytest.importorskip("pinocchio")
+    model = pin.Model()
+    model.gravity.linear = -G * robot.up
+    before, parent = pin.SE3.Identity(), 0
+    for i, (a, d, theta, alpha, beta) in enumerate(robot.mdh):
+        slides = robot.prismatic[i]
+        kind = pin.JointModelPZ() if slides else pin.JointModelRZ()
+        parent = model.addJoint(parent, kind, before, f"j{i}")
+        turned = pin.SE3(Rotation.from_euler("z", theta).as_matrix(), np.zeros(3))
+        bent = Rotation.from_euler("XY", [alpha, beta]).as_matrix()
+        before = turned * pin.SE3(bent, np.array([a, 0.0, d]))
+        about = np.zeros((3, 3))
+        about[np.triu_indices(3)] = robot.inertia[i]
+        about = about + np.triu(about, 1).T
+        body = pin.Inertia(robot.mass[i], robot.com[i], about)
+        model.appendBodyToJoint(parent, body, before)
+    data = model.createData()
+    parts = zip(*(part * robot.sign for part in (moved.q, moved.qd, moved.qdd)), strict=True)
+    return np.array([pin.rnea(model, data, *part) for part in parts]) * robot.sign
+
+
+@pytest.mark.parametrize("slides", [(), (0,), (2, 4)])
+@pytest.mark.parametrize("seed", range(4))
+def test_torques_are_those_of_pinocchio(seed: int, slides: tuple[int, ...]) -> None:
+    robot = random_arm(seed, slides)
+    moved = motion(robot, seed)
+    ours = regressor(robot, moved) @ inertial_parameters(robot).ravel()
+    theirs = by_pinocchio(robot, moved)
+    assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
+
+
+def test_a_urdf_has_the_torques_of_pinocchio(tmp_path: Path) -> None:
+    """Inertias in turned frames, a body fixed to a link, an axis that points down."""
+    pin = pytest.importorskip("pinocchio")
+    rng, parts = np.random.default_rng(3), ['<robot name="arm"><link name="l0"/>']
+    for i in range(1, 6):
+        kind = ["revolute", "prismatic", "continuous", "revolute", "fixed"][i - 1]
+        xyz, rpy, about, turned = (" ".join(map(str, rng.normal(size=3) * s))
+                                   for s in (0.3, 1.0, 0.1, 1.0))  # fmt: skip
+        axis = ["0 0 1", "0 1 0", "0 0 -1", "1 0 0", "0 0 1"][i - 1]
+        parts.append(
+            f'<link name="l{i}"><inertial><mass value="{rng.uniform(1, 5)}"/>'
+            f'<origin xyz="{about}" rpy="{turned}"/><inertia ixx="0.3" ixy="0.01" ixz="-0.02" '
+            f'iyy="0.2" iyz="0.03" izz="0.4"/></inertial></link><joint name="j{i}" type="{kind}">'
+            f'<parent link="l{i - 1}"/><child link="l{i}"/><origin xyz="{xyz}" rpy="{rpy}"/>'
+            f'<axis xyz="{axis}"/><limit effort="1" velocity="1" lower="-2" upper="2"/></joint>'
+        )
+    path = tmp_path / "arm.urdf"
+    path.write_text("".join(parts) + "</robot>")
+    robot, model = mc.load_robot(path), pin.buildModelFromUrdf(str(path))
+    model.gravity.linear = np.array([0.0, 0.0, -G])
+    data, moved = model.createData(), motion(robot, 5)
+    theirs = []
+    for q, qd, qdd in zip(moved.q, moved.qd, moved.qdd, strict=True):
+        wound = [*q[:2], np.cos(q[2]), np.sin(q[2]), q[3]]  # a continuous joint is a pair there
+        theirs.append(pin.rnea(model, data, np.array(wound), qd, qdd))
+    ours = regressor(robot, moved) @ inertial_parameters(robot).ravel()
+    assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("slides", [(), (1,)])
+def test_power_is_the_change_of_energy(slides: tuple[int, ...]) -> None:
+    """Twin without Pinocchio: torque times speed is the derivative of the energy."""
+    robot = random_arm(9, slides)
+    phi = inertial_parameters(robot).ravel()
+    moved = motion(robot, 2, 20)
+    power = ((regressor(robot, moved) @ phi) * moved.qd).sum(axis=1)
+    still = np.zeros_like(moved.q)
+
+    def energy(s: float) -> Array:
+        q = moved.q + s * moved.qd + 0.5 * s * s * moved.qdd
+        qd = moved.qd + s * moved.qdd
+        # kinetic: half of qd' M qd, M qd the torque of accelerating by qd without gravity
+        heavy = regressor(robot, Motion(q, still, qd)) - regressor(robot, Motion(q, still, still))
+        return 0.5 * ((heavy @ phi) * qd).sum(axis=1)
+
+    step = 1e-4
+    kinetic = (energy(step) - energy(-step)) / (2.0 * step)
+    weight = ((regressor(robot, Motion(moved.q, still, still)) @ phi) * moved.qd).sum(axis=1)
+    assert_allclose(power, kinetic + weight, rtol=0, atol=1e-6 * np.abs(power).max())
+
+
+def test_base_parameters_of_known_arms() -> None:
+    """36 of a spatial arm with six turning joints whose first is vertical [Khalil, Dombre 2002]."""
+    robot = mc.load_robot("ur10")
+    columns = regressor(robot, motion(robot, 1, 200)).reshape(-1, 60)
+    base = base_parameters(columns)
+    assert base.shape == (60, 36)
+    value = np.random.default_rng(0).normal(size=60)
+    assert_allclose(columns @ base @ (base.T @ value), columns @ value, rtol=0, atol=1e-8)
+
+
+def test_a_robot_file_keeps_inertia_and_gain(tmp_path: Path) -> None:
+    robot = random_arm(0)
+    assert not len(robot.drive_gain)
+    robot.save(tmp_path / "arm.json")
+    again = mc.load_robot(tmp_path / "arm.json")
+    assert_allclose(inertial_parameters(again), inertial_parameters(robot), rtol=1e-12)
+    content = robot.to_dict()
+    content["joints"][2]["drive_gain"] = 11.5
+    assert mc.Robot.to_dict(robot_of(content))["joints"][2]["drive_gain"] == 11.5
+    assert np.isnan(robot_of(content).drive_gain[[0, 1, 3, 4, 5]]).all()

@@ -1,0 +1,100 @@
+"""Rows of a log: filters, rows that are not fitted, and noise that remembers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dynamics.motions import fourier, run_of
+from numpy.testing import assert_allclose
+
+from minimax_cal.dynamics.rows import AR_ORDER, EDGE_S, ROW_HZ, prepare, slope, whitening
+from minimax_cal.ground.arrays import Array
+
+
+def log(seed: int = 0, rate: float = 125.0, seconds: float = 30.0, uneven: float = 0.0):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 1.0 / rate)
+    time = time + uneven / rate * rng.uniform(size=len(time))
+    q, qd, qdd = fourier(rng, time, 3)
+    return run_of(f"run{seed}", time, q, 3.0 * qdd + qd), time, (q, qd, qdd)
+
+
+@pytest.mark.parametrize(("rate", "uneven"), [(125.0, 0.4), (500.0, 0.0), (60.0, 0.2)])
+def test_derivatives_and_torques_are_filtered_alike(rate: float, uneven: float) -> None:
+    """What is linear in the motion stays so to far below the noise of any motor."""
+    run, *_ = log(1, rate, uneven=uneven)
+    logs = prepare([run])
+    inner = ~logs.gap[logs.picked]
+    fitted = logs.filtered(3.0 * logs.motion.qdd + logs.motion.qd)
+    assert_allclose(logs.y[inner], fitted[inner], rtol=0, atol=2e-3 * np.abs(logs.y).max())
+    assert logs.seconds == pytest.approx(30.0, abs=0.1)
+    assert len(logs.picked) == pytest.approx(30.0 * ROW_HZ, abs=2)
+
+
+def test_slope_is_exact_for_cubics() -> None:
+    t = np.linspace(0.0, 1.0, 101)
+    cubic = t**3 - t**2
+    assert_allclose(slope(cubic, 100.0)[2:-2], (3 * t**2 - 2 * t)[2:-2], rtol=0, atol=1e-11)
+
+
+def test_rows_at_rest_near_reversals_and_gaps_are_not_fitted() -> None:
+    run, time, (q, qd, _) = log(2)
+    hold = (time > 10.0) & (time < 12.0)
+    q[hold] = q[np.argmax(hold)]  # a jump at its end, which is far from both sides
+    cut = (time < 20.0) | (time > 20.5)
+    logs = prepare([run_of("one", time[cut], q[cut], run.torque[cut])])
+    at = logs.since[logs.picked]
+    assert not logs.moving[(at > 10.3) & (at < 11.7)].any()
+    assert not logs.fitted[(at > 20.0 - EDGE_S + 0.02) & (at < 20.5 + EDGE_S - 0.02)].any()
+    speed = np.stack([np.interp(at, time, column) for column in qd.T], axis=1)
+    flips = np.diff(np.sign(speed), axis=0) != 0
+    assert not (logs.moving[1:] & flips)[at[1:] < 9.0].any()
+    assert logs.fitted[at < 9.0].mean() > 0.5
+
+
+def test_runs_stand_one_after_another() -> None:
+    first, second = (log(seed)[0] for seed in (3, 4))
+    both, alone = prepare([first, second]), prepare([second])
+    assert (np.bincount(both.quarter) > 150).all()
+    assert both.quarter.max() == 7
+    mine = both.only([1])
+    for found in (mine.y, both.y[both.run == 1]):
+        assert_allclose(found, alone.y, rtol=0, atol=1e-12)
+    assert (mine.moving == alone.moving).all()
+    assert mine.names == ("run4",)
+
+
+def remembering(rng: np.random.Generator, count: int) -> Array:
+    """Autoregressive noise whose innovations have unit variance."""
+    out, new = np.zeros(count), rng.normal(size=count)
+    for i in range(2, count):
+        out[i] = 1.2 * out[i - 1] - 0.5 * out[i - 2] + new[i]
+    return out
+
+
+def test_noise_is_white_after_whitening_across_gaps_too() -> None:
+    logs = prepare([log(seed, seconds=120.0)[0] for seed in (5, 6)])
+    rng = np.random.default_rng(7)
+    size = np.array([0.5, 2.0, 7.0])
+    noise = np.stack([remembering(rng, len(logs.picked)) for _ in size]) * size[:, None]
+    rest = noise[logs.fitted.T]
+    white = whitening(logs, rest)
+    out = white.white(rest)
+    for j in range(3):
+        mine, place = out[white.joint == j], white.place[white.joint == j]
+        assert mine.std() == pytest.approx(1.0, abs=0.03)
+        for lag in (1, 2, 3):
+            here = np.flatnonzero(place >= lag)
+            assert abs((mine[here] * mine[here - lag]).mean()) < 4.0 / np.sqrt(len(here))
+        for order in range(AR_ORDER):  # after a gap rows are no noisier, however few went before
+            assert mine[place == order].std() == pytest.approx(1.0, abs=0.25)
+        assert_allclose(white.weights[j, 4, :2], [1.2, -0.5], atol=0.08)
+    columns = np.stack([rest, 2.0 * rest], axis=1)
+    assert_allclose(white.white(columns), np.stack([out, 2.0 * out], axis=1), rtol=1e-12)
+
+
+def test_computed_torques_have_a_noise() -> None:
+    run, *_ = log(8)
+    logs = prepare([run])
+    white = whitening(logs, np.zeros(int(logs.fitted.sum())))
+    assert np.isfinite(white.weights).all()
