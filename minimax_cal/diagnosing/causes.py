@@ -105,7 +105,7 @@ def found_again(study: Study, causes: Causes) -> Causes:
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
-    again = judged_again(found, choice, study, causes.library, causes.ripple)
+    again = judged_again(found, choice, study)
     effects = again.findings
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(study, choice, causes.traces) is not None

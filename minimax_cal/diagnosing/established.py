@@ -13,7 +13,6 @@ from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.bench import Added, Bench, bench
-from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import (
     AGAIN,
     ALONE,
@@ -50,22 +49,17 @@ class Again:
     met: float
 
 
-def judged_again(
-    findings: Sequence[Finding], whole: Choice, study: Study, library: Library, ripple: bool
-) -> Again:
-    """The findings, sought anew without each fifth.
-
-    whole: what was chosen on all poses.  library: what it was chosen from.
-    """
+def judged_again(findings: Sequence[Finding], whole: Choice, study: Study) -> Again:
+    """The findings, sought anew without each fifth.  whole: what was chosen on all poses."""
     if not findings:
         return Again((), UNASKED)
     part = folds(study.data, FOLDS)
     known: list[list[bool]] = [[] for _ in findings]
     rich, choices = 0, []
     for number in range(FOLDS):
-        rest = library.only(study.rows.at(part != number))
+        rest = whole.part(study.rows.at(part != number))
         rich += rest.products.dof(NOTHING) >= LEAST_DOF
-        choice = select(rest, ripple=ripple, level=AGAIN, seldom=MOST)
+        choice = select(rest, level=AGAIN, seldom=MOST)
         choices.append(choice)
         for one, times in zip(findings, known, strict=True):
             if is_found(one, choice, whole):

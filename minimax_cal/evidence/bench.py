@@ -18,7 +18,6 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
 
 ROUNDING = 1e-15  # share of a square that is no more than rounding
-SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when one is added
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +323,7 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
     products, rows = lib.products, lib.rows
     main, loose, ridge = columns_of(chosen, fits)
     noise, dof = products.noise(main), products.dof(main)
-    ratios = noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
+    ratios = products.ratios_below(noise)
     index = np.concatenate([main, loose])
     at = products.at(ratios, index)
     factor = triangles(beside_priors(at, index, ridge * noise.variance))

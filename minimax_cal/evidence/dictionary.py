@@ -54,12 +54,10 @@ class Dictionary(Protocol):
     def finer(self, term: Any) -> Sequence[Any]:
         """The law with its tuned numbers closer together about those given; empty for none."""
 
-    def lines(
-        self, noise: Noise, known: Array, kept: Array, found: Sequence[Any]
-    ) -> list[tuple[Any, float]]:
+    def lines(self, noise: Noise, known: Array, found: Sequence[Any]) -> list[tuple[Any, float]]:
         """Lines that what is left shows, with how many frequencies were tried for each.
 
-        known: (N, q) columns fitted already.  kept: (N,) rows that count.  found: lines chosen.
+        known: (N, q) columns fitted already.  found: lines chosen.
         """
 
     def is_expected(self, line: Any, found: Sequence[Any]) -> bool:

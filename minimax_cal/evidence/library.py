@@ -12,6 +12,7 @@ import numpy as np
 from minimax_cal.evidence.dictionary import Dictionary, Key, Spec
 from minimax_cal.evidence.noise import Problem
 from minimax_cal.evidence.products import Columns, Products
+from minimax_cal.evidence.sweeping import Grams, Swept
 from minimax_cal.ground.arrays import Array
 
 GONE = 1e-8  # share of a field that poses must show
@@ -114,13 +115,13 @@ class Aside:
 class Library:
     """All candidates that these data can test.
 
-    products: of their columns, which all libraries of the same data share.  untestable: family and
-    what the data lack.  found: candidates stored later, by their text.  lines: as the last search
-    found them.
+    products: of their columns, which all libraries of the same data share; of a part, swept: there
+    nothing is tuned, and no line sought.  untestable: family and what the data lack.  found:
+    candidates stored later, by their text.  lines: as the last search found them.
     """
 
     dictionary: Dictionary
-    products: Products
+    products: Products | Swept
     candidates: tuple[Candidate, ...]
     untestable: tuple[Key, ...] = ()
     found: dict[str, Candidate] = field(default_factory=dict)
@@ -129,9 +130,7 @@ class Library:
     @staticmethod
     def empty(dictionary: Dictionary) -> Library:
         """No candidates yet."""
-        rows = dictionary.problem
-        products = Products(Columns(rows), np.ones(len(rows.error), bool))
-        return Library(dictionary, products, ())
+        return Library(dictionary, Products(Columns(dictionary.problem)), ())
 
     @staticmethod
     def of(dictionary: Dictionary, terms: Sequence[Any], untestable: Sequence[Key]) -> Library:
@@ -186,12 +185,14 @@ class Library:
             return np.asarray(self.lines.clear[index])
         return self.products.clear(index)
 
-    def only(self, kept: Array) -> Library:
-        """The library for some of the rows, of which the others' columns are taken away.
+    @property
+    def is_part(self) -> bool:
+        """Whether some rows alone count."""
+        return isinstance(self.products, Swept)
 
-        kept: (N,) True for rows that count.
-        """
-        return replace(self, products=self.products.of(kept)).shown()
+    def part(self, grams: Grams, kept: Array) -> Library:
+        """The library for some of the rows alone.  kept: (N,) True for those that count."""
+        return replace(self, products=Swept(grams, kept), lines=None).shown()
 
     def shown(self) -> Library:
         """The library without candidates that geometry imitates."""

@@ -1,24 +1,24 @@
 """Cross-products of columns, rows weighed for any ratio of the noises, each formed once.
 
-Products at the nodes of a decade give those at any ratio there (see `ratios`).  The products of
-some poses are those of all poses less those of the others.  The geometry is projected out once at
-every node; what is left is as smooth.
+Products at the nodes of a decade give those at any ratio there (see `ratios`).  The geometry is
+projected out once at every node; what is left is as smooth.  `sweeping` has those of some rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import FREE, Noise, Problem, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.noise import FREE, Noise, Problem, costs, noise_of, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
 from minimax_cal.ground.arrays import Array
 
 LEAST = 1e-13  # of a column's square: what is left of one that geometry imitates is no less
 BLOCK = 4_000_000  # weighed numbers that are held at once
+SHRINK = np.array([1.0, 0.4, 0.12, 0.03, 0.0])  # of the ratio, when an effect is added
 
 
 class Columns:
@@ -30,7 +30,7 @@ class Columns:
 
     def __init__(self, rows: Problem) -> None:
         self.rows = rows
-        self.fixed = rows.basis.shape[1] + 1  # geometry and the error
+        self.fixed: int = rows.basis.shape[1] + 1  # geometry and the error
         self.count = 0
         self.held = grown(np.empty((256, len(rows.error))), self.fixed)
         self.plain = np.empty((0, len(rows.error)))
@@ -113,43 +113,22 @@ class Lines:
 
 
 class Sums:
-    """Products at some ratios, summed over some rows.
+    """Products at some ratios, summed over all rows.  ratios: (g,)."""
 
-    ratios: (g,).  out: (n,) rows that the total counts and these do not, None for all rows.
-    """
-
-    def __init__(
-        self, columns: Columns, ratios: Array, out: Array | None = None, total: Sums | None = None
-    ) -> None:
-        self.columns, self.ratios, self.out, self.total = columns, ratios, out, total
-        spread = columns.rows.variance_ratio
-        self.weights = 1.0 / (1.0 + np.outer(ratios, spread if out is None else spread[out]))
+    def __init__(self, columns: Columns, ratios: Array) -> None:
+        self.columns, self.ratios = columns, ratios
+        self.weights = 1.0 / (1.0 + np.outer(ratios, columns.rows.variance_ratio))
         self.lines = Lines(len(ratios))
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
-        self.here = np.empty((0, self.weights.shape[1]))
-        self.copied = 0
-
-    def fields(self) -> Array:
-        """(p + 1 + D, n) columns at the rows that are summed here."""
-        every = self.columns.clear
-        if self.out is None:
-            return every
-        self.here = grown(self.here, len(every))
-        if len(every) > self.copied:
-            self.here[self.copied : len(every)] = every[self.copied :][:, self.out]
-            self.copied = len(every)
-        return self.here[: len(every)]
 
     def products(self, index: Array, start: int, stop: int) -> Array:
         """(f, g, d) of columns with those from a first to before a last."""
-        if self.total is None:
-            return self.lines.across(self.weighed, index, start, stop)
-        return self.total.products(index, start, stop) - self.weighed(index, start, stop)
+        return self.lines.across(self.weighed, index, start, stop)
 
     def weighed(self, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) as `products`, of the rows here; the fewer columns are weighed."""
-        fields = self.fields()
+        """(f, g, d) as `products`, formed; the fewer columns are weighed."""
+        fields = self.columns.clear
         there = fields[start:stop]
         if len(there) < len(index):
             return np.swapaxes(self.spread(there, fields[index]), 0, 2)
@@ -168,20 +147,15 @@ class Sums:
 
     def among(self, index: Array) -> Array:
         """(c, d, d, g) products within each of c sets of columns (c, d)."""
-        if self.total is not None:
-            return self.total.among(index) - within(self.fields()[index], self.weights)
         mark = (index.tobytes(), index.shape[1])
         if mark not in self.sets:
-            self.sets[mark] = within(self.fields()[index], self.weights)
+            self.sets[mark] = within(self.columns.clear[index], self.weights)
         return self.sets[mark]
 
     def squares(self) -> Array:
         """(D, g) squares of candidates' columns as they are."""
         new = self.columns.plain[len(self.whole) : self.columns.count]
-        more = (new if self.out is None else new[:, self.out]) ** 2 @ self.weights.T
-        if self.total is not None:
-            more = self.total.squares()[len(self.whole) :] - more
-        self.whole = np.concatenate([self.whole, more])
+        self.whole = np.concatenate([self.whole, new**2 @ self.weights.T])
         return self.whole
 
 
@@ -198,24 +172,20 @@ def within(fields: Array, weights: Array) -> Array:
 class Beside:
     """What is left of products at some ratios when the geometry is projected out.
 
-    span: (p, r) combinations of the geometry's columns that the rows tell apart.
-    factor: (g, r, r) lower triangles of their products.  logs: (g,) log determinants of those.
-    error: (g,) squares of the error, unprojected.
+    factor: (g, p, p) lower triangles of the geometry's products.  logs: (g,) log determinants of
+    those.  error: (g,) squares of the error, unprojected.
     """
 
-    def __init__(self, sums: Sums, span: Array) -> None:
-        self.sums, self.span = sums, span
-        depth, r = len(sums.ratios), span.shape[1]
-        p = len(span)
-        index = np.arange(p)
-        gram = span.T @ np.moveaxis(sums.products(index, 0, p), 0, 1) @ span
-        self.factor = triangles(gram)
+    def __init__(self, sums: Sums) -> None:
+        self.sums, p = sums, sums.columns.fixed - 1
+        depth = len(sums.ratios)
+        self.factor = triangles(np.moveaxis(sums.products(np.arange(p), 0, p), 0, 1))
         self.inverse = np.linalg.inv(self.factor)
         self.logs = 2.0 * np.log(np.einsum("grr->gr", self.factor)).sum(axis=1)
         self.error = sums.products(np.array([p]), p, p + 1)[0, :, 0]
         self.lines = Lines(depth)
         self.sets: dict[tuple[bytes, int], Array] = {}
-        self.held = np.empty((depth, r, 0))
+        self.held = np.empty((depth, p, 0))
         self.known = 0
 
     @property
@@ -225,13 +195,12 @@ class Beside:
 
     @property
     def part(self) -> Array:
-        """(g, r, p + 1 + D) coordinates of all columns in the geometry's span."""
+        """(g, p, p + 1 + D) coordinates of all columns in the geometry's span."""
         width, known = self.width, self.known
         if width > known:
             self.held = grown(self.held, width, axis=2)
-            raw = self.sums.products(np.arange(len(self.span)), known, width)
-            turned = self.span.T @ np.moveaxis(raw, 0, 1)
-            self.held[:, :, known:width] = self.inverse @ turned
+            raw = self.sums.products(np.arange(self.sums.columns.fixed - 1), known, width)
+            self.held[:, :, known:width] = self.inverse @ np.moveaxis(raw, 0, 1)
             self.known = width
         return np.asarray(self.held[:, :, :width])
 
@@ -271,7 +240,8 @@ class At:
     square: (s,) of the error, unprojected.  whole: (s, D) squares of the candidates' as they are.
     factor: (s, r, r) lower triangles of the geometry's products; part: (s, r, 1 + q) coordinates
     of the error and of the q columns in its span; logs: (s,) log determinants.
-    pull: (s, q) of the q columns with the error.  views: where the ratios come from.
+    pull: (s, q) of the q columns with the error.  among: products (s, c, d, d) within sets of
+    candidates' columns (c, d).
     """
 
     lines: Array
@@ -282,25 +252,14 @@ class At:
     part: Array
     logs: Array
     pull: Array
-    views: Sequence[View]
-
-    def among(self, index: Array) -> Array:
-        """(s, c, d, d) products within sets of candidates' columns (c, d)."""
-        out = np.empty((len(self.logs), *index.shape, index.shape[1]))
-        for here, beside, between in self.views:
-            own = beside.among(index + beside.sums.columns.fixed)
-            out[here] = np.moveaxis(own @ between.T, -1, 0)
-        return out
+    among: Callable[[Array], Array]
 
 
 class Products:
-    """Products for any ratio, of all rows or of those that are kept.
+    """Products for any ratio, of all rows."""
 
-    kept: (N,) whether a row counts.  all: the products of all rows, where some do not count.
-    """
-
-    def __init__(self, columns: Columns, kept: Array, all: Products | None = None) -> None:
-        self.columns, self.kept, self.all = columns, kept, all
+    def __init__(self, columns: Columns) -> None:
+        self.columns, self.kept = columns, np.ones(len(columns.rows.error), dtype=bool)
         self.formed: dict[int | None, Beside] = {}
         self.summed: dict[int | None, Sums] = {}
         self.noises: dict[bytes, Noise] = {}
@@ -309,26 +268,16 @@ class Products:
         """(d, N) candidates' columns less what geometry imitates."""
         return np.asarray(self.columns.clear[self.columns.fixed + index])
 
-    def of(self, kept: Array) -> Products:
-        """The products of some rows only.  kept: (N,)."""
-        return Products(self.columns, kept, self.all or self)
-
     def sums(self, number: int | None) -> Sums:
         """Products at the nodes of a decade of ratios; None: at RATIOS."""
         if number not in self.summed:
-            ratios = RATIOS if number is None else nodes(number)
-            if self.all is None:
-                made = Sums(self.columns, ratios)
-            else:
-                out = np.flatnonzero(~self.kept)
-                made = Sums(self.columns, ratios, out, self.all.sums(number))
-            self.summed[number] = made
+            self.summed[number] = Sums(self.columns, RATIOS if number is None else nodes(number))
         return self.summed[number]
 
     def beside(self, number: int | None) -> Beside:
         """What the geometry leaves of the products of a decade; None: at RATIOS."""
         if number not in self.formed:
-            self.formed[number] = Beside(self.sums(number), self.span)
+            self.formed[number] = Beside(self.sums(number))
         return self.formed[number]
 
     def views(self, ratios: Array) -> list[View]:
@@ -349,21 +298,13 @@ class Products:
         return out
 
     @cached_property
-    def span(self) -> Array:
-        """(p, r) combinations of the geometry's columns that the rows tell apart."""
-        p = self.columns.fixed - 1
-        if self.all is None:
-            return np.eye(p)
-        return told_apart(self.sums(None).products(np.arange(p), 0, p)[:, 0])
-
-    @cached_property
     def count(self) -> int:
-        """Rows that were measured and count."""
-        return int(np.count_nonzero(self.kept & self.columns.rows.measured))
+        """Rows that were measured."""
+        return int(np.count_nonzero(self.columns.rows.measured))
 
     def dof(self, index: Array) -> int:
         """Degrees of freedom beside the geometry and some of the candidates' columns."""
-        return self.count - int(self.span.shape[1]) - len(index)
+        return self.count - (self.columns.fixed - 1) - len(index)
 
     def noise(self, index: Array) -> Noise:
         """The noise beside some of the candidates' columns, by restricted maximum likelihood."""
@@ -376,10 +317,9 @@ class Products:
         """The noise, computed."""
         rows, dof = self.columns.rows, self.dof(index)
         if dof < FREE:
-            error = rows.error[self.kept]
-            return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
+            square = float(rows.error @ rows.error)
+            return Noise(0.0, square / max(self.count, 1) + 1e-18, 0.0)
         chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])
-        varied = rows.variance_ratio[self.kept]
 
         def cost(ratios: Array) -> tuple[Array, Array]:
             gram = np.empty((len(ratios), len(chosen), len(chosen)))
@@ -389,24 +329,28 @@ class Products:
                 least[here] = LEAST * (between @ beside.sums.squares()[index].T)
                 logs[here] = between @ beside.logs
             gram[:, range(len(index)), range(len(index))] += least
-            value, squares = costs(gram, ratios, varied, dof)
+            value, squares = costs(gram, ratios, rows.variance_ratio, dof)
             return value + logs, squares
 
         ratio = likeliest(lambda ratios: cost(ratios)[0])
         return noise_of(ratio, float(cost(np.array([ratio]))[1][0]) / dof, rows)
 
     def geometry(self) -> Array:
-        """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
-        return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
+        """(p, N) the geometry's columns."""
+        return self.columns.clear[: self.columns.fixed - 1]
+
+    def ratios_below(self, noise: Noise) -> Array:
+        """(s,) ratios at which candidates are compared beside a noise, the largest first."""
+        return noise.ratio * SHRINK if noise.ratio > 0.0 else np.zeros(1)
 
     def at(self, ratios: Array, index: Array) -> At:
         """Products at ratios (s,) of some candidates' columns (q,) and of the error."""
-        s, q, r, p = len(ratios), len(index), self.span.shape[1], self.columns.fixed - 1
+        s, q, p = len(ratios), len(index), self.columns.fixed - 1
         fixed = np.concatenate([[p], p + 1 + index])
         lines = np.empty((s, 1 + q, len(self.columns.clear) - p))
         square, logs = np.empty(s), np.empty(s)
         whole = np.empty((s, self.columns.count))
-        factor, part = np.empty((s, r, r)), np.empty((s, r, 1 + q))
+        factor, part = np.empty((s, p, p)), np.empty((s, p, 1 + q))
         views = self.views(ratios)
         for here, beside, between in views:
             lines[here] = np.moveaxis(between @ beside.across(fixed)[:, :, p:], 1, 0)
@@ -414,5 +358,13 @@ class Products:
             square[here], logs[here] = between @ beside.error, between @ beside.logs
             factor[here] = np.tensordot(between, beside.factor, 1)
             part[here] = np.tensordot(between, beside.part[:, :, fixed], 1)
+
+        def among(sets: Array) -> Array:
+            out = np.empty((s, *sets.shape, sets.shape[1]))
+            for here, beside, between in views:
+                own = beside.among(sets + beside.sums.columns.fixed)
+                out[here] = np.moveaxis(own @ between.T, -1, 0)
+            return out
+
         pull = lines[:, 1:, 0]
-        return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, pull, views)
+        return At(lines[:, 1:, 1:], lines[:, 0], square, whole, factor, part, logs, pull, among)

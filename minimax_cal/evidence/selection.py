@@ -38,6 +38,7 @@ from minimax_cal.evidence.limits import (
     TUNINGS,
 )
 from minimax_cal.evidence.noise import FREE, Noise
+from minimax_cal.evidence.sweeping import Grams
 from minimax_cal.ground.arrays import Array
 
 NOTHING: Array = np.zeros(0, dtype=int)
@@ -77,6 +78,18 @@ class Choice:
         """Values and sigmas (d,) of the parameters of each effect, all estimated together."""
         return together(self.library, self.found, self.noise)
 
+    @cached_property
+    def grams(self) -> Grams:
+        """What the searches of parts of the rows start from."""
+        products = self.library.products
+        return Grams(products.columns, [products.noise(NOTHING), self.noise])
+
+    def part(self, kept: Array) -> Library:
+        """What a part of the rows may choose from, all that this search tuned; kept: (N,)."""
+        lib = self.library
+        lines = [c for c in lib.found.values() if c.is_line and c not in lib.candidates]
+        return replace(lib, candidates=(*lib.candidates, *lines)).part(self.grams, kept)
+
     @property
     def known(self) -> Array:
         """(N, q) their columns."""
@@ -104,8 +117,8 @@ def select(
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
-    lib: of all poses, or of some, as `Library.only` gives it: the rest of its poses are not looked
-    at.  ripple: whether to look for lines of gears besides.  level: chance
+    lib: of all rows, or of some, as `Choice.part` gives it: no other is looked at, and nothing is
+    tuned.  ripple: whether to look for lines of gears besides.  level: chance
     of a false name on data without an effect.  seldom: of more than REFINED effects each is
     compared anew after so many, and at the end.  first: what was chosen with other weights.
     """
@@ -117,10 +130,10 @@ def select(
         lib, fits = refined(lib, fits, level, last=True)
         noise = noise_beside(lib, fits)
     for _ in range(MOST):
-        if ripple:
+        if ripple and not lib.is_part:
             known = lib.columns[:, columns_of([one.candidate for one in fits])[0]]
             heard = [one.candidate.term for one in fits if one.candidate.is_line]
-            found = lib.dictionary.lines(noise, known, lib.products.kept, heard)
+            found = lib.dictionary.lines(noise, known, heard)
             lib = replace(lib, candidates=plain(lib), lines=lib.aside(found))
         table = bench(lib, [one.candidate for one in fits], fits)
         if table.dof < LEAST_DOF:
@@ -208,7 +221,7 @@ def addition(
             continue
         if table.improbable(one, level):
             seen.add(one.candidate.key)
-            lib, better = adopted(lib, tuned(table, one), one.candidate)
+            lib, better = adopted(lib, shaped(table, one), one.candidate)
             better = signed(lib, fits, better, least, table)
             if better.evidence > 0.0 and table.p_value(better) < level:
                 best = better if not best or better.evidence > best.evidence else best
@@ -231,6 +244,11 @@ def signed(lib: Library, fits: Sequence[Added], one: Added, least: float, table:
     return replace(one, gain=max(one.gain - owed, 0.0), evidence=one.evidence - owed)
 
 
+def shaped(table: Bench, best: Added) -> Added:
+    """A candidate tuned; of a part of the rows as it is."""
+    return best if table.library.is_part else tuned(table, best)
+
+
 def tuned(table: Bench, best: Added) -> Added:
     """A candidate with what its law has chosen (a moment, a time constant) searched more finely.
 
@@ -246,6 +264,17 @@ def tuned(table: Bench, best: Added) -> Added:
             break
         best = ranked[0]
     return best
+
+
+def tuned_again(choice: Choice) -> Choice:
+    """The choice of a part of the rows, each effect tuned by these alone, and stored nowhere."""
+    pairs = zip(choice.benches, choice.fits, strict=True)
+    best = [tuned(table, one) for table, one in pairs]
+    found = (
+        replace(one, candidate=replace(one.candidate, term=other.candidate.term))
+        for one, other in zip(choice.found, best, strict=True)
+    )
+    return replace(choice, found=tuple(found))
 
 
 def adopted(lib: Library, one: Added, instead: Candidate) -> tuple[Library, Added]:
@@ -304,7 +333,7 @@ def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
         beside = bench(lib, [*chosen, first.candidate], [*others, first])
         both = first.evidence + beside.added(pair[1].candidate).evidence
         near = table.ranked(free)[0]
-        best = tuned(table, near)
+        best = shaped(table, near)
         if best.evidence > both - TIE:
             lib, best = adopted(lib, best, near.candidate)
             return one_course(lib, [*others, best])

@@ -56,11 +56,9 @@ class ArmLaws:
         choices = EFFECTS[term.effect].finer(self.scene, term.choice)
         return [replace(term, choice=choice) for choice in choices]
 
-    def lines(
-        self, noise: Noise, known: Array, kept: Array, found: Sequence[Term]
-    ) -> list[tuple[Term, float]]:
+    def lines(self, noise: Noise, known: Array, found: Sequence[Term]) -> list[tuple[Term, float]]:
         """Lines of gears, with the frequencies tried: `periodogram.strongest_lines`."""
-        return strongest_lines(self.scene, self.problem, noise, known, kept=kept, heard=found)
+        return strongest_lines(self.scene, self.problem, noise, known, heard=found)
 
     def is_expected(self, line: Term, found: Sequence[Term]) -> bool:
         """Whether a line is where its gear's is."""

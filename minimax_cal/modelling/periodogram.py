@@ -29,7 +29,6 @@ def strongest_lines(
     noise: Noise,
     known: Array,
     *,
-    kept: Array | None = None,
     heard: Sequence[Term] = (),
 ) -> list[tuple[Term, float]]:
     """The strongest line of each joint near its gear's ratio, and any, if it stays.
@@ -38,10 +37,9 @@ def strongest_lines(
 
     With the number of independent frequencies tried of such lines, at all joints; near ratios at
     the joint alone once another has a line: each gear of an arm whose gears err is asked for by
-    itself.  known: (N, q) columns that are fitted already.  kept: (N,) rows that count, None for
-    all.  heard: lines that were found.
+    itself.  known: (N, q) columns that are fitted already.  heard: lines that were found.
     """
-    weight = noise.weights(rows) * (1.0 if kept is None else kept)
+    weight = noise.weights(rows)
     pull = weight * remaining(rows, weight, known)
     arms = rows.of(scene.jacobian)
     apart: list[tuple[Term, float]] = []

@@ -81,7 +81,7 @@ def test_what_is_sought_anew_meets_its_fifth(ripple: tuple[Study, Causes]) -> No
     """By least squares on the other poses, told here in another way."""
     made, causes = ripple
     part = np.arange(made.data.poses) % 5 == 0
-    library = causes.library.only(made.rows.at(~part))
+    library = causes.choice.part(made.rows.at(~part))
     choice = select(library)
     assert [c.key for c in choice.chosen] == [("gear_ripple", "J2")]
     rows = library.rows
@@ -105,7 +105,7 @@ def test_rows_that_others_do_not_tell_are_no_test(
     """An error of theirs alone, however large, is not laid at the door of what was named."""
     made, causes = ripple
     part = np.arange(made.data.poses) % 5 == 0
-    choice = select(causes.library.only(made.rows.at(~part)))
+    choice = select(causes.choice.part(made.rows.at(~part)))
     rows = choice.library.rows
     mine = np.repeat(part, len(rows.error) // made.data.poses)
     known = np.concatenate([rows.basis, choice.known, rows.error[:, None]], axis=1)

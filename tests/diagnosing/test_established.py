@@ -85,10 +85,10 @@ def test_an_effect_is_shown_by_poses_that_turn_its_joint(geared: tuple[Study, Li
     effect = named(whole, "gear_error", "J1")
     q = study.data.q[:, 0]
     order = np.argsort(np.argsort(q))
-    some = select(lib.only(study.rows.at(order % 5 != 0)))
+    some = select(whole.part(study.rows.at(order % 5 != 0)))
     assert shows(effect, some, whole)
     assert is_found(effect, some, whole)
-    few = select(lib.only(study.rows.at(np.abs(order - len(q) / 2) < 0.1 * len(q))))
+    few = select(whole.part(study.rows.at(np.abs(order - len(q) / 2) < 0.1 * len(q))))
     assert not shows(effect, few, whole)
 
 
@@ -112,7 +112,7 @@ def test_a_part_that_names_nothing_else_is_asked_for_the_effect_by_itself() -> N
     lib = arm_library(study.scene, study.rows)
     whole = select(lib)
     effect = replace(named(whole, "gear_error", "J1"), alternatives=())
-    rest = lib.only(study.rows.at(np.arange(study.data.poses) % 5 != 0))
+    rest = whole.part(study.rows.at(np.arange(study.data.poses) % 5 != 0))
     silent = select(rest, level=1e-15)
     assert not silent.chosen
     assert not is_found(effect, silent, whole)

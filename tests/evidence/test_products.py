@@ -13,9 +13,7 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.noise import FREE, Problem, orthonormal, remaining, restricted
 from minimax_cal.evidence.ratios import NODES, interpolation, nodes
-from minimax_cal.evidence.selection import Choice, select
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
@@ -43,16 +41,6 @@ def lib(rough: Study) -> Library:
     return arm_library(rough.scene, rough.rows)
 
 
-@pytest.fixture(scope="module")
-def poses(rough: Study) -> Array:
-    """All but every sixth."""
-    return np.asarray(np.arange(rough.scene.poses) % 6 != 2)
-
-
-def kept_rows(rough: Study, poses: Array) -> Array:
-    return np.repeat(poses, rough.rows.weight.shape[1])
-
-
 @pytest.mark.parametrize("decade", [-3, 0, 4])
 def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
     ratios = 10.0 ** np.linspace(decade, decade + 1, 101)
@@ -66,20 +54,16 @@ def test_polynomials_of_a_decade_give_every_weight(decade: int) -> None:
     assert_allclose(found, weights(ratios), rtol=1e-9)
 
 
-@pytest.mark.parametrize("some", [False, True])
-def test_products_are_the_sums_over_rows_that_count(
-    lib: Library, rough: Study, poses: Array, some: bool
-) -> None:
+def test_products_are_the_sums_over_rows(rough: Study) -> None:
     """Of what weighted least squares on the geometry leave of the columns."""
-    kept = kept_rows(rough, poses) if some else np.ones(len(rough.rows.error), dtype=bool)
-    products = lib.products.of(kept) if some else arm_library(rough.scene, rough.rows).products
+    products = arm_library(rough.scene, rough.rows).products
     index, sets = np.array([3, 17, 18]), np.array([[0, 5], [7, 30]])
     clear, raw = products.columns.clear, products.columns.raw
     p = products.columns.fixed - 1
     found = products.at(RATIOS, index)
     within = found.among(sets)
     for i, ratio in enumerate(RATIOS):
-        weight = kept / (1.0 + ratio * rough.rows.variance_ratio)
+        weight = 1.0 / (1.0 + ratio * rough.rows.variance_ratio)
         geometry, root = products.geometry() * np.sqrt(weight), np.sqrt(weight)
         basis = np.linalg.qr(geometry.T)[0]
         every = clear[p:] * root
@@ -109,64 +93,6 @@ def test_columns_are_stored_without_what_geometry_imitates(lib: Library, rough: 
                     rtol=0, atol=ROUNDING * np.abs(lib.columns).max())  # fmt: skip
 
 
-def test_the_noise_of_some_poses_is_that_of_their_rows_alone(
-    lib: Library, rough: Study, poses: Array
-) -> None:
-    rows, kept = rough.rows, kept_rows(rough, poses)
-    alone = Problem(rows.error[kept], orthonormal(rows.basis[kept]), rows.variance_ratio[kept],
-                    rows.size, rows.group[kept], rows.measured[kept], rows.exact)  # fmt: skip
-    assert alone.count == 3 * int(np.count_nonzero(rough.model.weight[:, poses]))
-    index = np.array([4, 9])
-    found = lib.only(rough.rows.at(poses)).products.noise(index)
-    expected = restricted(alone, lib.columns[kept][:, index])
-    assert_allclose(found.ratio, expected.ratio, rtol=1e-6)
-    assert_allclose(found.variance, expected.variance, rtol=1e-7)
-
-
-def test_the_span_of_some_poses_is_orthonormal_there(
-    lib: Library, rough: Study, poses: Array
-) -> None:
-    rows = kept_rows(rough, poses)
-    products = lib.products.of(rows)
-    p = len(products.span)
-    basis = rough.rows.basis[rows] @ products.span
-    assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), rtol=0, atol=ROUNDING)
-    beside = products.beside(None)
-    for number in (0, -1):  # coordinates of the geometry's own columns, at both ends of RATIOS
-        weight = 1.0 / (1.0 + beside.sums.ratios[number] * rough.rows.variance_ratio[rows])
-        half = np.sqrt(weight)[:, None] * rough.rows.basis[rows]
-        gram = half.T @ half
-        square = beside.part[number, :, :p].T @ beside.part[number, :, :p]
-        assert_allclose(square, gram, rtol=0, atol=ROUNDING * np.abs(gram).max())
-
-
-def test_few_rows_have_the_noise_of_their_mean_square(lib: Library, rough: Study) -> None:
-    """Fewer than `FREE` degrees of freedom tell no two noises apart."""
-    none = np.zeros(0, dtype=int)
-    number = np.arange(rough.scene.poses)
-    some = [kept_rows(rough, number < count) for count in (1, 2, 3)]
-    rows = next(rows for rows in some if lib.products.of(rows).dof(none) < FREE)
-    noise = lib.products.of(rows).noise(none)
-    error = rough.rows.error[rows]
-    assert noise.ratio == noise.jitter == 0.0
-    assert_allclose(noise.variance, float(error @ error) / rows.sum(), rtol=1e-6)
-
-
-def test_a_candidate_beside_others_is_least_squares_on_the_poses_that_count(
-    lib: Library, rough: Study, poses: Array
-) -> None:
-    some = lib.only(rough.rows.at(poses))
-    first, second = (next(c for c in some.candidates if c.key == key and not len(c.doubt))
-                     for key in (("backlash", "J2"), ("gear_error", "J3")))  # fmt: skip
-    one = bench(some, [first]).added(second)
-    rows = rough.rows
-    root = np.sqrt(kept_rows(rough, poses) / (1.0 + one.ratio * rows.variance_ratio))[:, None]
-    columns = lib.columns[:, np.concatenate([first.main, second.main])]
-    matrix = np.concatenate([rows.basis, columns], axis=1) * root
-    expected = np.linalg.lstsq(matrix, rows.error * root[:, 0], rcond=None)[0]
-    assert_allclose(one.value, expected[-2:], rtol=1e-8)
-
-
 def test_candidates_stored_nowhere_compare_as_stored_ones(lib: Library) -> None:
     chosen = [next(c for c in lib.candidates if c.key == ("joint_compliance", "all"))]
     term = Term("gear_ripple", "J4", {"turns": 33.3})
@@ -183,33 +109,6 @@ def test_where_no_line_is_sought_none_is_compared(lib: Library) -> None:
     """No joint moves enough for a line: nothing aside, with and without effects chosen."""
     for chosen in ([], list(lib.candidates[:1])):
         assert bench(lib, chosen).beside(lib.aside(())).ranked(()) == []
-
-
-def left_by(choice: Choice) -> Array:
-    """(N,) what geometry and effects, fitted to the rows that count, leave of all rows."""
-    rows = choice.library.rows
-    weight = choice.noise.weights(rows) * choice.library.products.kept
-    return remaining(rows, weight, choice.known)
-
-
-def test_a_selection_from_some_poses_looks_at_no_other(
-    lib: Library, rough: Study, poses: Array, rng: np.random.Generator
-) -> None:
-    """Errors of the others, whatever they are, change nothing; they are predicted besides."""
-    choice = select(lib.only(rough.rows.at(poses)))
-    assert {c.key for c in choice.chosen} == {("backlash", "J2"), ("gear_ripple", "J4")}
-    kept = kept_rows(rough, poses)
-    other = rough.rows.error + np.where(kept, 0.0, 1e-3 * rng.normal(size=len(kept)))
-    spoilt_lib = arm_library(rough.scene, replace(rough.rows, error=other))
-    spoilt = select(spoilt_lib.only(rough.rows.at(poses)))
-    assert [c.term.text for c in spoilt.chosen] == [c.term.text for c in choice.chosen]
-    for one, again in zip(choice.fits, spoilt.fits, strict=True):
-        assert_allclose(again.value, one.value, rtol=1e-6)
-    left = left_by(choice)
-    assert_allclose((left_by(spoilt) - other)[kept], (left - rough.rows.error)[kept], atol=1e-9)
-    outside = np.sqrt(np.mean(left[~kept] ** 2))
-    assert outside < 1.3 * np.sqrt(np.mean(left[kept] ** 2))
-    assert outside < 0.9 * np.sqrt(np.mean(rough.rows.error[~kept] ** 2))
 
 
 def test_waves_on_a_grid_are_sums_over_poses(rng: np.random.Generator) -> None:
@@ -238,31 +137,6 @@ def test_products_know_no_order_of_columns(rng: np.random.Generator) -> None:
     ours = late.products.at(RATIOS[:2], index).lines[:, :, index]
     theirs = early.products.at(RATIOS[:2], same).lines[:, :, same]
     assert_allclose(ours, theirs, rtol=1e-10, atol=1e-12 * np.abs(theirs).max())
-
-
-def test_a_part_that_shows_hardly_anything_of_a_cause_does_not_test_it() -> None:
-    """A nest that moved late, and poses from before: rounding is left of its columns."""
-    made = study(jitter=0.0, noise=1.0, seed=3)
-    whole = arm_library(made.scene, made.rows)
-    shift = next(c for c in whole.candidates if c.term.effect == "target_shift")
-    since = made.scene.data.columns["clock"] < shift.term.choice["since"]
-    part = whole.only(made.rows.at(since))
-    assert shift not in part.candidates
-    select(part)  # and no warning
-
-
-def test_parts_leave_no_memory_behind(lib: Library, rough: Study, poses: Array) -> None:
-    """Products are large: they go with the last name for them, not when a collector comes."""
-    part = lib.only(rough.rows.at(poses))
-    choice = select(part)
-    assert choice.benches
-    held = [weakref.ref(part.products), *map(weakref.ref, part.products.formed.values())]
-    gc.disable()
-    try:
-        del part, choice
-        assert [one() for one in held] == [None] * len(held)
-    finally:
-        gc.enable()
 
 
 def test_laws_leave_no_scene_behind(rough: Study) -> None:

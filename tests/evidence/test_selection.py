@@ -1,7 +1,6 @@
 """Selection by evidence: names what is there, nothing where nothing is, and knows its rivals."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +9,8 @@ from scipy.optimize import lsq_linear
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
-from minimax_cal.diagnosing import causes
 from minimax_cal.diagnosing.causes import chosen
 from minimax_cal.diagnosing.diagnose import resemblance
-from minimax_cal.diagnosing.established import Again
-from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
@@ -22,7 +18,6 @@ from minimax_cal.evidence.bench import Added, against_signs, bench, columns_of, 
 from minimax_cal.evidence.library import Kind
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.noise import restricted
-from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.ground.arrays import Array
@@ -76,26 +71,6 @@ def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
-
-
-def test_fifths_are_asked_of_what_was_told_before_the_search(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What all poses tuned a law to is no candidate of those that shall find it again."""
-    asked = []
-
-    def again(found: list[Finding], choice: Choice, *rest: Any) -> Again:
-        asked.append((choice, rest[1]))
-        return Again(tuple(found), 0.5)
-
-    monkeypatch.setattr(causes, "judged_again", again)
-    made = opened(Cause("target_shift", "smr2", 1000.0), seed=3)
-    told = {c.term.text for c in arm_library(made.scene, made.rows).candidates}
-    _, found = causes.causes_of(made, (), (), silent)
-    ((choice, lib),) = asked
-    assert {c.term.text for c in choice.chosen} - told  # its moment was tuned
-    assert {c.term.text for c in lib.candidates} <= told
-    assert lib is found.library
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
