@@ -13,6 +13,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.diagnosing.diagnose import diagnose
     from minimax_cal.diagnosing.many import diagnose_many
     from minimax_cal.diagnosing.result import Diagnosis
+    from minimax_cal.dynamics.logs import read_runs
+    from minimax_cal.dynamics.run import Run
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
     from minimax_cal.fitting.instruments.kinds import relative
@@ -68,6 +70,7 @@ __all__ = [
     "Options",
     "Robot",
     "RobotError",
+    "Run",
     "Simulation",
     "SimulatorGap",
     "Truth",
@@ -95,6 +98,7 @@ __all__ = [
     "minimize_max",
     "plan",
     "read_measurements",
+    "read_runs",
     "register",
     "relative",
     "report",
@@ -142,6 +146,8 @@ MODULES = {  # name: where it is defined
     "Diagnosis": "diagnosing.result",
     "diagnose": "diagnosing.diagnose",
     "diagnose_many": "diagnosing.many",
+    "Run": "dynamics.run",
+    "read_runs": "dynamics.logs",
     "plan": "planning.plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from minimax_cal.cli.options import (
     JSON,
@@ -22,7 +23,11 @@ from minimax_cal.cli.options import (
     show,
     with_output,
 )
+from minimax_cal.dynamics.logs import LogFiles, are_logs, import_logs, runs_text
+from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
@@ -85,8 +90,14 @@ def import_command(
 ) -> int:
     """Read FILEs of a tracker or controller as they are, show what was understood, write CSV.
 
+    Files of joints with torques or currents in time are logs of motions, which `torques` reads.
     Without -o nothing is written.
     """
+    if joints is None and not chosen["columns"] and are_logs(files):
+        unused = {"leave_out": leave_out, "layout": layout, "decimal": decimal}
+        if name := next((name for name, value in unused.items() if value), ""):
+            raise OptionError(f"{name}= is about measured points, and {files[0]} is a log")
+        return show_logs(import_logs(files, units=chosen["units"]), to, safe_cells)
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
     found = replace(found, data=left_out(found.data, leave_out))
     check_finite(found.data)  # what is left of it
@@ -103,6 +114,58 @@ def import_command(
     show(found.files(), *found.columns())
     click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
     return 0
+
+
+def show_logs(found: LogFiles, to: Output, safe_cells: bool) -> int:
+    """Show what was understood of logs, and write them."""
+    to.write_rows(
+        lambda: to.cells(runs_text(found.runs, found.sliding), safe_cells),
+        lambda: json_text(log_content(found, to.path)),
+    )
+    to.notice(*found.notices)
+    if to.as_json:
+        click.echo(json_text(log_content(found, to.path)), nl=False)
+        return 0
+    rows = tuple(
+        (run.name, title, len(run.time), run.duration, 1.0 / step_of(run), columns[0], run.unit)
+        for run, title, columns in zip(found.runs, found.titles, found.columns, strict=True)
+    )
+    header = ("run", "format", "rows", "s", "rows a second", "first joint", "torque in")
+    total = sum(run.duration for run in found.runs)
+    many = f"{len(rows)} runs" if len(rows) > 1 else "1 run"
+    show(Table(f"{many}, {total:.1f} s, {found.runs[0].joints} joints", header, rows))
+    if not to.path:
+        click.echo("nothing written; add -o FILE")
+    return 0
+
+
+def step_of(run: Run) -> float:
+    """Typical time between rows [s]."""
+    return float(np.median(np.diff(run.time)))
+
+
+def log_content(found: LogFiles, output: Path | None) -> dict[str, object]:
+    """The JSON of the command for logs."""
+    return {
+        "schema": 1,
+        "output": str(output) if output else None,
+        "joints": found.runs[0].joints,
+        "unit": found.runs[0].unit,
+        "runs": [
+            {
+                "name": run.name,
+                "source": run.source,
+                "format": title,
+                "rows": len(run.time),
+                "duration_s": run.duration,
+                "step_s": step_of(run),
+                "payload_kg": run.payload,
+                "columns": list(columns),
+            }
+            for run, title, columns in zip(found.runs, found.titles, found.columns, strict=True)
+        ],
+        "notices": list(found.notices),
+    }
 
 
 def readable(text: str, path: Path | None) -> str:

@@ -94,6 +94,24 @@ def make() -> None:
     header = [*rows[0][:6], *(f"wire{i + 1}_mm" for i in range(4))]
     write("wires.csv", [header, *(list(map(str, [*a, *w])) for a, w in zip(q, wires, strict=True))])
 
+    motions()
+
+
+def motions() -> None:
+    """Logs of two motions, in the columns of this project and in those of UR."""
+    t = 0.02 * np.arange(150)
+    rng = np.random.default_rng(5)
+    for name, columns in (
+        ("log.csv", ("t_s", "q{}_rad", "qd{}_rad_s", "i{}_A", 1)),
+        ("rtde.csv", ("timestamp", "actual_q_{}", "actual_qd_{}", "actual_current_{}", 0)),
+    ):
+        time, *stems, first = columns
+        phase = rng.uniform(0.0, 6.0, 6) + t[:, None]
+        current = np.cos(phase) + 0.02 * rng.normal(size=(150, 6))
+        header = [time, *(str(stem).format(first + j) for stem in stems for j in range(6))]
+        table = np.column_stack([t, np.sin(phase), np.cos(phase), current])
+        write(name, [header, *([f"{value:.6g}" for value in row] for row in table)])
+
 
 def write(name: str, rows: list[list[str]]) -> None:
     """A CSV file."""

@@ -29,6 +29,7 @@ class Sheet:
 
     header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
     delimiter, decimal: empty where the text has no columns.
+    torn: lines that have fewer or more cells, where they were left out.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class Sheet:
     header: tuple[str, ...]
     line: Array
     cells: tuple[tuple[str, ...], ...]
+    torn: tuple[int, ...] = ()
 
     @property
     def width(self) -> int:
@@ -55,10 +57,11 @@ def open_text(path: Path | str) -> Sheet:
     return Sheet(path, text, encoding, "", "", (), np.empty(0, dtype=int), ())
 
 
-def cut(sheet: Sheet, decimal: str = "") -> Sheet:
+def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
     """The rows and columns of a text, by the delimiter and decimal sign found.  Raises DataError.
 
-    decimal: the sign, where the user told it.
+    decimal: the sign, where the user told it.  most_torn: share of rows that may be left out
+    because they have fewer or more cells than the others.
     """
     path, text = sheet.path, sheet.text
     numbered = [
@@ -77,18 +80,22 @@ def cut(sheet: Sheet, decimal: str = "") -> Sheet:
         if not rows:
             raise DataError(f"{path}: holds a header but no rows")
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
-    for number, row in rows:
-        if len(row) < width or any(row[width:]):
-            what = "the header has" if header else "most rows have"
-            raise DataError(
-                f"{path}:{number}: {len(trimmed(row))} cells, but {what} {width}; "
-                "complete the row or delete it"
-            )
-    line = np.array([number for number, _ in rows])
+    torn = [(number, row) for number, row in rows if len(row) < width or any(row[width:])]
+    if len(torn) > (max(1.0, most_torn * len(rows)) if most_torn else 0.0):
+        number, row = torn[0]
+        what = "the header has" if header else "most rows have"
+        raise DataError(
+            f"{path}:{number}: {len(trimmed(row))} cells, but {what} {width}; "
+            "complete the row or delete it"
+        )
+    lost = tuple(number for number, _ in torn)
+    rows = [(number, row) for number, row in rows if number not in lost] if lost else rows
+    line = np.array([number for number, _ in rows], dtype=int)
     cells = tuple(tuple(row[:width]) for _, row in rows)
     names = header or tuple(f"column {i + 1}" for i in range(width))
     sign = decimal or decimal_of(path, names, line, cells)
-    return replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
+    found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
+    return replace(found, torn=lost)
 
 
 def decoded(path: Path) -> tuple[str, str]:
@@ -110,6 +117,8 @@ def split_line(line: str, delimiter: str) -> list[str]:
     """The cells of a line."""
     if delimiter == " ":
         return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(delimiter)]
     row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [cell.strip() for cell in row]
 
@@ -159,6 +168,8 @@ def decimal_of(
     path: Path, names: tuple[str, ...], line: Array, cells: tuple[tuple[str, ...], ...]
 ) -> str:
     """The decimal sign, where the cells prove it.  Raises DataError."""
+    if not any("," in cell for row in cells for cell in row):
+        return "."
     comma, point, proven = "", "", False
     for number, row in zip(line, cells, strict=True):
         for name, cell in zip(names, row, strict=True):

@@ -1,0 +1,184 @@
+"""Logs of arms in motion, as controllers and recorders write them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from minimax_cal.dynamics.logs.bags import is_bag, read_bag
+from minimax_cal.dynamics.logs.draft import Draft, drafts_of
+from minimax_cal.dynamics.logs.faults import checked
+from minimax_cal.dynamics.logs.formats import is_log
+from minimax_cal.dynamics.logs.repeats import check_repeats
+from minimax_cal.dynamics.logs.table import Log, read_table
+from minimax_cal.dynamics.logs.write import runs_text
+from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.measuring.importers import units_of
+from minimax_cal.measuring.importers.reading import along_arm
+from minimax_cal.measuring.importers.sheet import cut, open_text
+
+__all__ = ["LogFiles", "are_logs", "import_logs", "read_runs", "runs_text"]
+
+
+@dataclass(frozen=True, eq=False)
+class LogFiles:
+    """runs: of all files.  titles: the format of each run's file.  sliding: (n,) by their columns.
+
+    columns: of each run, the joints' columns and those of torque or current.
+    """
+
+    runs: tuple[Run, ...]
+    titles: tuple[str, ...]
+    columns: tuple[tuple[str, ...], ...]
+    sliding: Array
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What is to be said of the files."""
+        return tuple(dict.fromkeys(text for run in self.runs for text in run.notices))
+
+
+def read_runs(
+    paths: Sequence[Path | str] | Path | str,
+    joints: Sequence[str] = (),
+    units: str | Sequence[str] | Mapping[str, str] = (),
+) -> tuple[Run, ...]:
+    """Runs of an arm from logs: CSV of this project, UR RTDE, ROS or LeRobot, or ROS bags.
+
+    Parameters
+    ----------
+    paths
+        Files; each is a trajectory, or holds several that a column `run` tells apart.
+    joints
+        Names of the robot's joints; their number is checked, and logs with names are put in
+        their order.
+    units
+        What a file does not tell, as ``q=deg``.
+
+    Returns
+    -------
+    tuple of Run
+        In radians, metres, seconds, and N m (N) or A.
+
+    Raises
+    ------
+    DataError
+        For a file that cannot be read, or whose rows cannot be (units, order, commands, gaps).
+
+    Examples
+    --------
+    >>> runs = mc.read_runs(["run1.csv", "run2.csv"])
+    """
+    return import_logs(paths, joints, units).runs
+
+
+def import_logs(
+    paths: Sequence[Path | str] | Path | str,
+    joints: Sequence[str] = (),
+    units: str | Sequence[str] | Mapping[str, str] = (),
+) -> LogFiles:
+    """The runs of logs, and how the files were understood; as `read_runs`."""
+    several = [paths] if isinstance(paths, Path | str) else list(paths)
+    files = [Path(path) for path in several]
+    if not files:
+        raise OptionError("name a log to read")
+    if twice := [path for i, path in enumerate(files) if path in files[:i]]:
+        raise DataError(f"{twice[0]}: is given twice; give each log once")
+    given = (
+        units
+        if isinstance(units, Mapping)
+        else units_of([units] if isinstance(units, str) else units)
+    )
+    drafts: list[Draft] = []
+    for path in files:
+        name = path.stem if [p.stem for p in files].count(path.stem) == 1 else str(path)
+        for log in read_bag(path) if is_bag(path) else [read_table(path, given)]:
+            drafts += map(checked, drafts_of(in_order(log, joints), name))
+    same_arm(drafts)
+    check_repeats(drafts)
+    return LogFiles(
+        runs=tuple(draft.run() for draft in drafts),
+        titles=tuple(draft.log.title for draft in drafts),
+        columns=tuple((*d.log.headers["q"], *d.log.headers[d.kind]) for d in drafts),
+        sliding=drafts[0].log.sliding,
+    )
+
+
+def in_order(log: Log, joints: Sequence[str]) -> Log:
+    """The log with its joints in the robot's order, where names tell.  Raises DataError."""
+    n = log.values["q"].shape[1]
+    found = order_by_names(log.joints, joints)
+    if found is not None:
+        others = [name for i, name in enumerate(log.joints) if i not in found]
+        said = [f"{log.source}: joints {', '.join(others)} are not the robot's: left out"]
+        log = replace(log, notices=(*log.notices, *(said if others else ())))
+        return log.taking(found)
+    if joints and n != len(joints):
+        names = f" ({', '.join(log.joints)})" if log.joints else ""
+        raise DataError(f"{log.source}: has {n} joints{names}, but the robot has {len(joints)}")
+    if not log.joints:
+        return log
+    along = along_arm([name if name.endswith("_joint") else f"{name}_joint" for name in log.joints])
+    named = [name if name.endswith("_joint") else f"{name}_joint" for name in log.joints]
+    order = [named.index(name) for name in along]
+    names = ", ".join(log.joints[i] for i in order)
+    how = "along the arm" if order != list(range(n)) else "as in the file; check their order"
+    said = [f"{log.source}: joints 1 to {n} are {names}, {how}"]
+    return replace(log, notices=(*log.notices, *said)).taking(order)
+
+
+def order_by_names(names: Sequence[str], joints: Sequence[str]) -> list[int] | None:
+    """Which of a log's joints are the robot's, in its order; None where names do not tell."""
+    if not names or not joints:
+        return None
+    found = []
+    for joint in joints:
+        same = [i for i, name in enumerate(names) if name == joint]
+        same = same or [
+            i for i, name in enumerate(names) if name.endswith(joint) or joint.endswith(name)
+        ]
+        if len(same) != 1:
+            return None
+        found.append(same[0])
+    return found if len(set(found)) == len(joints) else None
+
+
+def same_arm(drafts: Sequence[Draft]) -> None:
+    """Raise DataError where files have other joints than the first."""
+    first = drafts[0]
+    for draft in drafts:
+        if draft.q.shape[1] != first.q.shape[1] or (draft.log.sliding != first.log.sliding).any():
+            raise DataError(
+                f"{draft.log.source}: has other joints than {first.log.source}; give logs of one "
+                "arm"
+            )
+        if draft.kind != first.kind:
+            raise DataError(
+                f"{draft.log.source}: holds {'torques' if draft.kind == 'tau' else 'currents'}, "
+                f"unlike {first.log.source}; log the same of all runs"
+            )
+
+
+def are_logs(paths: Sequence[Path | str]) -> bool:
+    """Whether all files are logs of a motion, as their columns say."""
+    return all(is_bag(Path(path)) or looks_like_log(Path(path)) for path in paths)
+
+
+def looks_like_log(path: Path) -> bool:
+    """Whether the header of a text file, or its lack, is that of a log."""
+    try:
+        sheet = open_text(path)
+        head = "\n".join(sheet.text.lstrip("%").splitlines()[:50])
+        sheet = cut(replace(sheet, text=head), most_torn=1.0)
+    except DataError:
+        return False
+    if sheet.header:
+        return is_log(sheet.header)
+    cells = sheet.cells[0] if sheet.cells else ()
+    words = sum(cell.replace("_", "a").isalpha() for cell in cells[3:])
+    return (
+        len(cells) > 3 and words > 0 and len(cells) in (3 + 2 * words, 3 + 3 * words, 3 + 4 * words)
+    )

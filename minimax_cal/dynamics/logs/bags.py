@@ -1,0 +1,91 @@
+"""Logs of ROS: bags of ROS 1, directories and files of ROS 2, and MCAP; `rosbags` reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.logs.formats import SI
+from minimax_cal.dynamics.logs.table import Log
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.optional import optional
+
+ENDINGS = (".bag", ".mcap", ".db3")
+METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
+STATE = "sensor_msgs/msg/JointState"
+MEMBERS = {"q": "position", "qd": "velocity", "tau": "effort"}
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: by its ending, or a folder with the metadata of one."""
+    return path.suffix.lower() in ENDINGS or (path / METADATA).is_file()
+
+
+def read_bag(path: Path) -> list[Log]:
+    """The joint states of a bag, one log a topic with efforts.  Raises DataError, OptionError."""
+    rosbags = optional("rosbags.highlevel", "reading a bag", "minimax-cal[logs]")
+    typesys = optional("rosbags.typesys", "reading a bag", "minimax-cal[logs]")
+    if not path.exists():
+        raise DataError(f"{path}: cannot be read (No such file or directory)")
+    try:
+        types = typesys.get_typestore(typesys.Stores.LATEST)
+        with rosbags.AnyReader([path], default_typestore=types) as reader:
+            topics = {c.topic: c for c in reader.connections if c.msgtype == STATE}
+            messages = [
+                (c.topic, stamp, reader.deserialize(raw, STATE))
+                for c, stamp, raw in (reader.messages(list(topics.values())) if topics else ())
+            ]
+    except Exception as error:  # of a broken file the parser of another package raises anything
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"{path}: cannot be read as a bag ({why})") from error
+    by_topic = {topic: [(t, m) for at, t, m in messages if at == topic] for topic in topics}
+    logs = {topic: log_of(path, topic, found) for topic, found in by_topic.items() if found}
+    with_effort = [log for log in logs.values() if "tau" in log.values]
+    if not with_effort:
+        held = "no JointState" if not logs else f"no effort in {', '.join(logs)}"
+        raise DataError(f"{path}: holds {held}; record /joint_states with effort")
+    if len(with_effort) > 1:
+        names = " and ".join(topic for topic, log in logs.items() if "tau" in log.values)
+        raise DataError(f"{path}: holds efforts in {names}; record one of them")
+    return with_effort
+
+
+def log_of(path: Path, topic: str, messages: Sequence[tuple[int, Any]]) -> Log:
+    """The messages of one topic as columns; messages of other joints than the first are left out.
+
+    messages: time of reception [ns], message.
+    """
+    names = tuple(messages[0][1].name)
+    same = [(t, m) for t, m in messages if tuple(m.name) == names and len(m.position) == len(names)]
+    if not same:
+        raise DataError(f"{path}: {topic} holds no positions; record /joint_states with them")
+    stamped = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in same]
+    received = [1e-9 * (t - same[0][0]) for t, _ in same]
+    time = np.array(stamped if any(stamped) else received) - (stamped[0] if any(stamped) else 0.0)
+    values: dict[str, Array] = {"t": time}
+    for kind, member in MEMBERS.items():
+        rows = [np.asarray(getattr(m, member), dtype=float) for _, m in same]
+        if all(len(row) == len(names) for row in rows):
+            values[kind] = np.array(rows)
+    other = len(messages) - len(same)
+    said = (
+        f"{path}: {other} messages of {topic} have other joints than {', '.join(names)}: left out"
+    )
+    return Log(
+        source=str(path),
+        title="ROS bag",
+        line=np.arange(1, len(same) + 1),
+        values=values,
+        headers={
+            kind: tuple(f"{MEMBERS[kind]} of {n}" for n in names)
+            for kind in values
+            if kind in MEMBERS
+        },
+        units={kind: (SI[kind],) * len(names) for kind in values if kind in MEMBERS},
+        joints=names,
+        notices=(said,) if other else (),
+    )

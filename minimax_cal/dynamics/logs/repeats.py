@@ -1,0 +1,59 @@
+"""Runs that are one, and torques that repeat to the digit while the motion does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from minimax_cal.dynamics.logs.draft import Draft
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+
+WORD = 4  # rows that have to follow each other alike
+MOST_ALIKE = 0.2  # share of a run's words of torque that may stand elsewhere
+
+
+def words(values: Array) -> list[bytes]:
+    """Rows that follow each other, WORD at a time, as texts; repeated rows count once."""
+    fresh = np.append(True, np.any(np.diff(values, axis=0) != 0.0, axis=1))
+    rows = np.ascontiguousarray(values[fresh])
+    return [rows[i : i + WORD].tobytes() for i in range(len(rows) - WORD + 1)]
+
+
+def check_repeats(drafts: Sequence[Draft]) -> None:
+    """Raise DataError for a run given twice, or torques equal to the digit in other motions."""
+    of_torque = [set(words(draft.torque)) for draft in drafts]
+    of_motion = [set(words(draft.q)) for draft in drafts]
+    for a, b in combinations(range(len(drafts)), 2):
+        few = min(len(of_torque[a]), len(of_torque[b]))
+        if len(of_torque[a] & of_torque[b]) <= MOST_ALIKE * few:
+            continue
+        one, other = drafts[a], drafts[b]
+        few = min(len(of_motion[a]), len(of_motion[b]))
+        if len(of_motion[a] & of_motion[b]) > MOST_ALIKE * few:
+            raise DataError(
+                f"{other.log.source}: run {other.name} holds rows of {one.name}; give each once"
+            )
+        raise DataError(
+            f"{other.log.source}: torques of run {other.name} equal those of {one.name} to the "
+            "digit, but the motions differ: they are commands; log the measured ones"
+        )
+    for draft, torque in zip(drafts, of_torque, strict=True):
+        if within(draft, torque):
+            raise draft.error(
+                "torques repeat to the digit while the motion differs: they are commands; log the "
+                "measured ones"
+            )
+
+
+def within(draft: Draft, torque: set[bytes]) -> bool:
+    """Whether torques of one run repeat to the digit, and its motion does not."""
+    said, moved = words(draft.torque), words(draft.q)
+    repeated = len(said) - len(torque)
+    return (
+        len(said) > WORD
+        and repeated > MOST_ALIKE * len(said)
+        and len(moved) - len(set(moved)) < 0.5 * repeated
+    )

@@ -1,0 +1,482 @@
+"""Logs: columns of several tools, and the faults that logs have, each in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import SHARED
+from dynamics.motions import fourier
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.dynamics.logs import are_logs, import_logs, read_runs, runs_text
+from minimax_cal.dynamics.logs.with_robot import against_robot, gravity
+from minimax_cal.ground.arrays import Array
+
+N = 3
+WRITTEN = 1e-6  # rounding of the numbers in the files
+NAMES = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint",
+         "wrist_2_joint", "wrist_3_joint")  # fmt: skip
+Columns = dict[str, Array]
+
+
+def motion(seed: int = 1, n: int = N, rows: int = 600, rate: float = 100.0) -> Columns:
+    """Time, joints, speeds and noisy torques of a simulated run."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / rate
+    q, qd, qdd = fourier(rng, t, n, rate=0.3)
+    tau = 20.0 * np.cos(q) + 3.0 * np.sign(qd) + 2.0 * qdd + 0.1 * rng.normal(size=q.shape)
+    return {"t": t, "q": q, "qd": qd, "tau": tau}
+
+
+def house(made: Columns, *, angle: str = "rad", torque: str = "tau{}_Nm") -> Columns:
+    """The columns of this project."""
+    out: Columns = {"t_s": made["t"]}
+    factor = {"rad": 1.0, "deg": 180.0 / np.pi}[angle]
+    for j in range(made["q"].shape[1]):
+        out[f"q{j + 1}_{angle}"] = factor * made["q"][:, j]
+        if "qd" in made:
+            out[f"qd{j + 1}_{angle}_s"] = factor * made["qd"][:, j]
+        out[torque.format(j + 1)] = made["tau"][:, j]
+    return out
+
+
+def write(path: Path, columns: dict[str, Any], delimiter: str = ",") -> Path:
+    """A file of columns."""
+    cells = [
+        [v if isinstance(v, str) else f"{v:.7g}" for v in column] for column in columns.values()
+    ]
+    rows = [delimiter.join(columns), *(delimiter.join(row) for row in zip(*cells, strict=True))]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_the_houses_columns(tmp_path: Path) -> None:
+    made = motion()
+    columns = house(made, angle="deg")
+    columns |= {"payload_kg": np.full(600, 2.0), "temperature1_C": np.full(600, 30.0)}
+    columns |= {"temperature2_C": np.full(600, 31.0), "temperature3_C": np.full(600, 32.0)}
+    (run,) = read_runs(write(tmp_path / "a.csv", columns))
+    assert (run.name, run.unit, run.payload, run.notices) == ("a", "N m", 2.0, ())
+    assert run.qd is not None
+    assert run.temperature is not None
+    assert run.temperature.shape == (600, 3)
+    assert_allclose(run.time, made["t"], atol=WRITTEN)
+    assert_allclose(run.q, made["q"], atol=1e-5)
+    assert_allclose(run.qd, made["qd"], atol=1e-4)
+    assert_allclose(run.torque, made["tau"], atol=1e-4)
+
+
+def test_currents_runs_and_milliamperes(tmp_path: Path) -> None:
+    a, b = house(motion(1), torque="i{}_mA"), house(motion(2), torque="i{}_mA")
+    both: dict[str, Any] = {name: np.concatenate([a[name], b[name]]) for name in a}
+    both["run"] = ["slow"] * 600 + ["quick"] * 600
+    slow, quick = read_runs(write(tmp_path / "x.csv", both))
+    assert (slow.name, quick.name, slow.unit) == ("x:slow", "x:quick", "A")
+    assert quick.time[0] == 0.0
+    assert_allclose(quick.torque, 1e-3 * motion(2)["tau"], atol=WRITTEN)
+
+
+def test_rtde_with_spaces_and_many_columns(tmp_path: Path) -> None:
+    made = motion(n=6)
+    columns: Columns = {"timestamp": made["t"] + 4711.0}
+    for stem, values in (("actual_q", made["q"]), ("actual_qd", made["qd"]),
+                         ("target_q", made["q"] + 1e-4), ("target_qdd", made["q"]),
+                         ("target_current", made["tau"] - 0.3), ("actual_current", made["tau"]),
+                         ("joint_temperatures", 0.0 * made["q"] + 30.0)):  # fmt: skip
+        columns |= {f"{stem}_{j}": values[:, j] for j in range(6)}
+    columns |= {"robot_mode": np.full(600, 7.0), "payload": np.full(600, 1.5)}
+    path = write(tmp_path / "ur.csv", columns, " ")
+    found = import_logs(path)
+    (run,) = found.runs
+    assert found.titles == ("UR RTDE",)
+    assert (run.unit, run.payload, run.notices, run.qdd) == ("A", 1.5, (), None)
+    assert_allclose(run.q, made["q"], atol=WRITTEN)
+    assert are_logs([path])
+
+
+@pytest.mark.parametrize(
+    "form", ["{}[{}]", "/joint_states/{}[{}]", "/joint_states/{1}/{0}", "{}{}"]
+)
+def test_ros_in_tables(tmp_path: Path, form: str) -> None:
+    made = motion(n=6)
+    by_name = "{1}" in form
+    order = np.argsort(NAMES)  # a driver sorts by alphabet
+    columns: dict[str, Any] = {"__time": made["t"] + 1.6e9}
+    columns["__time"] = [f"{t:.6f}" for t in columns["__time"]]
+    for word, values in (
+        ("position", made["q"]),
+        ("velocity", made["qd"]),
+        ("effort", made["tau"]),
+    ):
+        for i, j in enumerate(order):
+            columns[form.format(word, NAMES[j] if by_name else i)] = values[:, j]
+    if not by_name:
+        columns |= {form.format("name", i): [NAMES[j]] * 600 for i, j in enumerate(order)}
+    for joints in ((), NAMES):
+        (run,) = read_runs(write(tmp_path / "ros.csv", columns), joints)
+        assert_allclose(run.q, made["q"], atol=WRITTEN)
+        assert_allclose(run.torque, made["tau"], atol=1e-4)
+        assert [("along the arm" in text) for text in run.notices] == ([] if joints else [True])
+
+
+def test_ros2_topic_echo(tmp_path: Path) -> None:
+    made = motion(n=2)
+    rows = [
+        ",".join(map(str, [170000000 + int(t), round(1e9 * (t % 1)), "base", "lift", "turn",
+                           *np.round([*q, *v, *tau], 7)]))
+        for t, q, v, tau in zip(made["t"], made["q"], made["qd"], made["tau"], strict=True)
+    ]  # fmt: skip
+    path = tmp_path / "echo.csv"
+    path.write_text("\n".join(rows))
+    (run,) = read_runs(path, ("turn", "lift"))
+    assert_allclose(run.time, made["t"], atol=WRITTEN)
+    assert_allclose(run.q, made["q"][:, ::-1], atol=WRITTEN)
+    assert are_logs([path])
+
+
+def test_rostopic_echo_p_in_nanoseconds(tmp_path: Path) -> None:
+    made = motion()
+    columns: dict[str, Any] = {
+        "%time": [str(1600000000000000000 + round(1e9 * t)) for t in made["t"]]
+    }
+    for word, values in (("position", made["q"]), ("effort", made["tau"])):
+        columns |= {f"field.{word}{j}": values[:, j] for j in range(N)}
+    (run,) = read_runs(write(tmp_path / "p.csv", columns))
+    assert_allclose(run.time, made["t"], atol=WRITTEN)
+    assert run.qd is None
+
+
+def test_lerobot_says_no_unit(tmp_path: Path) -> None:
+    made = motion()
+
+    def vectors(values: Array) -> list[str]:
+        return ['"[' + ", ".join(f"{v:.7g}" for v in row) + ']"' for row in values]
+
+    columns = {"episode_index": ["0"] * 600, "timestamp": made["t"],
+               "observation.state": vectors(np.degrees(made["q"])),
+               "observation.effort": vectors(made["tau"])}  # fmt: skip
+    path = write(tmp_path / "le.csv", columns)
+    with pytest.raises(mc.DataError, match=r"observation.state: has no unit; add units='q=deg'"):
+        read_runs(path)
+    (run,) = read_runs(path, units="q=deg")
+    assert_allclose(run.q, made["q"], atol=1e-5)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    mm = {"q2_rad": "q2_mm", "qd2_rad_s": "qd2_mm_s"}
+    slides = {mm.get(n, n): v * (1e3 if n in mm else 1.0) for n, v in house(motion(4)).items()}
+    slides["tau2_N"] = slides.pop("tau2_Nm")
+    other = {n: v[::-1] + 0.001 for n, v in slides.items() if not n.startswith("qd")}
+    other["t_s"] = slides["t_s"]
+    found = import_logs([write(tmp_path / "a.csv", slides), write(tmp_path / "b.csv", other)])
+    assert found.sliding.tolist() == [False, True, False]
+    (tmp_path / "both.csv").write_text(runs_text(found.runs, found.sliding))
+    again = import_logs(tmp_path / "both.csv")
+    assert [run.name for run in again.runs] == ["both:a", "both:b"]
+    assert again.sliding.tolist() == found.sliding.tolist()
+    for one, two in zip(found.runs, again.runs, strict=True):
+        assert_allclose(one.q, two.q, atol=1e-8)
+        assert_allclose(one.torque, two.torque, atol=1e-6)
+        assert (one.qd is None) == (two.qd is None)
+
+
+def test_real_logs_read_without_a_complaint() -> None:
+    files = sorted((SHARED / "ur10e_torque").glob("*.csv"))
+    if not files:
+        pytest.skip("no shared data")
+    runs = read_runs(files, [f"J{i}" for i in range(1, 7)])
+    assert [run.notices for run in runs] == [()] * 7
+    assert {run.unit for run in runs} == {"A"}
+    assert min(run.duration for run in runs) > 25.0
+
+
+# ---- faults ------------------------------------------------------------------------------------
+
+Change = Callable[[Columns], None]
+
+
+def times_back(c: Columns) -> None:
+    c["t_s"][300:] -= 3.0
+
+
+def degrees_with_speeds(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"q{j}_rad"] *= 5.0  # two turns of degrees are soon passed; keep these within
+        c[f"qd{j}_rad_s"] *= 5.0 * np.pi / 180.0
+
+
+def degrees_alone(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"q{j}_rad"] *= 180.0 / np.pi
+        del c[f"qd{j}_rad_s"]
+
+
+def speeds_in_degrees(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"qd{j}_rad_s"] *= 180.0 / np.pi
+
+
+def radians_called_degrees(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"q{j}_deg"] = c.pop(f"q{j}_rad")
+        c[f"qd{j}_deg_s"] = c.pop(f"qd{j}_rad_s")
+
+
+def wrong_order(c: Columns) -> None:
+    c["q1_rad"], c["q2_rad"] = c["q2_rad"], c["q1_rad"]
+
+
+def wrong_sign(c: Columns) -> None:
+    c["q2_rad"] *= -1.0
+
+
+def command_beside(c: Columns) -> None:
+    c["tau2_cmd_Nm"] = c["tau2_Nm"]
+    c["tau1_cmd_Nm"] = c["tau1_Nm"] + 0.1
+    c["tau3_cmd_Nm"] = c["tau3_Nm"] + 0.1
+
+
+def constant(c: Columns) -> None:
+    c["tau3_Nm"][:] = 0.0
+
+
+def nothing_moves(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"q{j}_rad"][:] = 0.5
+
+
+def jump(c: Columns) -> None:
+    c["q1_rad"][200:] += 1.5
+
+
+def commands_repeat(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"tau{j}_Nm"][300:] = c[f"tau{j}_Nm"][:300]
+
+
+def milliseconds(c: Columns) -> None:
+    c["t_s"] *= 1e3
+
+
+def two_units(c: Columns) -> None:
+    c["q2_deg"] = np.degrees(c.pop("q2_rad"))
+
+
+def no_torque(c: Columns) -> None:
+    for j in range(1, N + 1):
+        del c[f"tau{j}_Nm"]
+
+
+def only_commands(c: Columns) -> None:
+    for j in range(1, N + 1):
+        c[f"tau{j}_cmd_Nm"] = c.pop(f"tau{j}_Nm")
+
+
+def payload_changes(c: Columns) -> None:
+    c["payload_kg"] = np.where(c["t_s"] < 3.0, 0.0, 2.0)
+
+
+def joint_lacks(c: Columns) -> None:
+    del c["q2_rad"]
+
+
+def torque_lacks(c: Columns) -> None:
+    del c["tau2_Nm"]
+
+
+def same_column(c: Columns) -> None:
+    c["tau2_N"] = c["tau2_Nm"]
+
+
+REFUSED: list[tuple[Change, str]] = [
+    (times_back, r"x.csv:302: time runs back from 2.99 to 0 s; give each run a file or a label"),
+    (degrees_with_speeds, r"q\d_rad changes by 57.\d times what qd\d_rad_s says; .* in degrees"),
+    (degrees_alone, r"x.csv:\d+: column q\d_rad: -?\d.* rad is more than two turns; degrees\?"),
+    (speeds_in_degrees, r"changes by 0.017\d times what qd\d_rad_s says; .* qd1_deg_s"),
+    (radians_called_degrees, r"no joint moves more than [1-6]\.?\d? deg; radians\?"),
+    (
+        wrong_order,
+        r"column qd[12]_rad_s is the speed of q[12]_rad, not of q[12]_rad; put the joints",
+    ),
+    (wrong_sign, r"column qd2_rad_s has another sign than the change of q2_rad"),
+    (command_beside, r"column tau2_Nm equals tau2_cmd_Nm in all rows: it is the command"),
+    (constant, r"column tau3_Nm is 0 in all rows; the driver does not report it"),
+    (nothing_moves, r"no joint moves; log a motion"),
+    (jump, r"x.csv:202: column q1_rad jumps by 1.5\d* in 10 ms; delete the row"),
+    (commands_repeat, r"torques repeat to the digit while the motion differs: they are commands"),
+    (milliseconds, r"steps of 10 s are no log of a motion; name it t_ms"),
+    (two_units, r"x.csv:1: joint columns mix _rad and _deg"),
+    (no_torque, r"x.csv:1: no column of torque or current; drive this motion and log tau1_Nm"),
+    (only_commands, r"x.csv:1: tau1_cmd_Nm is the command; add the measured torque"),
+    (payload_changes, r"the payload changes from 0 to 2 kg within a run"),
+    (joint_lacks, r"x.csv:1: joint 2 has no column, but q3_rad is there"),
+    (torque_lacks, r"x.csv:1: joint column q2_rad has no torque or current beside tau1_Nm"),
+    (same_column, r"x.csv:1: tau2_Nm and tau2_N are one column"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), REFUSED, ids=[c.__name__ for c, _ in REFUSED])
+def test_faults_that_are_refused(tmp_path: Path, change: Change, message: str) -> None:
+    columns = house(motion())
+    assert read_runs(write(tmp_path / "x.csv", columns))[0].notices == ()
+    change(columns)
+    with pytest.raises(mc.DataError, match=message) as caught:
+        read_runs(write(tmp_path / "x.csv", columns))
+    assert "\n" not in str(caught.value)
+
+
+def gap(c: Columns) -> None:
+    c["t_s"][300:] += 0.5
+
+
+def uneven(c: Columns) -> None:
+    c["t_s"][1::2] += 0.008
+
+
+def wrapped(c: Columns) -> None:
+    c["q1_rad"][:] = (c["q1_rad"] + 1.0 + np.pi) % (2.0 * np.pi) - np.pi - 1.0
+    c["q1_rad"][350:] += 2.0 * np.pi
+
+
+def clipped(c: Columns) -> None:
+    c["tau2_Nm"][:] = np.minimum(c["tau2_Nm"], np.quantile(c["tau2_Nm"], 0.9))
+
+
+def noiseless(c: Columns) -> None:
+    c["tau2_Nm"][:] = 20.0 * np.cos(c["q2_rad"])
+
+
+def still(c: Columns) -> None:
+    c["q2_rad"][:], c["qd2_rad_s"][:] = 0.5, 0.0
+
+
+def dead_speeds(c: Columns) -> None:
+    c["qd2_rad_s"][:] = 0.0
+
+
+def speed_of_nothing(c: Columns) -> None:
+    c["qd2_rad_s"][:] = np.random.default_rng(3).normal(size=600)
+
+
+def same_stamps(c: Columns) -> None:
+    c["t_s"][100] = c["t_s"][99]
+
+
+def slowly(c: Columns) -> None:
+    c["t_s"] *= 10.0
+    for j in range(1, N + 1):
+        c[f"qd{j}_rad_s"] /= 10.0
+
+
+def misspelt(c: Columns) -> None:
+    c["qdd1_rads2"] = c["q1_rad"]
+
+
+REPORTED: list[tuple[Change, str]] = [
+    (gap, r"1 gaps in time, the longest 0.51 s \(line 302\)"),
+    (uneven, r"uneven time steps \(2 to 18 ms\)"),
+    (wrapped, r"column q1_rad jumps by whole turns \(lines? \d+.*\): unwrapped"),
+    (clipped, r"column tau2_Nm is cut off at [\d.]+ N m in \d\d rows"),
+    (noiseless, r"no noise in tau2_Nm: a command, a filtered or a simulated signal"),
+    (still, r"no motion in q2_rad: nothing is learnt of it"),
+    (dead_speeds, r"column qd2_rad_s is the same in all rows: not used"),
+    (speed_of_nothing, r"column qd2_rad_s does not follow q2_rad \(correlation -?0.\d+\)"),
+    (same_stamps, r"1 rows repeat the time of the row before: left out \(line 102\)"),
+    (slowly, r"only 10 rows a second"),
+    (misspelt, r"column qdd1_rads2 is not used \(did you mean qdd1_rad_s2\?\)"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), REPORTED, ids=[c.__name__ for c, _ in REPORTED])
+def test_faults_that_are_mended_or_said(tmp_path: Path, change: Change, message: str) -> None:
+    columns = house(motion())
+    before = read_runs(write(tmp_path / "x.csv", columns))[0]
+    change(columns)
+    (run,) = read_runs(write(tmp_path / "x.csv", columns))
+    assert [bool(re.search(message, text)) for text in run.notices] == [True]
+    if change is wrapped:
+        turns = (run.q - before.q) / (2.0 * np.pi)
+        assert_allclose(turns, np.broadcast_to(np.round(turns[0]), turns.shape), atol=1e-5)
+
+
+def test_torn_lines(tmp_path: Path) -> None:
+    lines = write(tmp_path / "x.csv", house(motion())).read_text().splitlines()
+    lines[100], lines[200] = lines[100][:30], lines[200].replace(",", ",0.1-", 1)
+    (tmp_path / "x.csv").write_text("\n".join([*lines[:-1], lines[-1][:20]]))
+    (run,) = read_runs(tmp_path / "x.csv")
+    assert run.notices == (f"{tmp_path}/x.csv: 3 torn lines are left out (101, 201, 601)",)
+    assert len(run.time) == 597
+    torn = [line[:30] if i % 20 == 3 else line for i, line in enumerate(lines[:601])]
+    (tmp_path / "x.csv").write_text("\n".join(torn))
+    with pytest.raises(mc.DataError, match=r"x.csv:4: \d cells, but the header has 10"):
+        read_runs(tmp_path / "x.csv")
+
+
+def test_too_short(tmp_path: Path) -> None:
+    with pytest.raises(mc.DataError, match=r"60 rows in 0.59 s are too short for a run"):
+        read_runs(write(tmp_path / "x.csv", house(motion(rows=60))))
+
+
+def test_between_runs(tmp_path: Path) -> None:
+    one, other = house(motion(1)), house(motion(2))
+    first = write(tmp_path / "a.csv", one)
+    with pytest.raises(mc.DataError, match=r"a.csv: is given twice"):
+        read_runs([first, first])
+    copy = write(tmp_path / "b.csv", one)
+    with pytest.raises(mc.DataError, match=r"b.csv: run b holds rows of a; give each once"):
+        read_runs([first, copy])
+    for j in range(1, N + 1):
+        other[f"tau{j}_Nm"] = one[f"tau{j}_Nm"]
+    with pytest.raises(
+        mc.DataError, match=r"equal those of a to the digit, but the motions differ"
+    ):
+        read_runs([first, write(tmp_path / "b.csv", other)])
+    with pytest.raises(mc.DataError, match=r"b.csv: holds currents, unlike"):
+        read_runs([first, write(tmp_path / "b.csv", house(motion(2), torque="i{}_A"))])
+    with pytest.raises(mc.DataError, match=r"a.csv: has 3 joints, but the robot has 6"):
+        read_runs(first, NAMES)
+
+
+def test_points_are_no_log(tmp_path: Path) -> None:
+    columns = house(motion()) | {f"smr1_{axis}_mm": np.arange(600.0) for axis in "xyz"}
+    assert not are_logs([write(tmp_path / "x.csv", columns)])
+    assert are_logs([write(tmp_path / "x.csv", house(motion()))])
+    (tmp_path / "x.csv").write_text("q1_deg,q2_deg\n1,2\n3,4\n")
+    assert not are_logs([tmp_path / "x.csv"])
+
+
+def heavy_run(robot: mc.Robot, gain: float) -> mc.Run:
+    """A run whose torques hold the arm's masses, and friction, by a factor."""
+    t = 0.01 * np.arange(500)
+    rng = np.random.default_rng(7)
+    q, qd, _ = fourier(rng, t, robot.joints, rate=0.2)
+    q = 0.3 * q
+    tau = gravity(robot, q) + 8.0 * np.sign(qd) + rng.normal(size=q.shape)
+    return mc.Run("a", "a.csv", t, q, None, None, gain * tau, "N m")
+
+
+def test_a_current_called_effort(robot: mc.Robot) -> None:
+    n = robot.joints
+    heavy = replace(robot, mass=np.full(n, 8.0), com=np.full((n, 3), 0.05))
+    assert against_robot(heavy, [heavy_run(heavy, 1.0)])[0].notices == ()
+    (run,) = against_robot(heavy, [heavy_run(heavy, 0.08)])
+    assert [bool(re.search(r"joint [23] is 0.08\d* times what holds .* a current\?", text))
+            for text in run.notices] == [True]  # fmt: skip
+    assert against_robot(heavy, [replace(run, unit="A", notices=())])[0].notices == ()
+    assert against_robot(robot, [replace(run, notices=())])[0].notices == ()  # no masses given
+
+
+def test_joints_outside_their_limits(robot: mc.Robot) -> None:
+    run = heavy_run(replace(robot, mass=np.full(robot.joints, 8.0), com=np.zeros((6, 3))), 1.0)
+    off = replace(run, q=run.q + np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0]))
+    (told,) = against_robot(robot, [off])[0].notices
+    assert re.search(r"a.csv: joint 2 moves from .* deg, outside the limits of", told)
+    with pytest.raises(mc.DataError, match=r"a.csv: has 5 joints, but .* has 6"):
+        against_robot(robot, [replace(run, q=run.q[:, :5])])
