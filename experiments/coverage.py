@@ -211,7 +211,7 @@ def run(batch: Batch) -> Runs:
         if not np.array_equal(fit.identification.active, active):
             continue
         axes = fit.nominal.rotation
-        error = (fit.state.along(axes) - true.state.along(axes))[active]
+        error = (fit.state.along(axes, robot) - true.state.along(axes, robot))[active]
         told = (fit.uncertainty, known_by_noise(fit))
         cell = Cell.of(robot, fit.state, arm.target_names)
         inside = [positions(cell, known, ideal, case, rng) for known in told]
@@ -314,7 +314,7 @@ def resampled(batch: Batch) -> tuple[Array, Array]:
         if not np.array_equal(found.place, place):
             continue
         low, high = found.interval(LEVEL).T
-        truth = true.state.along(fit.before.base[:3, :3])[place]
+        truth = true.state.along(fit.before.base[:3, :3], robot)[place]
         held.append((low <= truth) & (truth <= high))
         q = random_poses(robot, WORKSPACE, rng)
         low, high = found.position_interval(q, LEVEL)

@@ -301,7 +301,7 @@ def path_of(
         data = Measurements(q, nowhere, (), sliding, rows, {}, source="targets")
     if not data.poses:
         raise DataError(f"{data.source}: holds no targets")
-    check_joints(robot, data)
+    data = check_joints(robot, data)
     check_columns(data)
     data = data if ordered(data) else data.in_visit_order()  # a path is in its order
     return replace(data, columns={**data.columns, "clock": np.full(data.poses, clock)})
@@ -351,7 +351,7 @@ def placed(
     q = random_poses(nominal, SAMPLE, np.random.default_rng(0))
     turn, moved = bent(arm, still(q, arm.target_names, arm.robot))
     flange = moved @ kinematics.forward(
-        arm.robot.mdh, q * arm.robot.sign + turn, arm.robot.prismatic
+        arm.robot.mdh, arm.robot.turned(q) + turn, arm.robot.prismatic
     )
     pose, tool = nominal.pose(q), np.eye(4)
     for _ in range(1 if frame == "flange" else 50):

@@ -116,7 +116,7 @@ def diagnose(
     for name in exclude:
         if name not in EFFECTS:
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
-    checks.check_joints(robot, given)
+    given = checks.check_joints(robot, given)
     checks.check_spread(robot, given)
     options = DiagnosisOptions(seed, holdout, holdout_by, instrument, tuple(exclude), quick)
     raw = with_groups(with_history(with_instrument(given, instrument)))

@@ -105,7 +105,7 @@ class Site:
         """The scene of all rows of the plan."""
         robot, base = self.scene.robot, (self.scene.rotation, self.scene.origin)
         data = self.plan.data
-        return Scene.of(robot, data, base, self.scene.target_positions, data.q * robot.sign)
+        return Scene.of(robot, data, base, self.scene.target_positions, robot.turned(data.q))
 
     @cached_property
     def turned(self) -> Rows:
@@ -126,7 +126,7 @@ class Site:
         k, _, m = self.whole.points.shape
         model = replace(
             self.model,
-            q=self.plan.data.q * self.scene.robot.sign,
+            q=self.scene.robot.turned(self.plan.data.q),
             y=np.zeros((k, 3, m)),
             weight=self.plan.weight,
         )
@@ -307,7 +307,7 @@ def predicted(scene: Scene, data: Measurements) -> dict[str, Array]:
     if not scene.measured_torques:
         return {}
     robot, base = scene.robot, (scene.rotation, scene.origin)
-    there = Scene.of(robot, data, base, scene.target_positions, data.q * robot.sign)
+    there = Scene.of(robot, data, base, scene.target_positions, robot.turned(data.q))
     mass, com = scene.masses
     links = np.diag(mass)
     known, new = ([s.torque(one, com) for one in links] for s in (scene, there))

@@ -84,7 +84,7 @@ def regressor(robot: Robot, motion: Motion) -> Array:
 
     Newton and Euler, each link's wrench projected on the joints before it.
     """
-    q, qd, qdd = (part * robot.sign for part in (motion.q, motion.qd, motion.qdd))
+    q, qd, qdd = (robot.turned(part) for part in (motion.q, motion.qd, motion.qdd))
     links = chain(robot.mdh, np.ascontiguousarray(q), robot.prismatic)
     axes = link_axes(links)
     moving = link_motion(robot, links, qd, qdd)
@@ -102,7 +102,7 @@ def regressor(robot: Robot, motion: Motion) -> Array:
             lever = cross(links.z[j], links.after[k] - links.before[j])
             lever = np.einsum("abm,bm->am", axes[k], lever)
             part[:] = np.einsum("am,apm->pm", z, moment) + np.einsum("am,apm->pm", lever, force)
-    return np.asarray(np.moveaxis(out * robot.sign[:, None, None], -1, 0))
+    return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, out), -1, 0))
 
 
 def link_parameters(mass: float, com: Array, inertia: Array) -> Array:

@@ -179,7 +179,7 @@ def calibrate(
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = measured(data)
-    check(robot, data, options)
+    data = checked(robot, data, options)
     poses = parted(robot, data, options)
     progress("start")
     options = with_jump(robot, poses, options, progress)
@@ -214,20 +214,23 @@ def fit_split(
     held: (m,) True where held out.  Raises CalibrationError.
     """
     began = time.perf_counter()
-    check(robot, data, options)
+    data = checked(robot, data, options)
     poses = Parts(data, data.take(~held), data.take(held), data.notices)
     solved = fit_cell(robot, poses.train, options, progress)
     return judged(robot, options, poses, solved, began)[0]
 
 
-def check(robot: Robot, data: Measurements, options: Options) -> None:
-    """Raise an error, before any work, for what cannot be done."""
+def checked(robot: Robot, data: Measurements, options: Options) -> Measurements:
+    """The data with all joints of the arm.  Raises an error, before any work, for what cannot be
+    done.
+    """
     objective_of(options.objective, data)
     check_options(options)
     if isinstance(options.qp, str):
         usable(options.qp)
-    checks.check_joints(robot, data)
+    data = checks.check_joints(robot, data)
     checks.check_spread(robot, data)
+    return data
 
 
 def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
@@ -323,7 +326,7 @@ def judged(
         status=status,
         iterations=solved.iterations,
         seconds=time.perf_counter() - began,
-        parameters=parameters_of(solved),
+        parameters=parameters_of(robot, solved),
         accuracy={
             "nominal": accuracy(before[:, held]),
             "train": accuracy(after[:, ~held]),
@@ -413,8 +416,8 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
-def parameters_of(solved: Solved) -> Parameters:
-    """Every parameter, link by link.
+def parameters_of(robot: Robot, solved: Solved) -> Parameters:
+    """Every parameter, link by link, in the convention of the robot's file.
 
     Base entries are measured along the nominal base's own axes: its origin as seen from the
     instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
@@ -426,7 +429,7 @@ def parameters_of(solved: Solved) -> Parameters:
         stood, effects = jumps(frames, x.base), np.zeros(len(solved.units))
         effects[len(effects) - len(x.effects) :] = x.effects
         effects[: len(stood)] = stood
-        return replace(x, effects=effects).along(solved.nominal.rotation)
+        return replace(x, effects=effects).along(solved.nominal.rotation, robot)
 
     before = values(solved.nominal, solved.start)
     found = known.active | (np.arange(solved.names.count) >= solved.names.geometric)

@@ -629,7 +629,7 @@ def parameters_of(part: FitPart, arrays: Mapping[str, Array]) -> tuple[Parameter
 def parameter_names(parameters: Parameters, cell: Cell) -> Names:
     """All names in their order."""
     effects = tuple(p.name for p in parameters if p.of_effect)
-    return Names(cell.robot.joints, cell.target_names, effects)
+    return Names.of(cell.robot, cell.target_names, effects)
 
 
 def identification_of(

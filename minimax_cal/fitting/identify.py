@@ -230,7 +230,7 @@ def plenty_of_poses(robot: Robot, model: Model, poses: int = 200) -> Model:
     """A model of the same cell at random poses over the joints' whole range."""
     k, asked = len(model.y), DRAWN.setdefault(robot, {})
     if poses not in asked:
-        asked[poses] = random_joints(robot, (poses,), np.random.default_rng(0)) * robot.sign
+        asked[poses] = robot.turned(random_joints(robot, (poses,), np.random.default_rng(0)))
     q = asked[poses]
     return Model(
         q=q,

@@ -122,7 +122,7 @@ class Opened:
 
 def place(robot: Robot, data: Measurements) -> Cell:
     """An arm where it fits all poses best.  Raises DataError."""
-    check_joints(robot, data)
+    data = check_joints(robot, data)
     return Cell.of(robot, fit_base(model_of(robot, data), robot.mdh).state, data.target_names)
 
 

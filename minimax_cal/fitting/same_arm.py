@@ -57,7 +57,7 @@ def too_changed(robot: Robot, after: Robot, active: Array) -> str:
     if robot.rough or not len(far):
         return ""
     far = far[np.argsort(-np.abs(change[far]) / most[far])]
-    names, lengths = Names(robot.joints, ()).all, 2 * robot.joints
+    names, lengths = Names.of(robot, ()).all, 2 * robot.joints
     named = ", ".join(
         f"{names[i]} by {1e3 * change[i]:+.3g} mm" if i < lengths
         else f"{names[i]} by {math.degrees(change[i]):+.3g} degrees"
@@ -85,7 +85,7 @@ def check_arm(robot: Robot, data: Measurements) -> None:
     limit = GROSS * robot.reach()
     if np.sqrt(given.mean_square) <= limit:
         return
-    free = np.zeros(Names(robot.joints, data.target_names).count, dtype=bool)
+    free = np.zeros(Names.of(robot, data.target_names).count, dtype=bool)
     free[5 * robot.joints :] = True
     free[zero_positions(robot.prismatic)] = True
     model, state = refitted(robot, data, given.state, free)

@@ -512,7 +512,7 @@ def uncertainty_from_dict(content: Mapping[str, Any], cell: Cell, source: str) -
         )
     nowhere = cell.scene(still(np.zeros((1, cell.robot.joints)), cell.target_names, cell.robot))
     effects, own = names_of(cell.effects.terms, nowhere)
-    names = Names(cell.robot.joints, cell.target_names, effects)
+    names = Names.of(cell.robot, cell.target_names, effects)
     units = (*names.units[: names.geometric], *own)
     try:
         part = content["covariance"]

@@ -72,7 +72,7 @@ def open_saved(
     notices: list[str] = []
     if data:
         measured = read_measurements(data)
-        check_joints(known.cell.robot, measured)
+        measured = check_joints(known.cell.robot, measured)
         notices += measured.notices
         if known.placed:
             measured, said = known_targets(measured, known.cell)
@@ -172,7 +172,7 @@ def nominal_cell(
     missing = [name for name in cell.target_names if name not in train.target_names]
     if missing:
         raise DataError(f"{train.source}: {missing[0]} was not measured")
-    check_joints(robot, train)
+    train = check_joints(robot, train)
     state = fit_base(model_of(robot, cell.placed(train)), robot.mdh).state
     said = f"{robot.name} before calibration is placed where it fits {train.poses} poses best"
     return Cell.of(robot, state, train.target_names, sessions=cell.sessions), (said,)

@@ -10,8 +10,10 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.columns import OF_JOINT
 from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.couplings import whole
 from minimax_cal.robots.robot import Robot
 
 STANDS_OUT = 8.0  # times the typical error, and 4 times what 95 % keep to: worth a look
@@ -21,13 +23,14 @@ MOST_ORDERED = 5  # targets of which all orders are tried
 TURNS = 4.0 * np.pi  # no arm joint is commanded beyond two turns unless it says so in its limits
 
 
-def check_joints(robot: Robot, data: Measurements) -> None:
-    """Raise DataError if the joint columns cannot belong to the robot."""
+def check_joints(robot: Robot, data: Measurements) -> Measurements:
+    """The data with columns of 0 for joints without a drive, where these are not among them.
+
+    Raises DataError if the joint columns cannot belong to the robot.
+    """
     n = data.q.shape[1]
     if n != robot.joints:
-        raise DataError(
-            f"{data.source}: has {n} joint columns, but {robot.name} has {robot.joints} joints"
-        )
+        data = with_passive(robot, data)
     for i in np.flatnonzero(data.sliding != robot.prismatic):
         unit, mend = ("rad", "mm") if robot.prismatic[i] else ("mm", "rad")
         kind = "slides" if robot.prismatic[i] else "turns"
@@ -43,6 +46,30 @@ def check_joints(robot: Robot, data: Measurements) -> None:
             f"{data.source}:{data.line[row]}: joint {joint + 1} at {data.q[row, joint]:.1f} rad is "
             f"more than two turns; degrees? then name the columns q1_deg, q2_deg, ..."
         )
+    return data
+
+
+def with_passive(robot: Robot, data: Measurements) -> Measurements:
+    """The data with columns of 0 for joints without a drive.  Raises DataError for another arm."""
+    n, driven = data.q.shape[1], np.flatnonzero(~robot.passive)
+    if n != len(driven):
+        passive = robot.joints - len(driven)
+        without = f", {passive} of them without a drive" if passive else ""
+        raise DataError(
+            f"{data.source}: has {n} joint columns, but {robot.name} has {robot.joints} joints"
+            f"{without}"
+        )
+
+    def renumbered(name: str) -> str:
+        found = OF_JOINT.fullmatch(name)
+        return f"{name[: found.start(1)]}{driven[int(found[1]) - 1] + 1}" if found else name
+
+    columns = {renumbered(name): column for name, column in data.columns.items()}
+    sliding = np.where(robot.passive, robot.prismatic, whole(data.sliding, robot.passive))
+    aside = with_passive(robot, data.aside) if data.aside else None
+    return replace(
+        data, q=whole(data.q, robot.passive), sliding=sliding, columns=columns, aside=aside
+    )
 
 
 def span(robot: Robot) -> Array:

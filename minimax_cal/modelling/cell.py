@@ -102,7 +102,7 @@ class Cell:
         base = (self.base[:3, :3], self.base[:3, 3])
         hidden = np.full((data.poses, len(self.target_names), 3), np.nan)
         data = self.placed(replace(data, target_names=self.target_names, y=hidden))
-        return Scene.of(self.robot, data, base, self.target_positions, data.q * self.robot.sign)
+        return Scene.of(self.robot, data, base, self.target_positions, self.robot.turned(data.q))
 
     def follow(self, data: Measurements) -> Array:
         """As `predict`, with the columns of the data (session, order, temperature, payload ...).
@@ -126,7 +126,7 @@ class Cell:
 
         In the axes of the first session.
         """
-        check_joints(self.robot, data)
+        data = check_joints(self.robot, data)
         strange = [name for name in data.target_names if name not in self.target_names]
         if strange:
             raise DataError(

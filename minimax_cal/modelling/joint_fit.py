@@ -78,10 +78,10 @@ def model_at(cell: Cell, poses: Measurements | Array) -> tuple[Model, State]:
     if not isinstance(poses, Measurements):
         q = np.atleast_2d(np.asarray(poses, dtype=float))
         poses = still(q, cell.target_names, cell.robot)
-    names = Names(cell.robot.joints, cell.target_names)
+    names = Names.of(cell.robot, cell.target_names)
     nothing = np.zeros(names.count)
     model = Model(
-        q=poses.q * cell.robot.sign,
+        q=cell.robot.turned(poses.q),
         prismatic=cell.robot.prismatic,
         y=np.zeros((len(names.target_names), 3, poses.poses)),
         weight=np.ones((len(names.target_names), poses.poses)),

@@ -499,11 +499,11 @@ def model_of(robot: Robot, data: Measurements) -> Model:
         usual = np.nanmedian(u95)
         least = usual / HEAVIEST  # a slip of the pen must not turn the fit into one pose's
         weight = weight * np.where(np.isfinite(u95), (usual / np.maximum(u95, least)) ** 2, 1.0)
-    names = Names(robot.joints, data.target_names)
+    names = Names.of(robot, data.target_names)
     mean = np.zeros(names.count)
     mean[names.links] = links_of(robot.mdh)
     return Model(
-        q=data.q * robot.sign,
+        q=robot.turned(data.q),
         prismatic=robot.prismatic,
         y=np.where(seen[:, None], np.moveaxis(data.y, 0, 2), 0.0),
         weight=weight,

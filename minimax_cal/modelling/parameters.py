@@ -19,6 +19,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import transform
 
 BASE_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
@@ -58,15 +59,17 @@ class State:
         """(4, 4) pose of the base in the measurement frame, of a single state."""
         return transform(self.rotation, self.origin)
 
-    def along(self, axes: Array) -> Array:
+    def along(self, axes: Array, robot: Robot) -> Array:
         """(p,) all parameters of a single state as people are told them, in the order of `Names`.
 
-        axes: (3, 3) a rotation, along and from which the base's origin and turn are told.
+        axes: (3, 3) a rotation, along and from which the base's origin and turn are told.  robot:
+        in whose file's convention links are told.
         """
+        links = robot.notation.told(self.mdh, robot.prismatic)
         turn = kinematics.rotation_vector(axes.T @ self.rotation)
         base = (axes.T @ self.origin, turn)
         return np.concatenate(
-            [links_of(self.mdh), *base, self.target_positions.reshape(-1), self.effects]
+            [links_of(links), *base, self.target_positions.reshape(-1), self.effects]
         )
 
     @property
@@ -99,16 +102,26 @@ class State:
 
 @dataclass(frozen=True)
 class Names:
-    """The parameters of an arm with n joints seen through some targets, and of its effects."""
+    """The parameters of an arm with n joints seen through some targets, and of its effects.
+
+    rows: names of the link parameters as the robot's file has them; empty for a1 ... beta_n.
+    """
 
     joints: int
     target_names: tuple[str, ...]
     effects: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(robot: Robot, target_names: tuple[str, ...], effects: tuple[str, ...] = ()) -> Names:
+        """Of a robot, in the convention of its file."""
+        rows = robot.notation.names(robot.joints)
+        return Names(robot.joints, target_names, effects, rows)
 
     @cached_property
     def all(self) -> tuple[str, ...]:
         """Every name, in order: a1 ... beta_n, base_x ... base_rz, smr1_x ..., effects."""
-        links = [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
+        links = self.rows or [f"{kind}{i + 1}" for kind in MDH_NAMES for i in range(self.joints)]
         spots = [f"{target}_{axis}" for target in self.target_names for axis in "xyz"]
         return (*links, *BASE_NAMES, *spots, *self.effects)
 

@@ -144,7 +144,7 @@ class Reach:
         """How far the flange is from its goal: (m,) [m] and (m,) [rad], the way there counted."""
         turn, moved = bent(self.arm, self.at(q))
         robot = self.arm.robot
-        pose = moved @ kinematics.forward(robot.mdh, q * robot.sign + turn, robot.prismatic)
+        pose = moved @ kinematics.forward(robot.mdh, robot.turned(q) + turn, robot.prismatic)
         apart = np.swapaxes(pose[:, :3, :3], -1, -2) @ self.goal[:, :3, :3]
         angle = np.linalg.norm(Rotation.from_matrix(apart).as_rotvec(), axis=1)
         return np.linalg.norm(pose[:, :3, 3] - self.goal[:, :3, 3], axis=1), angle
@@ -209,8 +209,8 @@ class Reach:
     def missing(self, q: Array, goal: Array, turn: Array) -> tuple[Array, Array]:
         """What is missing of goals, and its slope, as `inverse.missing` has them."""
         robot = self.arm.robot
-        moved = q * robot.sign + turn
-        return missing(robot.mdh, moved, robot.prismatic, robot.sign, goal, self.lever)
+        moved = robot.turned(q) + turn
+        return missing(robot.mdh, moved, robot.prismatic, robot.turning, goal, self.lever)
 
     def outcomes(self, q: Array, good: Array, settled: Array) -> tuple[Outcome, ...]:
         """How each target ended."""

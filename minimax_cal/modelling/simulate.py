@@ -127,6 +127,6 @@ def simulate(
 
 def gravity(robot: Robot, q: Array) -> Array:
     """Gravity torques (m, n), in the controller's sense [N m]; assumed masses where unknown."""
-    links = kinematics.chain(robot.mdh, q * robot.sign, robot.prismatic)
+    links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
     bend = torques(links, *masses_of(robot), robot.up).T * robot.sign
     return np.where(robot.prismatic, 0.0, bend)

@@ -146,7 +146,7 @@ def drawn(
     kept_q, kept_seen, tested, found = [], [], 0, 0
     total = dict.fromkeys((*arm, *tracker), 0)
     while found < count and tested < (MOST if found else VAIN):
-        q = qmc.scale(sequence.random(BATCH), room.lower, room.upper)
+        q = room.lower + (room.upper - room.lower) * sequence.random(BATCH)
         good, seen, against = judged(room, sight, q, arm, tracker)
         total = {name: number + against[name] for name, number in total.items()}
         tested += len(q)

@@ -81,8 +81,8 @@ def ground_of(
             raise OptionError(
                 "the fit tells where tracker and targets are: leave tracker= and spots= out"
             )
+        own = tuple(check_joints(robot, one) for one in own)
         for one in own:
-            check_joints(robot, one)
             if data:
                 check_arm(cells[0].robot, one)
             strange = [name for name in one.target_names if name not in cells[0].target_names]
@@ -105,7 +105,7 @@ def check_same(robot: Robot, calibrated: Robot) -> None:
     """
     change = links_of(calibrated.mdh - robot.mdh)
     change[zero_positions(robot.prismatic)] = 0.0
-    if named := wild(Names(robot.joints, ()), change, robot.reach()):
+    if named := wild(Names.of(robot, ()), change, robot.reach()):
         raise OptionError(
             f"the fit is of {calibrated.name}, which is not {robot.name} ({named}); name the robot "
             "of the fit, or give another fit"

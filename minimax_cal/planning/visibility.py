@@ -98,7 +98,7 @@ class View:
     def links(self) -> Chain:
         """The chain of the arm."""
         robot = self.room.robot
-        return kinematics.chain(robot.mdh, self.q * robot.sign, robot.prismatic)
+        return kinematics.chain(robot.mdh, robot.turned(self.q), robot.prismatic)
 
     @cached_property
     def points(self) -> Array:

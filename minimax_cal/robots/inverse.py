@@ -25,16 +25,16 @@ def missing(
     mdh: Array,
     q: Array,
     prismatic: Array,
-    sign: Array,
+    turning: Array,
     goal: Array,
     lever: float,
     spot: Array = FLANGE,
 ) -> tuple[Array, Array]:
     """What is missing of goals (m, r) [m], turns times the lever, and its slope (m, r, n).
 
-    q: (m, n), signs applied [rad, m].  goal: (m, 4, 4) in the base [m].  lever: what a radian
-    counts as [m]; with 0 the place alone counts, r = 3, else r = 6.  spot: (3,) that shall be at
-    the goal's origin, in the last frame [m].
+    q: (m, n), couplings and signs applied [rad, m].  turning: (n, n) that did so.  goal: (m, 4, 4)
+    in the base [m].  lever: what a radian counts as [m]; with 0 the place alone counts, r = 3, else
+    r = 6.  spot: (3,) that shall be at the goal's origin, in the last frame [m].
     """
     from scipy.spatial.transform import Rotation  # only who asks for joints waits for it
 
@@ -48,7 +48,7 @@ def missing(
         away = Rotation.from_matrix(goal[:, :3, :3] @ np.swapaxes(pose, -1, -2)).as_rotvec()
         residual = np.concatenate([residual, lever * away], axis=1)
         jacobian = np.concatenate([moves, np.where(slides, 0.0, lever * links.z)], axis=1)
-    return residual, np.moveaxis(jacobian * sign[:, None, None], -1, 0).swapaxes(1, 2)
+    return residual, np.moveaxis(jacobian, (2, 1), (0, 1)) @ turning
 
 
 def nearest(

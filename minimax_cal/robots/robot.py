@@ -20,12 +20,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning, RobotError
 from minimax_cal.ground.files import json_text, once, read_text, write_whole
-from minimax_cal.robots import kinematics
+from minimax_cal.robots import couplings, kinematics, notation
 from minimax_cal.robots.angle_units import check_angles, check_limits
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 from minimax_cal.robots.kinematics import MDH_NAMES
+from minimax_cal.robots.notation import FORMULAS, PLAIN, Notation
+from minimax_cal.robots.transforms import tail
 
-CONVENTION = "Rz(sign*q+theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)"
+CONVENTION = FORMULAS["standard"]
 METRES = {"mm": 1e-3, "m": 1.0}
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
@@ -82,6 +84,7 @@ class JointSchema(BaseModel):
     theta: Finite
     alpha: Finite
     beta: Finite = 0.0
+    offset: Finite = 0.0
     sign: Literal[1, -1] = 1
     type: Literal["revolute", "prismatic"] = "revolute"
     lower: Finite | None = None
@@ -92,6 +95,22 @@ class JointSchema(BaseModel):
     inertia: Inertia | None = None
     drive_gain: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
     name: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def no_slip(cls, given: object) -> object:
+        """What is not known would be ignored in silence."""
+        return only_known(cls.model_fields, given)
+
+
+class EndSchema(BaseModel):
+    """What follows the last joint of modified DH, as the a, alpha and beta of a next row."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    a: Finite = 0.0
+    alpha: Finite = 0.0
+    beta: Finite = 0.0
 
     @model_validator(mode="before")
     @classmethod
@@ -115,6 +134,8 @@ class RobotSchema(BaseModel):
     convention: str = CONVENTION
     units: UnitsSchema
     joints: Annotated[list[JointSchema], Field(min_length=1)]
+    coupling: dict[str, dict[str, Finite]] | list[list[Finite]] | None = None
+    flange: EndSchema | None = None
     up: Vector = (0.0, 0.0, 1.0)
     repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
     nominal: Literal["drawn", "rough"] = "drawn"
@@ -143,6 +164,8 @@ class Robot:
     inertia: (n, 6) xx, xy, xz, yy, yz, zz of each link about its centre of gravity, in the axes of
     frame i, NaN where unknown; empty where no link's is known [kg m^2].
     drive_gain: (n,) torque for one ampere, NaN where unknown; may be empty [N m/A, N/A].
+    coupling: (n, n) how far each joint goes per unit of each joint value; (0, 0) for each its own.
+    notation: how the robot's file writes its links.
     """
 
     name: str
@@ -159,11 +182,35 @@ class Robot:
     rough: bool = False
     inertia: Array = field(default_factory=lambda: np.zeros((0, 6)))
     drive_gain: Array = field(default_factory=lambda: np.zeros(0))
+    coupling: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    notation: Notation = PLAIN
 
     @property
     def joints(self) -> int:
         """Number of joints."""
         return len(self.mdh)
+
+    @property
+    def passive(self) -> Array:
+        """(n,) True for joints without a drive, which others take along: their value is 0."""
+        if not len(self.coupling):
+            return np.zeros(self.joints, dtype=bool)
+        return np.asarray(~self.coupling.any(axis=0))
+
+    @property
+    def turning(self) -> Array:
+        """(n, n) how the joints turn or slide in the chain per unit of each joint value."""
+        own = self.coupling if len(self.coupling) else np.eye(self.joints)
+        return np.asarray(self.sign[:, None] * own)
+
+    def turned(self, q: Array) -> Array:
+        """Joint values (..., n) as the chain takes them: couplings and signs applied."""
+        return np.asarray((q @ self.coupling.T if len(self.coupling) else q) * self.sign)
+
+    def commanded(self, turned: Array) -> Array:
+        """The joint values (..., n) of those in the chain: the inverse of `turned`."""
+        own = turned * self.sign
+        return np.asarray(own @ np.linalg.pinv(self.coupling).T if len(self.coupling) else own)
 
     def pose(self, q: Array) -> Array:
         """Pose of the last frame in the base: (..., 4, 4) [m].  q: (..., n) [rad, m].
@@ -172,12 +219,15 @@ class Robot:
         """
         q = self.own_joints(q)
         flat = q.reshape(-1, self.joints)
-        pose = kinematics.forward(self.mdh, flat * self.sign, self.prismatic)
+        pose = kinematics.forward(self.mdh, self.turned(flat), self.prismatic)
         return pose.reshape(*q.shape[:-1], 4, 4)
 
     def own_joints(self, q: Array) -> Array:
-        """Joint values (..., n), if they are of so many joints.  Raises RobotError."""
-        q = np.asarray(q)
+        """Joint values (..., n), if they are of so many joints, or of those with a drive.
+
+        Raises RobotError.
+        """
+        q = couplings.whole(np.asarray(q), self.passive)
         if not q.ndim or q.shape[-1] != self.joints:
             raise RobotError(
                 f"{self.name} has {self.joints} joints: joint values must be (..., {self.joints}), "
@@ -196,8 +246,8 @@ class Robot:
 
         def find(goal: Array, begin: Array) -> tuple[Array, Array]:
             def look(rows: Array, q: Array) -> tuple[Array, Array]:
-                signs = self.sign
-                return missing(self.mdh, q * signs, self.prismatic, signs, goal[rows], lever)
+                turned, turning = self.turned(q), self.turning
+                return missing(self.mdh, turned, self.prismatic, turning, goal[rows], lever)
 
             box = (np.broadcast_to(end, begin.shape) for end in (self.lower, self.upper))
             q = nearest(look, begin, *box)
@@ -211,40 +261,60 @@ class Robot:
         return max(0.1, float(np.hypot(self.mdh[:, 0], self.mdh[:, 1]).sum()))
 
     def to_dict(self) -> dict[str, Any]:
-        """The robot in the file schema, in millimetres and radians."""
+        """The robot in the file schema and the convention of its file, in mm and radians."""
+        rows, end = self.notation.written(self.mdh, self.prismatic)
+        sign = self.sign.copy()
+        sign[0] *= -1.0 if self.notation.half_turn else 1.0
 
         def joint(i: int) -> dict[str, Any]:
-            a, d, theta, alpha, beta = map(float, self.mdh[i])
+            a, d, theta, alpha, beta = map(float, rows[i])
             scale = 1e3 if self.prismatic[i] else 1.0
+            offset = self.notation.offset[i] if len(self.notation.offset) else 0.0
+            limits = {"lower": self.lower[i] * scale, "upper": self.upper[i] * scale}
             optional = {
-                "lower": self.lower[i] * scale,
-                "upper": self.upper[i] * scale,
+                "offset": offset * scale if offset else math.nan,
+                **({} if self.passive[i] else limits),
                 "ratio": self.ratio[i],
                 "mass_kg": self.mass[i],
             }
             out: dict[str, Any] = dict(a=a * 1e3, d=d * 1e3, theta=theta, alpha=alpha, beta=beta)
-            out["sign"] = int(self.sign[i])
+            out["sign"] = int(sign[i])
             if self.prismatic[i]:
                 out["type"] = "prismatic"
             out |= {key: float(value) for key, value in optional.items() if np.isfinite(value)}
             if np.all(np.isfinite(self.com[i])):
-                out["com_mm"] = [float(c) * 1e3 for c in self.com[i]]
+                com = self.com[i]
+                if self.notation.modified:  # of the frame of joint i, which lies before the link
+                    rest = tail(self.notation.told(self.mdh, self.prismatic)[i])
+                    com = rest[:3, :3] @ com + rest[:3, 3]
+                out["com_mm"] = [float(c) * 1e3 for c in com]
             if len(self.inertia) and np.all(np.isfinite(self.inertia[i])):
-                out["inertia"] = [float(c) for c in self.inertia[i]]
+                out["inertia"] = [float(c) for c in self.inertia_in_file(i)]
             if len(self.drive_gain) and np.isfinite(self.drive_gain[i]):
                 out["drive_gain"] = float(self.drive_gain[i])
             return out
 
         known = np.isfinite(self.repeatability)
+        coupling = couplings.to_dict(self.coupling)
+        after = dict(a=end[0] * 1e3, alpha=end[3], beta=end[4])
         return {
             "name": self.name,
-            "convention": CONVENTION,
+            "convention": "modified" if self.notation.modified else CONVENTION,
             "units": {"length": "mm", "angle": "rad"},
             "up": [float(u) for u in self.up],
             **({"repeatability_mm": 1e3 * self.repeatability} if known else {}),
             **({"nominal": "rough"} if self.rough else {}),
+            **({"coupling": coupling} if coupling else {}),
+            **({"flange": {k: float(v) for k, v in after.items()}} if end.any() else {}),
             "joints": [joint(i) for i in range(self.joints)],
         }
+
+    def inertia_in_file(self, i: int) -> Array:
+        """(6,) of link i, in the axes of the file's own frame i."""
+        if not self.notation.modified:
+            return np.asarray(self.inertia[i])
+        rest = tail(self.notation.told(self.mdh, self.prismatic)[i])
+        return in_other_axes(self.inertia[i], rest[:3, :3])
 
     def save(self, path: Path | str) -> None:
         """Write the robot as JSON."""
@@ -299,10 +369,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         schema = RobotSchema.model_validate(content)
     except ValidationError as error:
         raise RobotError(f"{source}: {explain(error)}") from error
-    if "".join(schema.convention.split()) != "".join(CONVENTION.split()):
-        raise RobotError(
-            f"{source}: convention {schema.convention!r} is not known; use {CONVENTION!r}"
-        )
+    modified = is_modified(schema, source)
     metre, radian = METRES[schema.units.length], RADIANS[schema.units.angle]
     joints = schema.joints
     prismatic = np.array([joint.type == "prismatic" for joint in joints])
@@ -323,6 +390,8 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     check_angles(angles, schema.units.angle, source)
     check_limits(lower, upper, prismatic, schema.units.angle, source)
     lower, upper = lower * unit, upper * unit
+    coupling = couplings.read(schema.coupling, [j.name for j in joints], source)
+    passive = ~coupling.any(axis=0) if len(coupling) else np.zeros(len(joints), dtype=bool)
     if np.any(lower >= upper):
         number = int(np.argmax(lower >= upper)) + 1
         raise RobotError(f"{source}: joint {number}: lower must be less than upper")
@@ -334,6 +403,22 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         raise RobotError(
             f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
         )
+    sign = np.array([float(j.sign) for j in joints])
+    offset = np.array([j.offset for j in joints]) * unit
+    offset = offset if offset.any() else np.zeros(0)
+    com = np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3
+    inertia = where_given([j.inertia for j in joints], [np.nan] * 6)
+    if modified:
+        end = schema.flange or EndSchema()
+        after = np.array([end.a, 0.0, 0.0, end.alpha, end.beta]) * scale
+        com = before_links(com, np.vstack([mdh[1:], after]))
+        turns = [tail(row)[:3, :3].T for row in np.vstack([mdh[1:], after])]
+        inertia = np.array([in_other_axes(*two) for two in zip(inertia, turns, strict=False)])
+        inertia = inertia.reshape(-1, 6)
+        mdh, sign, said = notation.read(mdh, sign, prismatic, offset, after, source)
+    else:
+        mdh, sign = notation.straight(mdh, sign, prismatic, offset, False)
+        said = Notation(offset=offset) if len(offset) else PLAIN
     up = np.array(schema.up)
     up = up / max(1.0, float(np.abs(up).max()))  # the squares of huge numbers are none
     if np.linalg.norm(up) < 1e-9:
@@ -341,19 +426,55 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     return Robot(
         name=schema.name,
         mdh=mdh,
-        sign=np.array([float(j.sign) for j in joints]),
+        sign=sign,
         prismatic=prismatic,
-        lower=lower,
-        upper=upper,
+        lower=np.where(passive, 0.0, lower),
+        upper=np.where(passive, 0.0, upper),
         ratio=optional([j.ratio for j in joints], np.nan),
         mass=optional([j.mass_kg for j in joints], np.nan),
-        com=np.array([[np.nan] * 3 if j.com_mm is None else j.com_mm for j in joints]) * 1e-3,
+        com=com,
         up=up / np.linalg.norm(up),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
         rough=schema.nominal == "rough",
-        inertia=where_given([j.inertia for j in joints], [np.nan] * 6),
+        inertia=inertia,
         drive_gain=where_given([j.drive_gain for j in joints], np.nan),
+        coupling=coupling,
+        notation=said,
     )
+
+
+def is_modified(schema: RobotSchema, source: str) -> bool:
+    """Whether a file's rows are Craig's.  Raises RobotError for a convention that is not known."""
+    given = "".join(schema.convention.split()).lower()
+    for name, formula in FORMULAS.items():
+        if given in (name, "".join(formula.split()).lower()):
+            if schema.flange and name == "standard":
+                raise RobotError(
+                    f"{source}: flange: of modified DH alone; a standard row holds its own a, "
+                    "alpha and beta: put them into the last joint"
+                )
+            return name == "modified"
+    raise RobotError(
+        f"{source}: convention {schema.convention!r} is not known; use 'standard' "
+        f"({FORMULAS['standard']}) or 'modified' (Craig's: {FORMULAS['modified']})"
+    )
+
+
+def in_other_axes(inertia: Array, turn: Array) -> Array:
+    """An inertia (6,) xx, xy, xz, yy, yz, zz in axes that a rotation (3, 3) leads into."""
+    at = np.triu_indices(3)
+    whole = np.zeros((3, 3))
+    whole[at] = whole.T[at] = inertia
+    return np.asarray((turn @ whole @ turn.T)[at])
+
+
+def before_links(com: Array, rows: Array) -> Array:
+    """Centres of gravity (n, 3), given in the frames of Craig's joints, in the engine's frames.
+
+    rows: (n, 5) the row after each joint [m, rad].
+    """
+    parts = [tail(row) for row in rows]
+    return np.array([t[:3, :3].T @ (c - t[:3, 3]) for t, c in zip(parts, com, strict=True)])
 
 
 def explain(error: ValidationError) -> str:
@@ -392,7 +513,7 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 
 
 def load_robot(source: Path | str) -> Robot:
-    """A built-in robot by name, or a robot file (.json, .toml, .yaml, .urdf).
+    """A built-in robot by name, or a robot file (.json, .toml, .yaml, .csv, .urdf).
 
     source: name or path; ``robot.urdf#link`` names the last link of a chain.  The file says its
     units; the robot has metres and radians.  Raises RobotError.
@@ -408,9 +529,13 @@ def load_robot(source: Path | str) -> Robot:
 
     if is_urdf(source):
         return robot_from_dict(load_urdf(source).content, str(source))
+    if path.suffix.lower() == ".csv":
+        from minimax_cal.robots.data_sheet import content_of  # few robots come as one
+
+        return robot_from_dict(content_of(path, read_text(path, kind=RobotError)), str(path))
     if path.suffix.lower() not in PARSERS:
         if len(str(source)) < 200 and path.exists():
-            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}, .urdf")
+            raise RobotError(f"{path}: not a robot file; use {', '.join(PARSERS)}, .csv, .urdf")
         near = difflib.get_close_matches(str(source), builtin_robots(), 1)
         hint = f"did you mean {near[0]!r}?" if near else f"built in: {', '.join(builtin_robots())}"
         raise RobotError(f"no robot called {str(source)[:60]!r}; {hint}, or give a robot file")

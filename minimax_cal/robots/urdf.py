@@ -73,19 +73,55 @@ def chain_to(urdf: Urdf, tip: str = "") -> tuple[Joint, ...]:
         tip = next(iter(ends)) if len(ends) == 1 else [*named, *bodies][0]
     chain = urdf.to_link(tip)
     for joint in chain:
-        if joint.kind in ("floating", "planar") or joint.mimics:
-            kind = "mimic" if joint.mimics else joint.kind
+        if joint.kind in ("floating", "planar"):
             raise RobotError(
                 f"{urdf.source}:{joint.element.line}: joint {joint.name!r} on the way to {tip!r} "
-                f"is {kind}; only revolute, continuous, prismatic and fixed joints are supported"
+                f"is {joint.kind}; only revolute, continuous, prismatic and fixed joints are "
+                "supported"
             )
     if not any(joint.moves for joint in chain):
         raise RobotError(f"{urdf.source}: no moving joint leads to {tip!r}")
     return chain
 
 
+@dataclass(frozen=True, eq=False)
+class Follow:
+    """How the n moving joints of a chain follow joint values: ratio @ q + offset.
+
+    ratio: (n, n), its column empty for a joint that mimics others.  offset: (n,) [rad, m].
+    """
+
+    ratio: Array
+    offset: Array
+
+
+def follow_of(chain: Sequence[Joint], source: str = "URDF") -> Follow:
+    """Of a chain, its mimics resolved.  Raises RobotError for one that follows no joint of it."""
+    moving = {joint.name: joint for joint in chain if joint.moves}
+    places = {name: i for i, name in enumerate(moving)}
+    ratio, offset = np.eye(len(moving)), np.zeros(len(moving))
+    for name, place in places.items():
+        factor, more, joint, seen = 1.0, 0.0, moving[name], {name}
+        while joint.mimic:
+            more += factor * joint.mimic.offset
+            factor *= joint.mimic.multiplier
+            if joint.mimic.joint not in moving or joint.mimic.joint in seen:
+                what = "a ring" if joint.mimic.joint in seen else "no moving joint of this chain"
+                raise RobotError(
+                    f"{source}:{joint.element.line}: joint {joint.name!r} mimics "
+                    f"{joint.mimic.joint!r}, {what}; name the tip of a chain that holds both"
+                )
+            seen.add(joint.mimic.joint)
+            joint = moving[joint.mimic.joint]
+        ratio[place, place], offset[place] = 0.0, more
+        ratio[place, places[joint.name]] = factor
+    return Follow(ratio, offset)
+
+
 def tip_poses(chain: Sequence[Joint], q: Array) -> Array:
     """The tip in the root link, by the URDF's own transforms: (m, 4, 4).  q: (m, n) [rad, m]."""
+    follow = follow_of(chain)
+    q = q[:, : len(follow.ratio)] @ follow.ratio.T + follow.offset
     pose, column = np.broadcast_to(np.eye(4), (len(q), 4, 4)), 0
     for joint in chain:
         pose = pose @ joint.origin
@@ -139,9 +175,13 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
     ends.append(ends[-1] @ link(rows[-1]))
     tool = inverse(ends[-1]) @ tip_pose
     mdh, slides = np.array(rows), np.array([joint.kind == "prismatic" for joint in moving])
+    follow = follow_of(chain, urdf.source)
+    mdh[np.arange(len(mdh)), np.where(slides, kinematics.D, kinematics.THETA)] += (
+        sign * follow.offset
+    )
     lower, upper = (np.array([getattr(j, n) for j in moving]) for n in ("lower", "upper"))
     q = random_joints(lower, upper)
-    pose = base @ kinematics.forward(mdh, q * sign, slides) @ tool
+    pose = base @ kinematics.forward(mdh, q @ follow.ratio.T * sign, slides) @ tool
     if not (worst := difference(pose, tip_poses(chain, q))) <= EXACT:
         raise RobotError(
             f"{urdf.source}: poses would be off by {worst:.1e} m; check its units (metres)"
@@ -157,6 +197,7 @@ def to_robot(urdf: Urdf, tip: str = "") -> UrdfRobot:
         "units": {"length": "m", "angle": "rad"},
         "up": base[2, :3].tolist(),
         "joints": joints,
+        **({"coupling": follow.ratio.tolist()} if any(j.mimic for j in moving) else {}),
     }
     return UrdfRobot(content, urdf, chain, base, tool, left_out(urdf, chain, base, tool))
 
@@ -197,7 +238,7 @@ def joint_content(
     out |= {"name": joint.name, "sign": int(sign)}
     if joint.kind == "prismatic":
         out["type"] = "prismatic"
-    if np.isfinite(joint.lower):
+    if np.isfinite(joint.lower) and not joint.mimic:
         out |= {"lower": joint.lower, "upper": joint.upper}
     mass, com, inertia = centre
     if mass > 0.0:

@@ -44,6 +44,15 @@ class Element:
         return next((c for c in self.children if c.tag == tag), None)
 
 
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that goes multiplier times as far as another one, and an offset [rad, m]."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
     """origin: (4, 4) of the child link in its parent at joint value 0.  axis: (3,) in the child."""
@@ -56,7 +65,7 @@ class Joint:
     axis: Array
     lower: float
     upper: float
-    mimics: bool
+    mimic: Mimic | None
     element: Element
 
     @property
@@ -244,9 +253,20 @@ def joint_of(element: Element, name: str, source: str) -> Joint:
         axis=axis / max(length, 1e-9),
         lower=lower,
         upper=upper,
-        mimics=element.child("mimic") is not None,
+        mimic=mimic_of(element.child("mimic"), where, source),
         element=element,
     )
+
+
+def mimic_of(element: Element | None, where: str, source: str) -> Mimic | None:
+    """A <mimic>, if there is one."""
+    if element is None:
+        return None
+    multiplier, offset = (
+        float(numbers(element, name, (default,), where, source)[0])
+        for name, default in (("multiplier", 1.0), ("offset", 0.0))
+    )
+    return Mimic(attribute(element, "joint", source), multiplier, offset)
 
 
 def mass_of(element: Element, name: str, source: str) -> tuple[float, Array]:

@@ -160,7 +160,7 @@ def judged_by(
     """
     if fit.data.poses and fit.provenance.data_sha256 == data.digest:
         return with_history(fit.data), fit.held, True
-    check_joints(fit.cell.robot, data)
+    data = check_joints(fit.cell.robot, data)
     check_arm(fit.cell.robot, data)
     data = with_history(data)
     return data, held_out(data, *chosen)[0], False

@@ -229,7 +229,7 @@ def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
                 axis=np.array(model.jnt_axis[joint]),
                 lower=float(low),
                 upper=float(high),
-                mimics=False,
+                mimic=None,
                 element=nothing,
             )
         )
@@ -237,7 +237,7 @@ def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
     end = inverse(before) @ body_pose(data, bodies[-1])
     parts.append(
         Joint("tip", "fixed", parent, "tip", end, np.array([0.0, 0.0, 1.0]), -np.inf, np.inf,
-              False, nothing)
+              None, nothing)
     )  # fmt: skip
     name = Path(source).stem
     urdf = Urdf(source, b"", name, "world", tuple(parts), masses(model, data, bodies, poses))

@@ -31,7 +31,7 @@ class Commands:
     def follow(self, data: Measurements) -> Array:
         """(m, n) the same for measured poses, with the way that led to each [rad, m]."""
         turn = self.cell.effects.turn(self.cell.scene(data))
-        return np.asarray(data.q + turn * self.cell.robot.sign)
+        return np.asarray(data.q + self.cell.robot.commanded(turn))
 
 
 def load_commands(path: Path | str) -> Commands:

@@ -102,7 +102,7 @@ def loads(arm: Arm, q: Array | None = None) -> tuple[Array, Array]:
     robot = arm.robot
     if q is None:
         q = random_poses(robot, SAMPLES, np.random.default_rng(0))
-    links = chain(robot.mdh, q * robot.sign, robot.prismatic)
+    links = chain(robot.mdh, robot.turned(q), robot.prismatic)
     at = centres(links, arm.com)
     beyond = np.cumsum(arm.mass[::-1])[::-1]
     own = [inertia_of(robot.mdh, i, m) for i, m in enumerate(arm.mass)]

@@ -580,7 +580,8 @@ def test_the_equivalent_truth_is_the_arm() -> None:
     assert_allclose(same.predict(q), arm.predict(q), rtol=0, atol=1e-9)
     known = true.identification.active
     axes = true.nominal.rotation
-    nominal, found = replace(true.state, mdh=robot.mdh).along(axes), true.state.along(axes)
+    nominal = replace(true.state, mdh=robot.mdh).along(axes, robot)
+    found = true.state.along(axes, robot)
     links = np.arange(len(known)) < 5 * robot.joints
     assert np.array_equal(found[~known & links], nominal[~known & links])
     assert not np.allclose(arm.robot.mdh, true.state.mdh, atol=1e-5)

@@ -195,7 +195,8 @@ BROKEN = {
             '<axis xyz="0 0 0"/>': "its axis is a zero vector",
             '<limit lower="1" upper="-1"/>': "limit lower is not below upper",
             '<limit lower="one"/>': "expected a number",
-            '<mimic joint="k"/>': "is mimic; only",
+            '<mimic joint="k"/>': "mimics 'k', no moving joint of this chain",
+            '<mimic joint="j"/>': "mimics 'j', a ring",
             '<origin xyz="1e300 0 0"/>': "is off by|over 1 km|check units",
         }.items()
     },

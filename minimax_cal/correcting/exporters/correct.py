@@ -28,7 +28,14 @@ from minimax_cal.robots.transforms import (
     to_rpy,
     transform,
 )
-from minimax_cal.robots.urdf import EXACT, UrdfRobot, random_joints, tip_poses, to_robot
+from minimax_cal.robots.urdf import (
+    EXACT,
+    UrdfRobot,
+    follow_of,
+    random_joints,
+    tip_poses,
+    to_robot,
+)
 from minimax_cal.robots.urdf_file import Joint, Urdf, edited, origin_edit, parse_urdf
 
 MISFIT = 0.02  # the nominal robot and the URDF may differ by so much [m, rad]
@@ -139,9 +146,11 @@ def rewritten(urdf: Urdf, chain: Sequence[Joint], targets: Sequence[Array], tip:
     """The bytes of the URDF with each moving joint's link where targets say, and the tip at tip."""
     wanted: dict[str, Array] = {}
     at, number = np.eye(4), 0
+    rest = follow_of(chain).offset  # of mimics at joint values 0
     for joint in chain:
         if joint.moves:
-            wanted[joint.name] = inverse(at) @ targets[number]
+            there = inverse(joint.motion(rest[[number]])[0])
+            wanted[joint.name] = inverse(at) @ targets[number] @ there
             at, number = targets[number], number + 1
         else:
             at = at @ joint.origin
@@ -153,6 +162,7 @@ def rewritten(urdf: Urdf, chain: Sequence[Joint], targets: Sequence[Array], tip:
             wanted[chain[last + 1].name] = inverse(targets[-1]) @ tip @ inverse(beyond)
         else:
             wanted[chain[last].name] = wanted[chain[last].name] @ inverse(targets[-1]) @ tip
+
     edits = []
     for joint in chain:
         new = wanted.get(joint.name, joint.origin)

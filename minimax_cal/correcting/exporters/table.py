@@ -35,12 +35,14 @@ class Exporter:
     """A format.
 
     write: its file.  carries: the effects of a cell that the file holds.  only: of the geometry it
-    holds no more than a fit with this `only` finds; all of it where empty.
+    holds no more than a fit with this `only` finds; all of it where empty.  couples: whether it
+    holds that a joint follows others.
     """
 
     write: Callable[[Job], Export]
     carries: Carries = nothing
     only: str = ""
+    couples: bool = False
 
 
 def later(module: str, verb: str) -> Callable[..., Any]:
@@ -50,12 +52,12 @@ def later(module: str, verb: str) -> Callable[..., Any]:
 
 MJCF = "minimax_cal.simulators.exporter"
 EXPORTERS: dict[str, Exporter] = {
-    "urdf": Exporter(urdf.write),
+    "urdf": Exporter(urdf.write, couples=True),
     "ur-yaml": Exporter(ur_yaml.write),
     "ros-yaml": Exporter(ros_yaml.write),
     "ros2-control": Exporter(ros2_control.write, only=OFFSETS),
     "dh-csv": Exporter(dh_csv.write),
-    "json": Exporter(robot_json.write),
+    "json": Exporter(robot_json.write, couples=True),
     "moc": Exporter(moc.write, moc.carries),
     "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries")),
 }
@@ -77,6 +79,11 @@ def export(job: Job, to: str) -> Export:
         raise OptionError(f"mjcf goes with the format mjcf, not with {to}")
     if job.tip and not (job.originals or job.model):
         raise OptionError("tip names a link of the file given as urdf or mjcf")
+    if len(job.robot.coupling) and not chosen.couples:
+        able = ", ".join(name for name, one in EXPORTERS.items() if one.couples)
+        raise OptionError(
+            f"{to}: has no place for joints that follow others (coupling); use {able}"
+        )
     found = chosen.write(job)
     if not job.originals:  # a given URDF keeps its own constants
         found = replace(found, notices=(*job.notices, *found.notices))

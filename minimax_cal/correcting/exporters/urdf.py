@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from minimax_cal.correcting.exporters.job import (
     triple,
 )
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.gravity import LEAST_MASS, inertia_of, masses_of, weighed
 from minimax_cal.robots.robot import LONGEST, Robot
 from minimax_cal.robots.transforms import tail, to_rpy
@@ -52,24 +54,72 @@ def new_urdf(robot: Robot) -> str:
         '  <link name="base_link"/>',
     ]
     lines += [body(robot, i, links[i + 1]) for i in range(robot.joints)]
+    lines += [f'  <link name="{name}"/>' for name in between(robot)]
     lines.append('  <link name="flange"/>')
     for i, (name, pose) in enumerate(zip((*names, "flange_joint"), origins(robot), strict=True)):
         last = i == robot.joints
-        bounded = not last and np.isfinite([robot.lower[i], robot.upper[i]]).any()
-        kind = "fixed" if last else "prismatic" if robot.prismatic[i] else "continuous"
-        kind = "revolute" if kind == "continuous" and bounded else kind
-        rpy = to_rpy(pose)
-        lines += [
-            f'  <joint name="{name}" type="{kind}">',
-            f'    <origin xyz="{triple(pose[:3, 3])}" rpy="{triple(rpy)}"/>',
-            f'    <parent link="{links[i]}"/>',
-            f'    <child link="{links[i + 1]}"/>',
-        ]
-        if not last:
-            lines.append(f'    <axis xyz="0 0 {int(robot.sign[i])}"/>')
-            lines.append(limit(robot.lower[i], robot.upper[i], kind))
-        lines.append("  </joint>")
+        parts = [Part(name, links[i], links[i + 1])] if last else parts_of(robot, i, links)
+        for part in parts:
+            bounded = np.isfinite([part.lower, part.upper]).any()
+            kind = "fixed" if last else "prismatic" if robot.prismatic[i] else "continuous"
+            kind = "revolute" if kind == "continuous" and bounded else kind
+            lines += [
+                f'  <joint name="{part.name}" type="{kind}">',
+                f'    <origin xyz="{triple(pose[:3, 3])}" rpy="{triple(to_rpy(pose))}"/>',
+                f'    <parent link="{part.parent}"/>',
+                f'    <child link="{part.child}"/>',
+            ]
+            if not last:
+                lines.append(f'    <axis xyz="0 0 {int(robot.sign[i])}"/>')
+                lines.append(limit(part.lower, part.upper, kind))
+            lines += [part.mimic] if part.mimic else []
+            lines.append("  </joint>")
+            pose = np.eye(4)
     return "\n".join([*lines, "</robot>", ""])
+
+
+@dataclass(frozen=True)
+class Part:
+    """A joint of the URDF, with its limits.  mimic: its element, empty where it has a drive."""
+
+    name: str
+    parent: str
+    child: str
+    lower: float = -np.inf
+    upper: float = np.inf
+    mimic: str = ""
+
+
+def parts_of(robot: Robot, i: int, links: Sequence[str]) -> list[Part]:
+    """Joint i as joints on one axis: one for each other that it follows, then its own drive.
+
+    Raises OptionError for a joint that takes another share than 1 of its own value.
+    """
+    name, limits = joint_names(robot)[i], (robot.lower[i], robot.upper[i])
+    if not len(robot.coupling):
+        return [Part(name, links[i], links[i + 1], *limits)]
+    shares = robot.coupling[i]
+    if shares[i] not in (0.0, 1.0):
+        raise OptionError(f"urdf: joint {i + 1} takes {shares[i]:g} of its own value; use json")
+    others = [int(j) for j in np.flatnonzero(shares) if j != i]
+    ends = [links[i], *(f"link_{i + 1}_with_{j + 1}" for j in others)]
+    ends = [*ends, links[i + 1]] if shares[i] else [*ends[:-1], links[i + 1]]
+    drives = joint_names(robot)
+    drives, follow = joint_names(robot), []
+    for at, j in enumerate(others):
+        low, high = sorted(float(shares[j] * end) for end in (robot.lower[j], robot.upper[j]))
+        mimic = f'    <mimic joint="{drives[j]}" multiplier="{number(shares[j])}"/>'
+        follow.append(Part(f"{name}_with_{j + 1}", ends[at], ends[at + 1], low, high, mimic))
+    return [*follow, Part(name, ends[-2], ends[-1], *limits)] if shares[i] else follow
+
+
+def between(robot: Robot) -> list[str]:
+    """Links between the joints on one axis, which have no body."""
+    own = [f"link_{i + 1}" for i in range(robot.joints)]
+    known = {*own, "base_link", "flange"}
+    links = ["base_link", *own, "flange"]
+    parts = [part for i in range(robot.joints) for part in parts_of(robot, i, links)]
+    return [part.child for part in parts if part.child not in known]
 
 
 def limit(lower: float, upper: float, kind: str) -> str:

@@ -220,12 +220,13 @@ def all_ways(robot: Robot, goals: Array) -> Iterator[Array]:
     """For each goal (4, 4) of the flange the different joints (s, n) that reach it."""
     span = near_zero(robot.lower, robot.upper)
     begin = np.random.default_rng(0).uniform(*span, (STARTS, robot.joints))
-    lever, signs = LEVER * robot.reach(), robot.sign
+    lever, turning = LEVER * robot.reach(), robot.turning
     for first in range(0, len(goals), CHUNK):
         chunk = np.repeat(goals[first : first + CHUNK], STARTS, axis=0)
 
         def look(rows: Array, q: Array, goal: Array = chunk) -> tuple[Array, Array]:
-            return missing(robot.mdh, q * signs, robot.prismatic, signs, goal[rows], lever)
+            here = robot.turned(q)
+            return missing(robot.mdh, here, robot.prismatic, turning, goal[rows], lever)
 
         start = np.tile(begin, (len(chunk) // STARTS, 1))
         box = (np.broadcast_to(end, start.shape) for end in (robot.lower, robot.upper))

@@ -25,8 +25,8 @@ def reach(
     place = transform(np.eye(3), goal)
 
     def look(rows: Array, here: Array) -> tuple[Array, Array]:
-        signs = robot.sign
-        return missing(robot.mdh, here * signs, robot.prismatic, signs, place[rows], 0.0, ball)
+        turned, turning = robot.turned(here), robot.turning
+        return missing(robot.mdh, turned, robot.prismatic, turning, place[rows], 0.0, ball)
 
     anywhere = np.full(q.shape, np.inf)
     found = nearest(look, q, -anywhere, anywhere, longest=LONGEST, steps=iterations)

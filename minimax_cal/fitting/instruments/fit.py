@@ -183,10 +183,10 @@ def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
     return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
 
 
-def parameters_of(fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
+def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
     """Every parameter, link by link; then target, anchors and, where fitted, offsets."""
     names = fit.instrument.names
-    before, after = (x.along(np.eye(3)) for x in (fit.nominal, fit.state))
+    before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     hidden = ("base_",) if offset else ("base_", "offset")
     every = link_by_link(names, names.units, before, after, sigma, fit.identification)

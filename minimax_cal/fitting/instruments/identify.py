@@ -108,7 +108,7 @@ def closed(robot: Robot, closures: Closures, x: State) -> Closures:
     """
     centre = closures.barycentres(places(closures.model, x))
     goal = np.repeat(centre, closures.visits, axis=-1).T
-    q, _ = reach(robot, x.target_positions[0], goal, closures.model.q * robot.sign)
+    q, _ = reach(robot, x.target_positions[0], goal, robot.commanded(closures.model.q))
     socket = np.repeat(np.arange(len(closures.first)), closures.visits)
     return Closures.of(robot, q, socket, closures.pairs, closures.distance)
 

@@ -70,7 +70,7 @@ def relative(
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     data = data if isinstance(data, RelativeData) else read_relative(data)
     check_options(data, chosen)
-    check_joints(robot, data.at)
+    data = replace(data, at=check_joints(robot, data.at))
     begin = from_poses if data.kind == "poses" else from_instrument
     return begin(robot, data, chosen, progress)
 
@@ -94,7 +94,7 @@ def from_instrument(
         status=fitted.found.status[0],
         iterations=int(fitted.found.iterations[0]),
         seconds=time.perf_counter() - began,
-        parameters=fit.parameters_of(fitted, offset=options.offset),
+        parameters=fit.parameters_of(robot, fitted, offset=options.offset),
         errors=fit.errors_of(robot, fitted, data, held),
         numbers=fit.count_numbers(data, held),
         turns={},

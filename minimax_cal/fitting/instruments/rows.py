@@ -22,11 +22,11 @@ TARGET = "target"  # the point on the flange: of the wires, or the ball
 
 def arm_at(robot: Robot, q: Array) -> Model:
     """The arm with one point on its flange at joint values (m, n), as the controller gives them."""
-    names = Names(robot.joints, (TARGET,))
+    names = Names.of(robot, (TARGET,))
     mean = np.zeros(names.count)
     mean[names.links] = links_of(robot.mdh)
     return Model(
-        q=q * robot.sign,
+        q=robot.turned(q),
         prismatic=robot.prismatic,
         y=np.zeros((1, 3, len(q))),
         weight=np.ones((1, len(q))),
@@ -72,7 +72,7 @@ class Wires:
         numbers = [wire.removeprefix("wire") for wire in wires]
         own = [f"anchor{number}_{axis}" for number in numbers for axis in "xyz"]
         own += [f"offset{number}" for number in numbers]
-        return Wires(arm_at(robot, q), Names(robot.joints, (TARGET,), tuple(own)), length)
+        return Wires(arm_at(robot, q), Names.of(robot, (TARGET,), tuple(own)), length)
 
     @property
     def points(self) -> int:

@@ -30,6 +30,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
+from minimax_cal.robots.robot import Robot
 
 TINY = 1e-300  # in place of a zero
 ALIKE = 1e-9  # two drawings are one to this [m, rad]
@@ -56,7 +57,8 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     value = [drawn + turn @ (links_of(fit.cell.robot.mdh) - drawn) for fit in fits]
     covariance = sum(turn @ links_covariance(fit) @ turn.T for fit in fits)
     told = [told_by(fit, kept, n) for fit in fits]
-    each = tuple(differences(one, value, np.asarray(covariance), kept, told))
+    told_in = [in_convention(one.cell.robot, links) for links in value]
+    each = tuple(differences(one, told_in, np.asarray(covariance), kept, told))
     found, same = changed(one, other)
     return Comparison(
         names=(names[0], names[1]),
@@ -67,6 +69,11 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
         same=same,
         notices=tuple(remarks(one, other)),
     )
+
+
+def in_convention(robot: Robot, links: Array) -> Array:
+    """(5n,) link parameters with the values that the convention of the robot's file has."""
+    return links_of(robot.notation.told(links.reshape(5, -1).T, robot.prismatic))
 
 
 def check_alike(one: Fit, other: Fit) -> None:

@@ -82,7 +82,7 @@ def free_columns(watched: Watched, rows: Rows) -> Array:
 def lacking(watched: Watched, rows: Rows) -> tuple[Array, Array]:
     """(N, l) new rows by what the model lacks, and (l,) which factors share a variance."""
     robot, (m, r, n) = watched.cell.robot, rows.arm.shape
-    by_angle, joint = by_pose(robot, watched.data.q * robot.sign, rows.arm)
+    by_angle, joint = by_pose(robot, robot.turned(watched.data.q), rows.arm)
     links = rows.jacobian[: m * r, : 5 * n].reshape(m, r, 5 * n)
     drift, kind = drifts(watched, links, rows.arm, when_of(watched), NEW)
     columns = np.concatenate([by_angle, drift], axis=2).reshape(m * r, -1)

@@ -29,7 +29,7 @@ def watched_of(
 ) -> tuple[Watched, tuple[str, ...]]:
     """The new measurements beside the calibration; what was left out.  Raises CalibrationError."""
     known_by = fit.known
-    check_joints(fit.cell.robot, data)
+    data = check_joints(fit.cell.robot, data)
     if len(np.unique(labels(data))) > 1:
         raise DataError(f"{data.source}: holds several sessions; check them one by one")
     cell, frame, tool = fit.cell, "frame" in known, "targets" in known

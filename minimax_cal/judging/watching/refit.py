@@ -34,8 +34,9 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     drawn = fit.before.robot
     nominal = place(drawn, data)
     axes, blank = nominal.base[:3, :3], np.zeros(names.count - names.geometric)
-    drawn_at = replace(nominal.state, effects=blank).along(axes)
-    every = link_by_link(names, sure.units, drawn_at, cell.state.along(axes), sure.sigma, known)
+    drawn_at = replace(nominal.state, effects=blank).along(axes, drawn)
+    end = cell.state.along(axes, cell.robot)
+    every = link_by_link(names, sure.units, drawn_at, end, sure.sigma, known)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
     links = [names.all[i] for i in range(5 * fit.cell.robot.joints) if not rows.active[i]]

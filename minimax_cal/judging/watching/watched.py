@@ -58,7 +58,7 @@ class Watched:
         """Of all parameters now."""
         robot, targets = self.cell.robot, self.cell.target_names
         scene = self.cell.scene(still(np.zeros((1, robot.joints)), targets, robot))
-        return Names(robot.joints, targets, names_of(self.cell.effects.terms, scene)[0])
+        return Names.of(robot, targets, names_of(self.cell.effects.terms, scene)[0])
 
     @cached_property
     def old(self) -> Old | None:

@@ -73,7 +73,7 @@ class Scene:
     @cached_property
     def q(self) -> Array:
         """(n, m) joint values, signs applied [rad, m]."""
-        return np.ascontiguousarray((self.data.q * self.robot.sign).T)
+        return np.ascontiguousarray(self.robot.turned(self.data.q).T)
 
     @cached_property
     def jacobian(self) -> Array:

@@ -206,7 +206,7 @@ def refused(claims: tuple[Claim, ...], status: Status) -> tuple[Claim, ...]:
 def changed(before: Robot, after: Robot) -> str:
     """Links that no whole arm changes so much; empty where there are none."""
     change = links_of(after.mdh - before.mdh)
-    return wild(Names(before.joints, ()), change, before.reach())
+    return wild(Names.of(before, ()), change, before.reach())
 
 
 def model_of(fit: Fit) -> str:

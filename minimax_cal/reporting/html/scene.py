@@ -90,7 +90,7 @@ def skeleton(robot: Robot, q: Array) -> tuple[Array, Array]:
 
     Each link goes along its joint axis by d, then along its normal by a.  q: (m, n) [rad, m].
     """
-    links = chain(robot.mdh, q * robot.sign, robot.prismatic)
+    links = chain(robot.mdh, robot.turned(q), robot.prismatic)
     spots, joints = [np.zeros((len(q), 3))], [True]
     for i in range(robot.joints):
         start, end = links.before[i].T, links.after[i].T
