@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.cell import Cell, load_cell
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+    from minimax_cal.planning.motion_plan import plan_motion
     from minimax_cal.planning.plan import plan
     from minimax_cal.reporting.fleet.overview import fleet
     from minimax_cal.reporting.report import report
@@ -97,6 +98,7 @@ __all__ = [
     "measurements",
     "minimize_max",
     "plan",
+    "plan_motion",
     "read_measurements",
     "read_runs",
     "register",
@@ -149,6 +151,7 @@ MODULES = {  # name: where it is defined
     "Run": "dynamics.run",
     "read_runs": "dynamics.logs",
     "plan": "planning.plan",
+    "plan_motion": "planning.motion_plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",
     "Delivered": "correcting.deliverable",

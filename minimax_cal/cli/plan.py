@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
@@ -15,13 +18,20 @@ from minimax_cal.cli.options import (
     options_from,
     plain_option,
     result_options,
+    show,
+    writable,
 )
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import write_whole
+from minimax_cal.planning.motion_plan import GROUP, MotionOptions, plan_motion
 from minimax_cal.planning.options import PlanOptions, limits_of
 from minimax_cal.planning.plan import plan
 from minimax_cal.planning.stops import ANGLES
 from minimax_cal.reporting.plots.plan import save_plan
-from minimax_cal.robots.robot import load_robot
+from minimax_cal.robots.robot import Robot, load_robot
+
+MOTION = tuple(field.name for field in fields(MotionOptions))  # options of motions alone
+SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
 
 
 @click.command(name="plan", cls=InGroups)
@@ -30,9 +40,18 @@ from minimax_cal.robots.robot import load_robot
     "What the poses are for",
     "--poses",
     type=int,
-    required=True,
     metavar="N",
     help="How many poses to measure.",
+)
+@plain_option(
+    GROUP,
+    "--motion",
+    is_flag=True,
+    help="Plan a motion instead, whose torques tell masses and friction.",
+)
+@options_from(MotionOptions)
+@plain_option(
+    GROUP, "--waypoints", type=PATH, help="Write points and speeds at 10 Hz to this CSV file too."
 )
 @plain_option(
     "What is known",
@@ -51,14 +70,34 @@ from minimax_cal.robots.robot import load_robot
     help=f"The unit of joints in the file: {' or '.join(ANGLES)}.",
 )
 @result_options("the poses (CSV)", figure="the poses and how accuracy grows with their number")
-def plan_command(robot: str, unit: str, to: Output, **chosen: Any) -> int:
-    """Which poses of ROBOT to measure next, in which order, and how accurate they will make it."""
+def plan_command(
+    robot: str,
+    unit: str,
+    to: Output,
+    *,
+    poses: int | None,
+    motion: bool,
+    waypoints: Path | None,
+    **chosen: Any,
+) -> int:
+    """Which poses of ROBOT to measure next, in which order, and how accurate they will make it.
+
+    Or, with --motion, a motion to drive while torques or currents are logged.
+    """
     if unit not in ANGLES:
         raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")
+    check_given(motion)
     arm = load_robot(robot)
     chosen["joints"] = limits_of(chosen["joints"], arm)
+    if motion:
+        writable(waypoints)
+        return show_motion(arm, unit, to, waypoints, chosen)
+    if poses is None:
+        raise OptionError("give the number of poses=, or motion= for a motion")
+    for name in MOTION:
+        chosen.pop(name)
     with to.stages() as progress:
-        found = plan(arm, progress=progress, **chosen)
+        found = plan(arm, poses, progress=progress, **chosen)
     to.notice(*found.notices)
     to.write_rows(lambda: found.csv(unit), found.json)
     to.draw(save_plan, found)
@@ -67,4 +106,36 @@ def plan_command(robot: str, unit: str, to: Output, **chosen: Any) -> int:
         return 0
     options.terminal().print(found.headline() + "\n", markup=False)
     options.show(*found.tables(), *(() if to.path else (found.pose_table(unit),)))
+    return 0
+
+
+def check_given(motion: bool) -> None:
+    """Raise OptionError for options of poses with a motion, or the other way round."""
+    at = click.get_current_context()
+    theirs = {field.name for field in fields(PlanOptions)} - set(SHARED)
+    theirs = {*theirs, "poses", "fit", "data", "figure"} if motion else {*MOTION, "waypoints"}
+    for name in sorted(theirs):
+        if at.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            what = "poses, not about a motion" if motion else "a motion; add motion="
+            raise OptionError(f"{name}= is about {what}")
+
+
+def show_motion(
+    arm: Robot, unit: str, to: Output, waypoints: Path | None, chosen: dict[str, Any]
+) -> int:
+    """Plan a motion, write and show it."""
+    wanted = {name: chosen[name] for name in (*MOTION, *SHARED)}
+    with to.stages() as progress:
+        found = plan_motion(arm, progress=progress, **wanted)
+    to.notice(*found.notices)
+    to.write_rows(lambda: found.csv(unit), found.json)
+    if waypoints:
+        write_whole(waypoints, found.waypoints(unit))
+        to.wrote(waypoints)
+    if to.as_json:
+        click.echo(found.json(), nl=False)
+        return 0
+    show(found.told_table(), headline=found.headline())
+    if not to.path:
+        click.echo("nothing written; add -o FILE")
     return 0

@@ -63,6 +63,7 @@ TEMPLATES = (
     "diagnose irb120 data.csv --json",
     "plan ROBOT --poses 6 --candidates 40 -o out.csv",
     "plan irb120 --poses 4 --candidates 40 --fit fit.json --data data.csv --json",
+    "plan irb120 --motion --duration 6 --rows-per-second 20 -o out.csv",
     "simulate ROBOT --poses 8 -o out.csv --truth out.json",
     "effects ROBOT data.csv --json",
     "gap robot.urdf data.csv --fit fit.json --diagnosis diagnosis.json --json",

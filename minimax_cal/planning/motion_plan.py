@@ -1,0 +1,460 @@
+"""Plan a motion whose torques tell an arm's masses and friction, and what they will tell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.regressor import (
+    PER_LINK,
+    Motion,
+    base_parameters,
+    inertial_parameters,
+    regressor,
+)
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import json_text, plain, write_whole
+from minimax_cal.ground.options import option
+from minimax_cal.ground.seeds import check_seed
+from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.ground.tables import Cell as TableCell
+from minimax_cal.ground.tables import Table
+from minimax_cal.planning.candidates import limits_of
+from minimax_cal.planning.motion import (
+    SURE_HZ,
+    Bounds,
+    Series,
+    free_series,
+    improved,
+    shrunk,
+)
+from minimax_cal.planning.stops import ANGLES, csv_text
+from minimax_cal.planning.visibility import THICK, Room
+from minimax_cal.robots.gravity import masses_of, weighed
+from minimax_cal.robots.robot import Robot, load_robot
+
+GROUP = "A motion instead of poses"
+HARMONICS, SLOW_HARMONICS = 8, 3  # of a series
+SLOW_SPEED = 0.2  # peak of the slow part: friction below it is seen nowhere else [rad/s, m/s]
+SLOW_PERIOD = 30.0  # of the slow part at least [s]
+DRAWN, ROUNDS = 8, 150  # series drawn, and random steps from the best of them
+ROWS_HZ = 5.0  # rows that count as independent: noise of torques is correlated in time
+NOISE = 0.01  # of the range of a joint's torque; measured arms have 0.3 to 2 %
+LEAST_NOISE = 0.05  # of any joint [N m, N]
+REST = 0.02  # of the largest speed: below it friction has no sign
+NOT_APART = 1e4  # relative sigma above which a parameter is not separable
+WAYPOINTS_HZ = 10.0
+SCHEMA = 1
+SHORTEST, LONGEST = 5.0, 300.0  # of a part [s]
+FASTEST_ROWS = 1000.0
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """What a motion is to be like.
+
+    duration: of a part [s].  speed, acceleration: of every joint at most [rad/s, rad/s^2], of
+    slides a metre a second where joints have a thousand degrees.  payload: known mass at the
+    flange in a part of its own [kg], None for none.  rows: of the file, a second.
+    """
+
+    duration: float = option(20.0, "How long a part of the motion takes, s.", group=GROUP)
+    speed: float = option(
+        np.radians(60.0), "The highest speed of a joint, deg/s (slides: mm/s).", "deg", group=GROUP
+    )
+    acceleration: float = option(
+        np.radians(120.0),
+        "The highest acceleration of a joint, deg/s^2 (slides: mm/s^2).",
+        "deg",
+        group=GROUP,
+    )
+    payload: float | None = option(
+        None,
+        "A known mass at the flange, kg; a part with it tells masses and drive gains apart.",
+        metavar="KG",
+        read=float,
+        group=GROUP,
+    )
+    rows: float = option(100.0, "Rows a second in the file.", flag="--rows-per-second", group=GROUP)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of the motion, recorded as a run of its own.  payload: [kg]."""
+
+    name: str
+    series: Series
+    payload: float
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a parameter's sigma will be [unit], inf if not separable.  place: as J2."""
+
+    parameter: str
+    place: str
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """parts: in the order of driving.  told: what they will tell, for a noise of `noise` (n,)."""
+
+    robot: Robot
+    parts: tuple[Part, ...]
+    told: tuple[Told, ...]
+    noise: Array
+    base: int
+    settings: Mapping[str, object]
+    notices: tuple[str, ...]
+    seconds: float
+
+    def headline(self) -> str:
+        """The plan in a few sentences."""
+        total = sum(part.series.period for part in self.parts)
+        names = ", ".join(f"{part.name} {part.series.period:g} s" for part in self.parts)
+        return (
+            f"{self.robot.name}: {total:g} s of motion ({names}), each begins and ends at rest. "
+            f"Tells {self.base} base parameters of the masses, and the friction of each joint."
+        )
+
+    def motion_table(self) -> Table:
+        """Range, speed and acceleration of each joint in each part."""
+        rows: list[tuple[TableCell, ...]] = []
+        slides = self.robot.prismatic
+        for part in self.parts:
+            moved = part.series.at(part.series.grid(SURE_HZ))
+            for j in range(self.robot.joints):
+                scale = 1e3 if slides[j] else 180.0 / np.pi
+                unit = "mm" if slides[j] else "deg"
+                low, high = moved.q[:, j].min(), moved.q[:, j].max()
+                top = [np.abs(values[:, j]).max() for values in (moved.qd, moved.qdd)]
+                sizes = [float(scale * value) for value in (low, high, *top)]
+                rows.append((part.name, f"J{j + 1}", *sizes, unit))
+        header = ("part", "joint", "from", "to", "speed /s", "acceleration /s^2", "unit")
+        return Table("motion", header, tuple(rows), ("", "", ".1f", ".1f", ".1f", ".1f", ""))
+
+    def told_table(self) -> Table:
+        """Predicted standard deviations, a row a joint."""
+        kinds = dict.fromkeys(told.parameter for told in self.told)
+        by = {(told.parameter, told.place): told for told in self.told}
+        rows: list[tuple[TableCell, ...]] = []
+        for j in range(self.robot.joints):
+            mine = [by[kind, f"J{j + 1}"] for kind in kinds]
+            rows.append((f"J{j + 1}", float(self.noise[j]), *map(shown, mine)))
+        header = ("joint", "noise", *(f"{kind} +-" for kind in kinds))
+        formats = ("", ".3g", *("" for _ in kinds))
+        return Table("standard deviations, predicted", header, tuple(rows), formats)
+
+    def rows_of(self, unit: str, rate: float, speeds: bool) -> str:
+        """CSV of all parts.  unit: of turning joints.  Raises OptionError."""
+        if unit not in ANGLES:
+            raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")
+        slides, n = self.robot.prismatic, self.robot.joints
+        scale = np.where(slides, 1e3, ANGLES[unit])
+        named = ["mm" if slides[j] else unit for j in range(n)]
+        header = ["run", "t_s", *(f"q{j + 1}_{named[j]}" for j in range(n))]
+        header += [f"qd{j + 1}_{named[j]}_s" for j in range(n)] if speeds else []
+        loaded = any(part.payload for part in self.parts)
+        header += ["payload_kg"] if loaded else []
+        rows: list[list[Any]] = []
+        for part in self.parts:
+            grid = part.series.grid(rate)
+            moved = part.series.at(grid)
+            blocks = [moved.q * scale, *([moved.qd * scale] if speeds else [])]
+            for at, t in enumerate(grid):
+                row = [float(value) for block in blocks for value in block[at]]
+                load = [f"{part.payload:g}"] if loaded else []
+                rows.append([part.name, f"{t:.6g}", *row, *load])
+        return csv_text(header, rows)
+
+    def csv(self, unit: str = "deg") -> str:
+        """The motion, in the columns of a log: drive it, and add the torques."""
+        return self.rows_of(unit, float(str(self.settings["rows"])), False)
+
+    def waypoints(self, unit: str = "deg") -> str:
+        """Points and speeds for a controller that joins them by itself."""
+        return self.rows_of(unit, WAYPOINTS_HZ, True)
+
+    def save(self, path: Path | str) -> None:
+        """Write JSON."""
+        write_whole(path, self.json())
+
+    def json(self) -> str:
+        """JSON: the series' coefficients in SI, and what they will tell."""
+        return json_text(plain(self.to_dict()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        moved = self.motion_table()
+        return {
+            "schema": SCHEMA,
+            "kind": "motion_plan",
+            "robot": self.robot.name,
+            "parts": [
+                {
+                    "name": part.name,
+                    "period_s": part.series.period,
+                    "payload_kg": part.payload,
+                    "centre": part.series.centre,
+                    "cos": part.series.a,
+                    "sin": part.series.b,
+                }
+                for part in self.parts
+            ],
+            "base_parameters": self.base,
+            "noise": self.noise,
+            "tells": [
+                {"parameter": t.parameter, "place": t.place, "sigma": t.sigma, "unit": t.unit}
+                for t in self.told
+            ],
+            "motion": [dict(zip(moved.header, row, strict=True)) for row in moved.rows],
+            "settings": self.settings,
+            "notices": self.notices,
+            "seconds": self.seconds,
+        }
+
+
+def shown(told: Told) -> str:
+    """A predicted sigma, to people."""
+    return f"{told.sigma:.2g} {told.unit}" if np.isfinite(told.sigma) else "not separable"
+
+
+def plan_motion(
+    robot: Robot | str | Path,
+    *,
+    duration: float = 20.0,
+    speed: float = float(np.radians(60.0)),
+    acceleration: float = float(np.radians(120.0)),
+    payload: float | None = None,
+    rows: float = 100.0,
+    joints: Mapping[int, tuple[float, float]] | None = None,
+    volume: Sequence[Sequence[float]] = (),
+    floor: float = 0.0,
+    body: float | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> MotionPlan:
+    """A motion whose torques tell masses and friction, within limits, and what it will tell.
+
+    Parameters
+    ----------
+    robot
+        A robot, its file, or a built-in name.
+    duration
+        Of a part of the motion [s].
+    speed, acceleration
+        Of every joint at most [rad/s, rad/s^2]; a slide has 1 mm where others have 1 degree.
+    payload
+        Known mass at the flange [kg], for a part that tells masses and drive gains apart.
+    rows
+        Of the file, a second.
+    joints
+        Limits by joint index that narrow the robot's [rad, m].
+    volume
+        Lowest and highest corner of the box for the arm's points, base axes [m].
+    floor, body
+        Height of the floor, and radius of the arm's links [m].
+    seed
+        Of all that is random.
+    progress
+        Called with a sentence at each stage.
+
+    Returns
+    -------
+    MotionPlan
+        Its parts, what they will tell, and CSV in the columns of a log.
+
+    Raises
+    ------
+    OptionError
+        For options that make no sense, and where no motion stays within the limits.
+
+    Examples
+    --------
+    >>> mc.plan_motion("irb2600", payload=5.0).save("motion.json")
+    """
+    began = time.perf_counter()
+    arm = robot if isinstance(robot, Robot) else load_robot(robot)
+    options = MotionOptions(duration, speed, acceleration, payload, rows)
+    check_motion(options)
+    check_seed(seed)
+    bounds, notices = bounds_of(arm, options, joints or {}, volume, floor, body)
+    rng = np.random.default_rng(seed)
+    progress("drawing motions")
+    draw = partial(free_series, bounds, HARMONICS, duration)
+    drawn = [draw(rng) for _ in range(DRAWN)]
+    model = model_of(arm, drawn)
+    worth = partial(information, model)
+    best = max(drawn, key=worth)
+    progress("improving the best of them")
+    best = improved(best, bounds, worth, ROUNDS, rng)
+    slow = slow_part(best, bounds, worth, rng)
+    parts = [Part("fast", sure(best, bounds), 0.0), Part("slow", sure(slow, bounds), 0.0)]
+    if payload:
+        parts.append(Part("loaded", parts[0].series, payload))
+    else:
+        notices = (*notices, UNLOADED)
+    if not weighed(arm).all():
+        notices = (*notices, f"{arm.name} gives no masses: the noise is that of assumed ones")
+    settings = {
+        **plain(vars(options)),
+        "joints": {str(joint): limits for joint, limits in (joints or {}).items()},
+        "volume": volume,
+        "floor": floor,
+        "body": body,
+        "seed": seed,
+    }
+    told = tuple(told_by(model, parts))
+    seconds = time.perf_counter() - began
+    base = model.basis.shape[1]
+    return MotionPlan(arm, tuple(parts), told, model.noise, base, settings, notices, seconds)
+
+
+UNLOADED = (
+    "without a known payload, currents cannot tell masses from drive gains; plan a part with one "
+    "(payload=) where currents are logged"
+)
+
+
+def check_motion(options: MotionOptions) -> None:
+    """Raise OptionError for options that make no sense."""
+    if not SHORTEST <= options.duration <= LONGEST:
+        raise OptionError(f"duration={options.duration:g}: give {SHORTEST:g} to {LONGEST:g} s")
+    for name in ("speed", "acceleration"):
+        value = getattr(options, name)
+        if not 0.0 < value < np.inf:
+            raise OptionError(f"{name}={value:g}: give a number above 0")
+    if options.payload is not None and not 0.0 < options.payload < 3e3:
+        raise OptionError(f"payload={options.payload:g}: give its mass in kg, above 0")
+    if not 2.0 <= options.rows <= FASTEST_ROWS:
+        raise OptionError(f"rows={options.rows:g}: give 2 to {FASTEST_ROWS:g} a second")
+
+
+def bounds_of(
+    robot: Robot,
+    options: MotionOptions,
+    joints: Mapping[int, tuple[float, float]],
+    volume: Sequence[Sequence[float]],
+    floor: float,
+    body: float | None,
+) -> tuple[Bounds, tuple[str, ...]]:
+    """What the motion may do, and notices.  Raises OptionError."""
+    lower, upper, notices = limits_of(robot, joints)
+    radius = THICK * robot.reach() if body is None else body
+    up = np.array([[0.0, 0.0, 1.0]])
+    room = Room(robot, np.zeros((1, 3)), up, lower, upper, radius, floor)
+    scale = np.where(robot.prismatic, 1e-3 * 180.0 / np.pi, 1.0)  # degrees to mm
+    box = np.array(volume, dtype=float).reshape(-1, 3)
+    return Bounds(room, box, scale * options.speed, scale * options.acceleration), notices
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What torques depend on.  basis: (10 n, r) of base parameters.  noise: (n,) [N m, N].
+
+    links: (10 n,) inertial parameters, as given or assumed.
+    """
+
+    robot: Robot
+    basis: Array
+    links: Array
+    noise: Array
+
+
+def model_of(robot: Robot, drawn: Sequence[Series]) -> Model:
+    """The model of an arm, its base parameters and noise as some motions show them."""
+    known = weighed(robot)
+    mass, com = masses_of(robot)
+    given = robot if known.all() else replace(robot, mass=mass, com=com)
+    links = inertial_parameters(given).ravel()
+    columns = [regressor(robot, series.at(series.grid(ROWS_HZ))) for series in drawn]
+    basis = base_parameters(np.concatenate(columns).reshape(-1, robot.joints * PER_LINK))
+    span = np.ptp(np.concatenate([block @ links for block in columns]), axis=0)
+    return Model(robot, basis, links, np.maximum(NOISE * span, LEAST_NOISE))
+
+
+def friction(motion: Motion) -> Array:
+    """(m, n, 2 n) columns of Coulomb and viscous friction of each joint."""
+    m, n = motion.qd.shape
+    out = np.zeros((m, n, 2 * n))
+    moves = np.abs(motion.qd) > REST * np.abs(motion.qd).max(axis=0)
+    for j in range(n):
+        out[:, j, j] = np.sign(motion.qd[:, j]) * moves[:, j]
+        out[:, j, n + j] = motion.qd[:, j]
+    return out
+
+
+def information(model: Model, series: Series) -> float:
+    """Log-determinant of what a motion tells of base parameters and friction."""
+    motion = series.at(series.grid(ROWS_HZ))
+    columns = np.concatenate([regressor(model.robot, motion) @ model.basis, friction(motion)], -1)
+    white = (columns / model.noise[:, None]).reshape(-1, columns.shape[-1])
+    sign, size = np.linalg.slogdet(white.T @ white)
+    return float(size) if sign > 0.0 else -np.inf
+
+
+def slow_part(best: Series, bounds: Bounds, worth: Any, rng: np.random.Generator) -> Series:
+    """A series whose joints all peak at SLOW_SPEED, or below where limits say so."""
+    slow = replace(bounds, speed=np.minimum(bounds.speed, SLOW_SPEED))
+    period = max(SLOW_PERIOD, best.period)
+    drawn = [free_series(slow, SLOW_HARMONICS, period, rng) for _ in range(DRAWN)]
+    return max(drawn, key=worth)
+
+
+def sure(series: Series, bounds: Bounds) -> Series:
+    """The series, smaller where its points are not free between the rows that were looked at."""
+    return shrunk(series, bounds, SURE_HZ) or series.sized(0.0)
+
+
+def told_by(model: Model, parts: Sequence[Part]) -> list[Told]:
+    """Sigma of friction, armature and drive gain of each joint, all fitted together with masses."""
+    robot, n = model.robot, model.robot.joints
+    rows = []
+    for part in parts:
+        motion = part.series.at(part.series.grid(ROWS_HZ))
+        rigid = regressor(robot, motion)
+        payload = part.payload * rigid[:, :, PER_LINK * (n - 1)]  # a point mass at the flange
+        torque = rigid @ model.links + payload
+        own = np.zeros((len(torque), n, 2 * n))
+        for j in range(n):
+            own[:, j, j], own[:, j, n + j] = motion.qdd[:, j], torque[:, j]
+        rows.append(np.concatenate([rigid @ model.basis, friction(motion), own], axis=-1))
+    columns = np.concatenate(rows) / model.noise[:, None]
+    white = columns.reshape(-1, columns.shape[-1])
+    sigma = sigmas(white)[model.basis.shape[1] :].reshape(4, n)
+    out = []
+    for kind, values in zip(("Coulomb", "viscous", "armature", "drive gain"), sigma, strict=True):
+        for j, value in enumerate(values):
+            unit, scale = unit_of(kind, bool(robot.prismatic[j]))
+            out.append(Told(kind, f"J{j + 1}", scale * float(value), unit))
+    return out
+
+
+def unit_of(kind: str, slides: bool) -> tuple[str, float]:
+    """How people read a parameter's sigma, and the factor to it from SI."""
+    if kind == "drive gain":
+        return "%", 100.0
+    turning = {"Coulomb": "N m", "viscous": "N m s/rad", "armature": "kg m^2"}
+    sliding = {"Coulomb": "N", "viscous": "N s/m", "armature": "kg"}
+    return (sliding if slides else turning)[kind], 1.0
+
+
+def sigmas(white: Array) -> Array:
+    """(p,) standard deviations by whitened columns (N, p), inf where others do as well."""
+    scale = np.linalg.norm(white, axis=0)
+    used = scale > 0.0
+    out = np.full(white.shape[1], np.inf)
+    _, size, right = np.linalg.svd(white[:, used] / scale[used], full_matrices=False)
+    within = ((right / np.maximum(size, 1e-300)[:, None]) ** 2).sum(axis=0)
+    sigma = np.sqrt(within)  # 1 for a column that no other resembles
+    out[used] = np.where(sigma < NOT_APART, sigma / scale[used], np.inf)
+    return out
