@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import UNASKED, asked, judged_again, mostly_loose, often
+from minimax_cal.diagnosing.established import asked, judged_again, mostly_loose, often
 from minimax_cal.diagnosing.lack_of_fit import (
     Named,
     Trace,
@@ -28,6 +28,7 @@ from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import ENOUGH, STRUCTURE
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
+from minimax_cal.evidence.stability import NOT_ASKED
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.dictionary import arm_library
@@ -48,7 +49,7 @@ class Causes:
     faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether structure is left that matters, or names that change with the poses.  met: as `Again`
+    whether structure is left that matters, or names that change with the poses.  met: as `Repeats`
     has it.  maps: of joints, sought beside the effects, once there is a ladder.
     """
 
@@ -60,7 +61,7 @@ class Causes:
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
     wary: bool
-    met: float = UNASKED
+    met: float = NOT_ASKED
     maps: Mapped = NO_MAPS
 
     @property
@@ -122,7 +123,7 @@ def believed(causes: Causes, scene: Scene) -> list[Finding]:
 def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes, scene: Scene) -> bool:
     """Whether an effect is a best guess that is in no model.
 
-    Names that are one must help the fifths without which they were sought, and none is a wave by
+    Names that are one must help the poses without which they were sought, and none is a wave by
     itself.  terms: of the effect, every: of all that were found with it.
     """
     return causes.wary and (causes.met > 1.0 or lone(terms, every, scene))

@@ -9,7 +9,6 @@ import numpy as np
 from minimax_cal.diagnosing.causes import Causes, effects_of, held_back
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
-from minimax_cal.evidence.limits import MOST
 from minimax_cal.evidence.selection import select, tuned_again
 from minimax_cal.fitting.beyond import Beyond, Errors, not_claimed, without
 from minimax_cal.fitting.options import Progress
@@ -29,7 +28,7 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
-    choice = tuned_again(select(causes.choice.part(study.rows.at(rows)), seldom=MOST))
+    choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
     every = [candidate.term for candidate in choice.chosen]
     named = [
         terms for terms in effects_of(choice) if not held_back(terms, every, causes, study.scene)

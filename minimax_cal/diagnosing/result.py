@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from minimax_cal.diagnosing.curves import Curve, Leftover, order_curve, residual_curve
-from minimax_cal.evidence.limits import BAND, ENOUGH, FIRM, LEVEL
+from minimax_cal.evidence.limits import BAND, CONFIRMED, ENOUGH, LEVEL
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
@@ -53,7 +53,6 @@ PEOPLES = {  # how people read a unit of the file
     "rad": (1e3, "mrad"),
     "rad/(N m)": (1e3, "mrad/(N m)"),
 }
-DWARFED = "small beside a larger effect of the same course"  # in a file, too
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
@@ -107,10 +106,9 @@ class Finding:
     on held-out poses.  before, after: held-out RMS without and with it, the larger effects being
     known [mm].  rows: of a data fault.  motion: the largest that a unit of each parameter makes at
     the poses of the fit [rad, or m for a bending], where its own unit rests on masses that nobody
-    told; empty otherwise.  again: share of the fits, each without a part of the poses, in which it
-    was found again; NaN where poses are too few to ask.  dwarfed: whether it may be what the
-    law of a far larger effect lacks.  minor: whether it is below 5 % of the squared held-out error
-    that geometry leaves.
+    told; empty otherwise.  again: frequency, the share of the subsamples of the poses in which it
+    is found again; NaN where poses are too few to ask.  minor: whether it is below 5 % of the
+    squared held-out error that geometry leaves.
     curve: (3, g) of an error map: joint value, turn, sigma [rad].
     shown: the terms that the data ask for, where `terms` are the whole law that these belong to.
     """
@@ -130,14 +128,13 @@ class Finding:
     rows: tuple[int, ...] = ()
     motion: tuple[float, ...] = ()
     again: float = 1.0
-    dwarfed: bool = False
     minor: bool = False
     curve: Array = field(default_factory=lambda: np.zeros((3, 0)))
     shown: tuple[Term, ...] = ()
 
     @property
     def established(self) -> bool:
-        """Whether it was found again whichever poses were left out, and stands by itself."""
+        """Whether it is found again in nearly all subsamples of the poses."""
         return not self.why_tentative
 
     @property
@@ -145,9 +142,13 @@ class Finding:
         """What keeps it from being established; '' if nothing does."""
         if math.isnan(self.again):
             return "poses too few to leave any out"
-        if self.again < FIRM:
-            return "not found again without some of the poses"
-        return DWARFED if self.dwarfed else ""
+        return "not found again without some of the poses" if self.again < CONFIRMED else ""
+
+    @property
+    def evidence(self) -> str:
+        """Whether it is established, and the frequency that decides."""
+        said = "established" if self.established else "tentative"
+        return said if self.rows or math.isnan(self.again) else f"{said}, {self.again:.2f}"
 
     @property
     def term(self) -> Term:
@@ -477,8 +478,7 @@ class Diagnosis:
         rows: list[tuple[TableCell, ...]] = [
             (f"{f.term.effect} {f.term.place}{f.lines}",
              "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
-             100.0 * f.share + 0.0, f.before, f.after, f.chance,
-             "established" if f.established else "tentative")
+             100.0 * f.share + 0.0, f.before, f.after, f.chance, f.evidence)
             for i, f in enumerate(found)
         ]  # fmt: skip
         title = f"effects found, rung by rung; by chance, {LEVEL:g} is rare enough"

@@ -14,14 +14,13 @@ from minimax_cal.diagnosing.curves import Curve
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import (
     CURVE,
-    DWARFED,
     SCHEMA,
     Alternative,
     Diagnosis,
     Finding,
     Step,
 )
-from minimax_cal.evidence.limits import FIRM
+from minimax_cal.evidence.limits import CONFIRMED
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.fit_file import (
     EARLIER,
@@ -50,7 +49,7 @@ from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.solvers.status import Status
 
-BELOW = math.nextafter(FIRM, 0.0)  # what was tentative when it was written stays so
+BELOW = math.nextafter(CONFIRMED, 0.0)  # what was tentative when it was written stays so
 
 
 class FallPart(Part):
@@ -83,9 +82,8 @@ class FindingPart(Part):
     def again(self) -> float:
         """How often it was found again, so that what was tentative stays so."""
         if self.established:
-            return 1.0
-        every_time = self.frequency >= FIRM and self.why_tentative != DWARFED
-        return BELOW if every_time else self.frequency
+            return self.frequency if self.frequency >= CONFIRMED else 1.0
+        return BELOW if self.frequency >= CONFIRMED else self.frequency
 
     def finding(self, known: Sequence[Term]) -> Finding:
         """As the code has it.  known: terms that were fitted, with their choices."""
@@ -106,7 +104,6 @@ class FindingPart(Part):
             fixed=self.fixed,
             rows=self.lines,
             again=self.again,
-            dwarfed=self.why_tentative == DWARFED,
             minor=self.minor,
             curve=np.array([self.curve.get(key, []) for key in CURVE], dtype=float),
         )

@@ -112,15 +112,14 @@ def select(
     *,
     ripple: bool = True,
     level: float = LEVEL,
-    seldom: int = SELDOM,
     first: Sequence[Candidate] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
-    lib: of all rows, or of some, as `Choice.part` gives it: no other is looked at, and nothing is
-    tuned.  ripple: whether to look for lines of gears besides.  level: chance
-    of a false name on data without an effect.  seldom: of more than REFINED effects each is
-    compared anew after so many, and at the end.  first: what was chosen with other weights.
+    lib: of all rows, or of some, as `Choice.part` gives it: no other is looked at, nothing is
+    tuned, and replacement waits for the end.  ripple: whether to look for lines of gears besides.
+    level: chance of a false name on data without an effect.  first: what was chosen with other
+    weights.
     """
     lib, fits = begun(lib, first)
     noise = noise_beside(lib, fits)
@@ -142,10 +141,10 @@ def select(
         if not best:
             break
         fits = [*fits, *best]
-        if len(fits) <= REFINED or len(fits) % seldom == 0:
+        if not lib.is_part and (len(fits) <= REFINED or len(fits) % SELDOM == 0):
             lib, fits = refined(lib, fits, level)
         noise = noise_beside(lib, fits)
-    if len(fits) > REFINED:
+    if len(fits) > REFINED or lib.is_part:
         lib, fits = refined(lib, fits, level)
     lib, fits = one_course(lib, fits)
     fits = needed(lib, fits, level)

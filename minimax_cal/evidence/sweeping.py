@@ -17,6 +17,7 @@ from minimax_cal.ground.arrays import Array
 
 COUNT = 7  # ratios beside 0, between those of the noises beside nothing and beside all effects
 ROOM = 4.0  # by which a part's ratio may lie outside these
+LOWER = 4  # ratios beside 0 at which a candidate is compared
 SMALL = 0.03  # of the largest ratio: the least that is not 0
 
 
@@ -112,7 +113,8 @@ class Swept:
 
     def ratios_below(self, noise: Noise) -> Array:
         """(s,) the ratios at which candidates are compared beside a noise, the largest first."""
-        return self.ratios[self.ratios <= noise.ratio][::-1]
+        below = self.ratios[self.ratios <= noise.ratio][::-1]
+        return np.asarray(np.concatenate([below[:-1][:LOWER], below[-1:]]))
 
     def at(self, ratios: Array, index: Array) -> At:
         """Products at some of the ratios (s,), as `Products.at`."""

@@ -11,9 +11,10 @@ from experiments.gap_cases import Case, Cause, make
 from minimax_cal.diagnosing import causes as module
 from minimax_cal.diagnosing.causes import Causes, believed, causes_of, found_again, lone
 from minimax_cal.diagnosing.diagnose import with_maps
-from minimax_cal.diagnosing.established import Again, predicted
+from minimax_cal.diagnosing.established import Again
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.selection import select
+from minimax_cal.evidence.stability import predicted
 from minimax_cal.fitting.options import silent
 from minimax_cal.modelling.dictionary import ArmLaws
 

@@ -133,7 +133,7 @@ def test_tentative_effects_stand_together_below(found: Diagnosis) -> None:
     assert told.reasons[-1] == "Tentative, and no cause yet: gear_ripple at joint 1."
     table = told.effects_table()
     assert table.header[-1] == "evidence"
-    assert [(row[0], row[-1]) for row in table.rows][-1] == ("gear_ripple J1", "tentative")
+    assert [(row[0], row[-1]) for row in table.rows][-1] == ("gear_ripple J1", "tentative, 0.00")
 
 
 def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
