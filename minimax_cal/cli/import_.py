@@ -32,6 +32,7 @@ from minimax_cal.measuring.columns import rows_in
 from minimax_cal.measuring.faults import distance_faults
 from minimax_cal.measuring.importers import Imported, csv_of, import_files
 from minimax_cal.measuring.measurements import check_finite, measurements_in
+from minimax_cal.measuring.mending import mended
 from minimax_cal.measuring.set_aside import left_out
 
 TOLD = "What the files do not tell"
@@ -72,6 +73,15 @@ TOLD = "What the files do not tell"
     help="Points to set aside, and why: 12:smr2 is that of line 12, 12 all of its pose; several "
     "with commas, the reason after an equals sign.",
 )
+@plain_option(
+    TOLD,
+    "--mend",
+    multiple=True,
+    metavar="HOW",
+    help="What is wrong in the whole file: shift=1 (each row takes the points one row further on; "
+    "shift=1@40.. from line 40 on), reverse (points in the opposite order), joints=1:3:2:4:5:6 "
+    "(columns of joints 2 and 3 swapped), scale=0.999 (of the points).",
+)
 @SAFE_CELLS
 @JSON
 @QUIET
@@ -84,6 +94,7 @@ def import_command(
     layout: str | None,
     decimal: str | None,
     leave_out: tuple[str, ...],
+    mend: tuple[str, ...],
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -99,7 +110,7 @@ def import_command(
             raise OptionError(f"{name}= is about measured points, and {files[0]} is a log")
         return show_logs(import_logs(files, units=chosen["units"]), to, safe_cells)
     found = import_files(files, joints, layout=layout or "", decimal=decimal or "", **chosen)
-    found = replace(found, data=left_out(found.data, leave_out))
+    found = replace(found, data=left_out(mended(found.data, mend), leave_out))
     check_finite(found.data)  # what is left of it
     off = [fault.text for fault in distance_faults(found.data)]
     found = replace(found, data=replace(found.data, notices=(*found.data.notices, *off)))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.checks import POOR_FIT, check_plausible
+from minimax_cal.fitting.checks import POOR_FIT, check_plausible, coarse_joints
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
@@ -257,7 +257,9 @@ def parted(robot: Robot, data: Measurements, options: Options) -> Parts:
         objective_of(options.objective, data)
     near = EVERYWHERE
     if len(np.unique(groups(train))) >= LEAST_POSES:
-        near = check_plausible(robot, data).state.rotation
+        given = check_plausible(robot, data)
+        near = given.state.rotation
+        notices += tuple(filter(None, [coarse_joints(robot, data, given)]))
     return Parts(data, train, held, notices, near)
 
 

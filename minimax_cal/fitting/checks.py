@@ -5,11 +5,22 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
+from minimax_cal.fitting.common_scale import scale_of
 from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.checks import best_orders, suspicions, swapped
+from minimax_cal.measuring.checks import best_orders, swapped
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.slips import (
+    DIGITS,
+    LATE,
+    MOST_SHIFT,
+    digits_of,
+    mend_by,
+    slips,
+    stale_rows,
+    with_points_moved,
+)
 from minimax_cal.modelling.model import Model, in_base, model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
@@ -23,6 +34,15 @@ ROUNDS = 5
 APART = 8.0  # times the typical miss, and this share of the reach: no error of the arm
 LEAST = 0.02
 CLOSE = 3.0  # times the typical miss: where a row belongs
+LEAST_HEAD = 8  # rows that place a base well enough to judge others
+CLOSE_BY = 3  # rows at either end that no break is looked for in
+FEW_CLIPPED = 3  # rows at the end of a joint's values that are no chance
+LEAST_SCALE = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
+MOST_SCALE = 0.05  # a larger one is another unit, or another arm
+SURE = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
+LEAST_MOVING = 5  # joints whose links have ways enough to differ from a common factor
+NAMED = 12  # lines that a message names
+SHIFTS = tuple(by for size in range(1, MOST_SHIFT + 1) for by in (size, -size))
 NO_ROWS: Array = np.zeros(0, dtype=int)
 
 
@@ -38,7 +58,7 @@ def measured_and_predicted(model: Model, state: State) -> tuple[Array, Array]:
 
 
 def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
-    """The fit of base and targets; DataError for slips that show then: names, units, signs.
+    """The fit of base and targets; DataError for slips that show then: names, units, signs, rows.
 
     All rows are looked at, those held out too: they judge the fit.
     """
@@ -47,20 +67,23 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
             f"{data.source}: {robot.name} has no lengths: every a and d of its joints is 0; "
             "check the robot file"
         )
+    check_fresh(robot, data)
     given = fitted(robot, data)
     check_names(robot, data, given)
     limit = POOR_FIT * robot.reach()
+    check_scale(robot, data, given)
     if np.sqrt(given.mean_square) <= limit:
         return given
+    check_broken(robot, data)
     mirrored = "the measurement frame looks left-handed; reverse one of its axes"
-    few = data.take(np.linspace(0, data.poses - 1, min(data.poses, FEW)).astype(int))
-    shown = fitted(robot, few) if few.poses < data.poses else given  # of the same rows as trials
+    shown = fitted(robot, few_of(data))  # of the same rows as trials
     trials = [(mirrored, shown.mirrored)]
     with work(brief=False):
-        for text, mended in suspicions(robot, few):
-            left = fitted(robot, mended).mean_square
+        for slip in slips(robot, data):
+            mended = few_of(slip.data)
+            left = fitted(slip.robot, mended).mean_square
             if left < EXPLAINED * spread(mended):  # points drawn together are near any arm
-                trials.append((text, left))
+                trials.append((slip.text, left))
     least_square = min(mean_square for _, mean_square in trials)
     # a mirrored arm is one with some joints reversed: of equals the simplest, named first, is meant
     text, mean_square = next(trial for trial in trials if trial[1] <= 2.0 * least_square)
@@ -69,7 +92,146 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
             f"{data.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(mean_square):.3g} mm, not {1e3 * np.sqrt(shown.mean_square):.3g} mm)"
         )
+    check_clipped(robot, data)
     return given
+
+
+def few_of(data: Measurements) -> Measurements:
+    """At most `FEW` rows, spread evenly."""
+    if data.poses <= FEW:
+        return data
+    return data.take(np.linspace(0, data.poses - 1, FEW).astype(int))
+
+
+def lines_of(data: Measurements, rows: Array) -> str:
+    """Lines of some rows, for people and for --leave-out."""
+    return ",".join(str(data.line[row]) for row in rows[:NAMED])
+
+
+def check_fresh(robot: Robot, data: Measurements) -> None:
+    """Raise DataError where points are those of the row before, though the arm moved."""
+    rows = stale_rows(robot, data)
+    if len(rows):
+        raise DataError(
+            f"{data.source}:{data.line[rows[0]]}: {len(rows)} rows have the points of the row "
+            "before to the last digit, though the joints moved: stale readings; measure them "
+            f"again, or minimax-cal import {data.source} --leave-out {lines_of(data, rows)}"
+            f"{',...' if len(rows) > NAMED else ''} -o mended.csv"
+        )
+
+
+def check_scale(robot: Robot, data: Measurements, given: BaseFit) -> None:
+    """Raise DataError where a common factor on all points, and no error of links, fits the arm."""
+    moving = np.count_nonzero(np.ptp(data.q, axis=0) > 0.0)
+    if moving < LEAST_MOVING or len(np.unique(data.q, axis=0)) < LEAST_HEAD:
+        return
+    if np.sqrt(given.mean_square) > MOST_SCALE * robot.reach():
+        return
+    found = scale_of(robot, data, given)
+    change = found.factor - 1.0
+    if found.gain >= SURE and LEAST_SCALE < abs(change) < MOST_SCALE:
+        raise DataError(
+            f"{data.source}: all points lie {found.factor:.5g} times as far apart as {robot.name} "
+            "is drawn, as no error of links does: check the instrument's scale, units and "
+            "temperature compensation; to correct the points: "
+            f"{mend_by(data, f'scale={1.0 / found.factor:.6g}')}"
+        )
+
+
+def misses(robot: Robot, data: Measurements, state: State) -> Array:
+    """(m,) how far the points of each row lie from where a base and targets have them [m]."""
+    model = model_of(robot, data)
+    measured, predicted = measured_and_predicted(model, state)
+    squares = (np.where(model.seen[:, None], measured - predicted, 0.0) ** 2).sum(axis=(0, 1))
+    return np.asarray(np.sqrt(squares / np.maximum(model.seen.sum(axis=0), 1)))
+
+
+def check_broken(robot: Robot, data: Measurements) -> None:
+    """Raise DataError where, from some row on, points stand beside the joints of another row.
+
+    A beam break, or a line too many: one end of the file fits the drawn arm, and the other does
+    with its points moved.
+    """
+    if data.poses < 3 * LEAST_HEAD:
+        return
+    limit = 4.0 * POOR_FIT * robot.reach()
+    count = min(data.poses // 3, FEW)
+    rows = np.arange(data.poses)
+    for end in (rows[:count], rows[-count:]):
+        state = fitted(robot, data.take(end)).state
+        own = misses(robot, data, state)
+        if np.sqrt(np.mean(own[end] ** 2)) > limit:
+            continue
+        cost, by, at = min(broken_at(robot, data, state, own, by, last=end[0] > 0) for by in SHIFTS)
+        if np.sqrt(cost / data.poses) <= limit and cost < EXPLAINED * float((own**2).sum()):
+            word, where = ("below", by) if by > 0 else ("above", -by)
+            way = "up to" if end[0] > 0 else "from"
+            line = data.line[at]
+            to = f"..{line}" if end[0] > 0 else f"{line}.."
+            raise DataError(
+                f"{data.source}:{line}: {way} about this line the points of each pose stand "
+                f"{LATE[where]} {word} its joints: a row was lost, or is too many; complete it, or "
+                + mend_by(data, f"shift={by}@{to}")
+            )
+
+
+def broken_at(
+    robot: Robot, data: Measurements, state: State, own: Array, by: int, *, last: bool
+) -> tuple[float, int, int]:
+    """Least sum of squares if points are moved from some row on (last: up to it); by, and that row.
+
+    As many rows as they are moved by do not count: their points may be lost.
+
+    own: (m,) misses of the rows as they are.
+    """
+    moved = np.zeros(data.poses)
+    moved[slice(None, -by) if by > 0 else slice(-by, None)] = misses(
+        robot, with_points_moved(data, by), state
+    )
+    one, other = (moved, own) if last else (own, moved)
+    gap = abs(by)  # rows at the break whose own points are lost
+    sums = np.concatenate([[0.0], np.cumsum(one**2)])
+    after = np.concatenate([np.cumsum(other[::-1] ** 2)[::-1], [0.0]])
+    sums += np.concatenate([after[gap:], np.zeros(gap)])
+    inner = slice(CLOSE_BY, data.poses - CLOSE_BY)
+    at = CLOSE_BY + int(np.argmin(sums[inner]))
+    return float(sums[at]), by, at - last
+
+
+def check_clipped(robot: Robot, data: Measurements) -> None:
+    """Raise DataError where rows at the end of a joint's values miss, and they alone."""
+    limit = POOR_FIT * robot.reach()
+    for joint in range(data.q.shape[1]):
+        values = data.q[:, joint]
+        ends = [end for end in (values.min(), values.max()) if (values == end).sum() >= FEW_CLIPPED]
+        at_end = np.isin(values, ends)
+        if not ends or at_end.all() or (~at_end).sum() < LEAST_HEAD:
+            continue
+        rest = fitted(robot, data.take(~at_end))
+        away = misses(robot, data.take(at_end), rest.state)
+        if np.sqrt(rest.mean_square) <= limit and np.median(away) > CLOSE * limit:
+            worst = ", ".join(f"{end:.6g}" for end in ends)
+            unit = "m" if robot.prismatic[joint] else "rad"
+            raise DataError(
+                f"{data.source}: joint {joint + 1} looks clipped at {worst} {unit}: the "
+                f"{at_end.sum()} rows there miss by {1e3 * np.median(away):.3g} mm, the others by "
+                f"{1e3 * np.sqrt(rest.mean_square):.3g} mm; export the joints unclipped, or "
+                f"minimax-cal import {data.source} --leave-out "
+                f"{lines_of(data, np.flatnonzero(at_end))}"
+                f"{',...' if at_end.sum() > NAMED else ''} -o mended.csv"
+            )
+
+
+def coarse_joints(robot: Robot, data: Measurements, given: BaseFit) -> str:
+    """A notice where joint values have so few digits that rounding could cost what is missing."""
+    name = digits_of(robot, data)
+    cost = DIGITS[name] * robot.reach() / np.sqrt(12.0) if name else np.inf
+    if np.sqrt(given.mean_square) < 0.5 * cost:
+        return ""
+    return (
+        f"{data.source}: joint values are {name}: if they were rounded and not commanded so, no "
+        f"fit gets much below {1e3 * cost:.2g} mm; export them with all their digits"
+    )
 
 
 def spread(data: Measurements) -> float:

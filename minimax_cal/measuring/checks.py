@@ -108,50 +108,6 @@ def limit_notices(robot: Robot, data: Measurements) -> list[str]:
     ]
 
 
-def suspicions(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
-    """Slips worth testing when nothing fits: what to say, and the data with the slip mended."""
-    turning = ~robot.prismatic
-    factor = np.pi / 180.0
-    yield (
-        "the joint values look like degrees; name the columns q1_deg, q2_deg, ...",
-        replace(data, q=np.where(turning, data.q * factor, data.q)),
-    )
-    yield (
-        "the joint values look like radians; name the columns q1_rad, q2_rad, ...",
-        replace(data, q=np.where(turning, data.q / factor, data.q)),
-    )
-    yield (
-        "the points look like millimetres given as metres: name the columns smr1_x_mm, ... (or the "
-        "robot file gives metres under the unit mm)",
-        data.with_y(data.y * 1e-3),
-    )
-    yield (
-        "the points look like metres given as millimetres: name the columns smr1_x_m, ... (or the "
-        "robot file gives millimetres under the unit m)",
-        data.with_y(data.y * 1e3),
-    )
-    for i, j in ((2, 1), (1, 2)):
-        for sign in (1.0, -1.0):
-            if robot.joints > 2 and turning[i] and turning[j]:
-                q = data.q.copy()
-                q[:, i] += sign * q[:, j]
-                word = "+" if sign > 0 else "-"
-                yield (
-                    f"joints {i + 1} and {j + 1} look coupled (a linked arm); "
-                    f"give q{i + 1} {word} q{j + 1} as joint {i + 1}",
-                    replace(data, q=q),
-                )
-    for count in range(1, min(robot.joints, 6) + 1):
-        for flipped in combinations(range(robot.joints), count):
-            q = data.q.copy()
-            q[:, flipped] *= -1.0
-            names = ", ".join(f"{i + 1}" for i in flipped)
-            yield (
-                f"the sign of joint {names} looks reversed; set its sign in the robot file",
-                replace(data, q=q),
-            )
-
-
 def best_orders(error_of: Array) -> tuple[Array, Array, Array]:
     """Under which names the targets of each row fit best.
 
@@ -201,7 +157,7 @@ def check_spread(robot: Robot, data: Measurements) -> None:
     """Raise DataError if the points cannot be those of targets on this arm.
 
     If one target's spread a hundred times more than another's, if two targets have the same points,
-    or if they stay while the flange moves: by another factor than 1000, which `suspicions` tells.
+    or if they stay while the flange moves: by another factor than 1000, which `slips` tells.
     """
     for i, j in combinations(range(len(data.target_names)), 2):
         both = data.seen[:, i] & data.seen[:, j]

@@ -23,7 +23,7 @@ from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import Closures, Instrument, places
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.measuring.checks import suspicions
+from minimax_cal.measuring.slips import of_couplings, of_signs, of_units
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
@@ -104,7 +104,8 @@ def slips(robot: Robot, data: RelativeData) -> Iterator[tuple[str, RelativeData]
             "the lengths look like metres given as millimetres: name the columns wire1_m, ...",
             replace(data, length=1e3 * data.length),
         )
-    for text, mended in suspicions(robot, data.at):
+    given = robot, data.at
+    for text, mended in (*of_units(*given), *of_couplings(*given), *of_signs(*given)):
         if mended.q is not data.at.q:  # else of points, which are not measured here
             yield text, replace(data, at=mended)
 

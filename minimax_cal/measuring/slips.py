@@ -1,0 +1,223 @@
+"""Slips worth testing when nothing fits: rows, columns, units, signs, conventions; and their mends.
+
+Each is tried by the alignment of the drawn arm alone, which takes milliseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import notation
+from minimax_cal.robots.notation import Notation
+from minimax_cal.robots.robot import Robot
+
+MOST_SHIFT = 3  # rows that a file is shifted by: a line more or less, seldom two
+INCH = 25.4
+LATE = {1: "one row", 2: "two rows", 3: "three rows"}
+STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
+DIGITS = {  # of joint values with so few, the step in rad and what to say
+    "whole degrees": np.pi / 180.0,
+    "tenths of a degree": np.pi / 1800.0,
+    "hundredths of a radian": 1e-2,
+}
+ON_GRID = 1e-6  # share of a step by which printed values miss their grid
+
+
+@dataclass(frozen=True, eq=False)
+class Slip:
+    """What may be wrong: what to say, and robot and data with it mended."""
+
+    text: str
+    robot: Robot
+    data: Measurements
+
+
+def with_points_moved(data: Measurements, by: int) -> Measurements:
+    """Each row with the points of the row that many further on; rows that get none are gone."""
+    if by > 0:
+        poses, points = slice(None, -by), slice(by, None)
+    else:
+        poses, points = slice(-by, None), slice(None, by or None)
+    rows = np.arange(data.poses)
+    out = data.take(rows[poses])
+    own = data.take(rows[points])
+    columns = {**out.columns, **{k: c for k, c in own.columns.items() if k == "u95"}}
+    return replace(out, y=own.y, columns=columns)
+
+
+def with_points_reversed(data: Measurements) -> Measurements:
+    """The points in the opposite order."""
+    columns = {k: c[::-1] if k == "u95" else c for k, c in data.columns.items()}
+    return replace(data, y=data.y[::-1], columns=columns)
+
+
+def with_joints_ordered(data: Measurements, order: list[int]) -> Measurements:
+    """Joint columns in another order.  order: which column each joint's values stand in."""
+    return replace(data, q=data.q[:, order], sliding=data.sliding[order])
+
+
+def slips(robot: Robot, data: Measurements) -> Iterator[Slip]:
+    """Slips of the whole file, likely ones first."""
+    for text, mended in (*of_units(robot, data), *of_rows(data), *of_columns(robot, data)):
+        yield Slip(text, robot, mended)
+    other = in_other_convention(robot)
+    if other is not None:
+        name = "modified (Craig's)" if other.notation.modified else "standard"
+        yield Slip(
+            f"the rows of {robot.name} look like {name} DH; set "
+            f'"convention": "{name.split()[0]}" in the robot file',
+            other,
+            data,
+        )
+    for text, mended in (*of_couplings(robot, data), *of_signs(robot, data)):
+        yield Slip(text, robot, mended)
+
+
+def mend_by(data: Measurements, how: str) -> str:
+    """The command that mends a file."""
+    return f"minimax-cal import {data.source} --mend {how} -o mended.csv"
+
+
+def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Angles and lengths in another unit than they say."""
+    turning, factor = ~robot.prismatic, np.pi / 180.0
+    yield (
+        "the joint values look like degrees; name the columns q1_deg, q2_deg, ...",
+        replace(data, q=np.where(turning, data.q * factor, data.q)),
+    )
+    yield (
+        "the joint values look like radians; name the columns q1_rad, q2_rad, ...",
+        replace(data, q=np.where(turning, data.q / factor, data.q)),
+    )
+    yield (
+        "the points look like millimetres given as metres: name the columns smr1_x_mm, ... (or the "
+        "robot file gives metres under the unit mm)",
+        data.with_y(data.y * 1e-3),
+    )
+    yield (
+        "the points look like metres given as millimetres: name the columns smr1_x_m, ... (or the "
+        "robot file gives millimetres under the unit m)",
+        data.with_y(data.y * 1e3),
+    )
+    for power, unit in ((INCH, "mm"), (1e-3 * INCH, "m")):
+        yield (
+            f"the points look like inches given as {unit}: "
+            f"minimax-cal import {data.source} --units smr=in -o mended.csv",
+            data.with_y(data.y * power),
+        )
+    yield (
+        "the lengths of the robot file look like inches given as mm: multiply them by 25.4",
+        data.with_y(data.y / INCH),
+    )
+
+
+def of_rows(data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Points in other rows than their joints."""
+    for size in range(1, MOST_SHIFT + 1):
+        for by in (size, -size):
+            if data.poses > 10 + size:
+                word = "below" if by > 0 else "above"
+                text = (
+                    f"the points look shifted: those of each pose stand {LATE[size]} {word} its "
+                    f"joints; {mend_by(data, f'shift={by}')}"
+                )
+                yield text, with_points_moved(data, by)
+    yield (
+        "the points look like those of the poses in reverse order; " + mend_by(data, "reverse"),
+        with_points_reversed(data),
+    )
+
+
+def of_columns(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Joint columns that stand under each other's names."""
+    n = robot.joints
+    orders = []
+    for i, j in combinations(range(n), 2):
+        order = list(range(n))
+        order[i], order[j] = j, i
+        orders.append((f"columns of joints {i + 1} and {j + 1} look swapped", order))
+    if n > 3:
+        orders.append(("joint columns look like those of the joints in reverse order",
+                       list(range(n))[::-1]))  # fmt: skip
+    for text, order in orders:
+        if np.array_equal(data.sliding[order], data.sliding):
+            names = ":".join(str(i + 1) for i in order)
+            yield (
+                f"the {text}; {mend_by(data, f'joints={names}')}",
+                with_joints_ordered(data, order),
+            )
+
+
+def in_other_convention(robot: Robot) -> Robot | None:
+    """The robot with the rows of its file read as of the other convention; None if impossible."""
+    rows, end = robot.notation.written(robot.mdh, robot.prismatic)
+    offset = robot.notation.offset
+    sign = robot.sign.copy()
+    if robot.notation.modified:
+        sign[0] *= -1.0 if robot.notation.half_turn else 1.0
+        mdh, sign = notation.straight(rows, sign, robot.prismatic, offset, False)
+        return replace(robot, mdh=mdh, sign=sign, notation=Notation(offset=offset))
+    first = rows[0, notation.TAIL]
+    if np.abs(first[[0, 2]]).max() > notation.SAME or abs(np.sin(first[1])) > notation.SAME:
+        return None
+    mdh, sign, said = notation.read(rows, sign, robot.prismatic, offset, end, robot.name)
+    return replace(robot, mdh=mdh, sign=sign, notation=said)
+
+
+def of_couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Joints 2 and 3 that a controller counts together."""
+    turning = ~robot.prismatic
+    for i, j in ((2, 1), (1, 2)):
+        for sign in (1.0, -1.0):
+            if robot.joints > 2 and turning[i] and turning[j]:
+                q = data.q.copy()
+                q[:, i] += sign * q[:, j]
+                yield (
+                    f"joints {i + 1} and {j + 1} look coupled (a linked arm); set "
+                    f'"coupling": {{"J{i + 1}": {{"J{j + 1}": {sign:g}}}}} in the robot file',
+                    replace(data, q=q),
+                )
+
+
+def of_signs(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:
+    """Joints that turn the other way."""
+    for count in range(1, min(robot.joints, 6) + 1):
+        for flipped in combinations(range(robot.joints), count):
+            q = data.q.copy()
+            q[:, flipped] *= -1.0
+            names = ", ".join(f"{i + 1}" for i in flipped)
+            yield (
+                f"the sign of joint {names} looks reversed; set its sign in the robot file",
+                replace(data, q=q),
+            )
+
+
+def stale_rows(robot: Robot, data: Measurements) -> Array:
+    """(b,) rows whose points are those of the row before, to the last digit, though the arm moved.
+
+    A reading that is taken again before the next point was measured.
+    """
+    flange = robot.pose(data.q)[:, :3, 3]
+    went = np.linalg.norm(np.diff(flange, axis=0), axis=1) > STILL
+    both = data.seen[1:] & data.seen[:-1]
+    same = (np.diff(data.y, axis=0) == 0.0).all(axis=2) & both
+    return 1 + np.flatnonzero(went & same.any(axis=1) & (same | ~both).all(axis=1))
+
+
+def digits_of(robot: Robot, data: Measurements) -> str:
+    """How few digits the joint values of all turning joints have, or ''."""
+    q = data.q[:, ~robot.prismatic]
+    moving = q[:, np.ptp(q, axis=0) > 0.0] if len(q) else q
+    if moving.size < 20:
+        return ""
+    for name, step in DIGITS.items():
+        away = np.abs(moving / step - np.round(moving / step))
+        if (away < max(ON_GRID, 1e-9 / step)).all():
+            return name
+    return ""
