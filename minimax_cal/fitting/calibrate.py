@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from minimax_cal.fitting import identify
-from minimax_cal.fitting.checks import POOR_FIT, check_plausible, coarse_joints
+from minimax_cal.fitting.checks import (
+    LEAST_SCALE,
+    POOR_FIT,
+    check_plausible,
+    coarse_joints,
+)
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
@@ -83,6 +88,8 @@ from minimax_cal.solvers.status import Status
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
+LEAST_LENGTH, LEAST_LENGTHS = 0.05, 4  # of lengths that tell a common share: size [m] and number
+SAME_SHARE = 0.15  # of that share, by which they may differ
 ENDED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
 
 
@@ -414,8 +421,30 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
             f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
             "measurements, with their joint signs, zero positions and units"
         )
+    if share := same_share(solved):
+        yield (
+            f"all lengths changed by the same share, {100.0 * share:+.3f} %: check the scale, the "
+            "units and the temperature compensation of the instrument"
+        )
     if named := wild(solved.names, links_of(solved.state.mdh - solved.nominal.mdh), reach):
         yield f"implausibly large changes: {named}; is the robot file the right one?"
+
+
+def same_share(solved: Solved) -> float:
+    """The share by which all identified lengths of the arm changed, 0 where they did not.
+
+    Warmth of an arm below `LEAST_SCALE` does so too.
+    """
+    n = 2 * len(solved.nominal.mdh)
+    drawn = links_of(solved.nominal.mdh)[:n]
+    change = links_of(solved.state.mdh)[:n] - drawn
+    told = solved.identification.active[:n] & (np.abs(drawn) > LEAST_LENGTH)
+    if told.sum() < LEAST_LENGTHS:
+        return 0.0
+    drawn, change = drawn[told], change[told]
+    share = float(drawn @ change / (drawn @ drawn))
+    off = np.linalg.norm(change - share * drawn) / np.linalg.norm(share * drawn)
+    return share if abs(share) > LEAST_SCALE and off < SAME_SHARE else 0.0
 
 
 def parameters_of(robot: Robot, solved: Solved) -> Parameters:

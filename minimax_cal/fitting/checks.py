@@ -35,6 +35,7 @@ APART = 8.0  # times the typical miss, and this share of the reach: no error of 
 LEAST = 0.02
 CLOSE = 3.0  # times the typical miss: where a row belongs
 LEAST_HEAD = 8  # rows that place a base well enough to judge others
+LEAST_PLACED = 10  # rows at the start that may be right before a break
 CLOSE_BY = 3  # rows at either end that no break is looked for in
 FEW_CLIPPED = 3  # rows at the end of a joint's values that are no chance
 LEAST_SCALE = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
@@ -157,7 +158,7 @@ def check_broken(robot: Robot, data: Measurements) -> None:
     limit = 4.0 * POOR_FIT * robot.reach()
     count = min(data.poses // 3, FEW)
     rows = np.arange(data.poses)
-    for end in (rows[:count], rows[-count:]):
+    for end in (rows[:count], rows[:LEAST_PLACED], rows[-count:]):
         state = fitted(robot, data.take(end)).state
         own = misses(robot, data, state)
         if np.sqrt(np.mean(own[end] ** 2)) > limit:

@@ -14,7 +14,8 @@ import numpy as np
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.model import in_base, model_of
+from minimax_cal.modelling.model import model_of
+from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 OFF_LENGTH, OFF_ANGLE = 0.3e-3, 0.5e-3  # how well arms are drawn; times FACTORS [m, rad]
@@ -39,8 +40,9 @@ def scale_of(robot: Robot, data: Measurements, given: BaseFit) -> Scale:
     seen = np.broadcast_to(model.seen[..., None], (*model.seen.shape, 3)).reshape(-1)
     every = model.jacobian(given.state).reshape(-1, p)[seen]
     error = model.error(given.state).reshape(-1)[seen]
-    points = np.swapaxes(in_base(given.state, model.y), -1, -2).reshape(-1, 3)
-    points = (points - points.mean(axis=0)).reshape(-1)[seen]
+    links_at = kinematics.chain(given.state.mdh, model.q, model.prismatic)
+    drawn = kinematics.points(links_at, given.state.target_positions)  # measured ones hold error
+    points = np.swapaxes(drawn, -1, -2).reshape(-1)[seen]
     taken, _ = np.linalg.qr(every[:, n:])
     sigma = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
     links, stretch, left = (

@@ -88,7 +88,8 @@ def read(
     if np.abs(lead - [0.0, np.copysign(np.pi, lead[1]) * half_turn, 0.0]).max() > SAME:
         raise RobotError(
             f"{source}: joints[0]: a, alpha and beta of the first row of modified DH lie before "
-            "joint 1 and move the base alone: they must be 0 (alpha also 180 degrees)"
+            "joint 1 and move the base alone: they must be 0 (alpha also 180 degrees); is this a "
+            "table of standard DH?"
         )
     mdh = rows.copy()
     mdh[:, TAIL] = np.vstack([rows[1:], end])[:, TAIL]

@@ -1,0 +1,168 @@
+"""Slips of whole files: each named before the fit with the mend that does it; sound data pass."""
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run, shared
+
+import minimax_cal as mc
+from minimax_cal.fitting.checks import check_plausible, coarse_joints, fitted
+from minimax_cal.fitting.common_scale import scale_of
+from minimax_cal.measuring import slips
+from minimax_cal.measuring.mending import mended
+from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+from minimax_cal.robots.robot import robot_from_dict
+
+ARMS = ("irb2600", "irb120", "ur10", "meca500", "ur5e", "scara_600")
+
+
+def lost(data: mc.Measurements, row: int) -> mc.Measurements:
+    """One point lost by a beam break: all later ones stand a row higher."""
+    y = np.delete(data.y, row, axis=0)
+    return replace(data.take(np.arange(data.poses - 1)), y=y)
+
+
+def stale(data: mc.Measurements) -> mc.Measurements:
+    y = data.y.copy()
+    y[[7, 20, 33]] = y[[6, 19, 32]]
+    return data.with_y(y)
+
+
+def clipped(data: mc.Measurements) -> mc.Measurements:
+    q = data.q.copy()
+    q[:, 1] = np.minimum(q[:, 1], np.quantile(q[:, 1], 0.85))
+    return replace(data, q=q)
+
+
+SLIPS: dict[str, tuple[Callable[[mc.Measurements], mc.Measurements], str]] = {
+    "shifted": (lambda d: slips.with_points_moved(d, 1), "one row above its joints; .*shift=-1 -o"),
+    "by three": (lambda d: slips.with_points_moved(d, -3), "three rows below .*--mend shift=3 -o"),
+    "reversed": (slips.with_points_reversed, "in reverse order; .*--mend reverse -o"),
+    "lost": (lambda d: lost(d, 25), "from about this line .*--mend shift=-1@\\d+\\.\\. -o"),
+    "stale": (stale, "3 rows have the points of the row before .*--leave-out 10,23,36 -o"),
+    "joints": (
+        lambda d: slips.with_joints_ordered(d, [0, 2, 1, 3, 4, 5]),
+        "columns of joints 2 and 3 look swapped; .*--mend joints=1:3:2:4:5:6 -o",
+    ),
+    "backwards": (
+        lambda d: slips.with_joints_ordered(d, [5, 4, 3, 2, 1, 0]),
+        "joint columns look like those of the joints in reverse order",
+    ),
+    "inches": (lambda d: d.with_y(d.y / 25.4), "look like inches given as mm: .*--units smr=in"),
+    "robot in inches": (lambda d: d.with_y(d.y * 25.4), "robot file look like inches"),
+    "clipped": (clipped, "joint 2 looks clipped at .* export the joints unclipped"),
+}
+
+
+@pytest.mark.parametrize("name", SLIPS)
+def test_a_slip_is_named_with_its_mend(name: str, robot: mc.Robot, noisy: Simulation) -> None:
+    make, said = SLIPS[name]
+    wrong = make(noisy.data)
+    check_plausible(robot, noisy.data)  # what runs for the first time takes its time
+    began = time.process_time()
+    with pytest.raises(mc.DataError, match=said) as caught:
+        mc.calibrate(robot, wrong)
+    assert time.process_time() - began < 2.0
+    assert "\n" not in str(caught.value)
+    if mend := re.search(r"--mend (\S+) ", str(caught.value)):
+        right = mended(wrong, [mend[1]])
+        check_plausible(robot, right)
+        assert right.poses >= noisy.data.poses - 6
+
+
+def test_a_mended_file_calibrates(robot: mc.Robot, noisy: Simulation, tmp_path: Path) -> None:
+    robot.save(tmp_path / "arm.json")
+    wrong, right = tmp_path / "wrong.csv", tmp_path / "right.csv"
+    mc.write_measurements(wrong, lost(noisy.data, 25))
+    assert run("calibrate", tmp_path / "arm.json", wrong, "--quiet") == 2
+    assert run("import", wrong, "--mend", "shift=-1@27..", "-o", right, "--quiet") == 0
+    assert run("calibrate", tmp_path / "arm.json", right, "--quiet") == 0
+    assert run("import", wrong, "--mend", "shift=x", "--quiet") == 2
+    assert run("import", wrong, "--mend", "joints=1:2", "--quiet") == 2
+
+
+@pytest.mark.parametrize("how", ["", "shift", "shift=0", "shift=1@900..", "joints=1", "scale=-1"])
+def test_what_no_mend_is(how: str, noisy: Simulation) -> None:
+    with pytest.raises(mc.OptionError, match="mend="):
+        mended(noisy.data, [how])
+
+
+def test_the_wrong_convention_is_named(noisy: Simulation, robot: mc.Robot) -> None:
+    standard = robot.to_dict()
+    rows = [dict(row) for row in standard["joints"]]
+    for key in ("a", "alpha", "beta"):
+        for row, before in zip(rows, [{}, *standard["joints"][:-1]], strict=True):
+            row[key] = before.get(key, 0.0)
+    craig = {**standard, "convention": "modified", "joints": rows}
+    check_plausible(robot_from_dict(craig), noisy.data)
+    wrong = robot_from_dict({**craig, "convention": "standard"})
+    with pytest.raises(mc.DataError, match=r'look like modified \(Craig\'s\) DH; set "convention"'):
+        mc.calibrate(wrong, noisy.data)
+    with pytest.raises(mc.RobotError, match="is this a table of standard DH"):
+        robot_from_dict({**standard, "convention": "modified"})
+
+
+def test_a_common_scale_that_no_drawing_error_explains() -> None:
+    robot = mc.load_robot("fanuc_r2000ic_165f")
+    good = simulate(robot, 80, 3, seed=3, truth=Truth(length=0.1e-3, angle=0.2e-3, compliance=0))
+    assert abs(scale_of(robot, good.data, fitted(robot, good.data)).gain) < 16.0
+    with pytest.raises(mc.DataError, match=r"points lie 1\.00\d+ times .*--mend scale=0\.99"):
+        mc.calibrate(robot, good.data.with_y(1.003 * good.data.y))
+
+
+def test_a_fit_that_stretches_every_length_alike_says_so(robot: mc.Robot) -> None:
+    made = simulate(robot, 60, 3, seed=1, truth=Truth(length=0.05e-3, angle=1e-3, compliance=0))
+    stretched = made.data.with_y(1.001 * made.data.y)
+    with pytest.warns(mc.CalibrationWarning, match=r"changed by the same share, \+0\.(09|1)"):
+        mc.calibrate(robot, stretched, "sum")
+
+
+def test_rounded_joints_are_noticed_where_rounding_can_cost_what_is_missing(
+    robot: mc.Robot, noisy: Simulation
+) -> None:
+    rounded = replace(noisy.data, q=np.radians(np.round(np.degrees(noisy.data.q))))
+    said = coarse_joints(robot, rounded, check_plausible(robot, rounded))
+    assert "joint values are whole degrees" in said
+    exact = noisy.cell.predict(rounded.q)  # commanded so: nothing is missing
+    assert not coarse_joints(robot, rounded.with_y(exact), fitted(robot, rounded.with_y(exact)))
+
+
+def sound(seed: int) -> tuple[mc.Robot, mc.Measurements]:
+    """A sound arm: errors of all sizes, levels, whole degrees, a path, a zero far off."""
+    rng = np.random.default_rng(seed)
+    robot = mc.load_robot(str(rng.choice(ARMS)))
+    size = rng.choice([1.0, 2.0, 4.0])
+    truth = Truth(length=0.4e-3 * size, angle=0.6e-3 * size, compliance=rng.choice([0.0, 2e-6]))
+    made = simulate(robot, int(rng.choice([20, 40, 80])), int(rng.choice([1, 3])), seed, truth)
+    q = made.data.q
+    way = rng.choice(["random", "degrees", "levels", "path"])
+    if way == "degrees":
+        q = np.where(robot.prismatic, q, np.radians(np.round(np.degrees(q))))
+    elif way == "levels":
+        q = np.clip(q, *np.percentile(q, [20, 80], axis=0))
+    elif way == "path":
+        q = np.linspace(q[0], q[1], len(q)) + 0.1 * (q - q.mean(axis=0))
+    noise = rng.normal(0.0, 2e-5, made.data.y.shape)
+    data = replace(made.data, q=q, y=made.cell.predict(q) + noise, simulated=False)
+    if rng.uniform() < 0.2 and not robot.prismatic[0]:
+        q = q.copy()
+        q[:, rng.integers(1, 3)] += rng.uniform(-0.1, 0.1)
+        data = replace(data, q=q)
+    return robot, data
+
+
+@pytest.mark.parametrize("seeds", [range(12), pytest.param(range(12, 300), marks=pytest.mark.slow)])
+def test_sound_data_are_never_refused(seeds: range) -> None:
+    for seed in seeds:
+        check_plausible(*sound(seed))
+
+
+@pytest.mark.parametrize("name", ["fanuc_r2000", "irb120", "meca500_r", "qkm_hl6", "ur10_b"])
+def test_real_data_are_not_refused(name: str) -> None:
+    robot, path = shared(name)
+    check_plausible(mc.load_robot(robot), mc.read_measurements(path))
