@@ -29,6 +29,8 @@ OPTIONAL = {
         "time": r"time_(s)",
         "temperature": r"temperature_(C)",
         "payload": r"payload_(kg)",
+        "payload centre": r"payload_[xyz]_(mm|m)",
+        "tool": r"tool",
         "tau": r"tau\d+_(Nm)",
         "approach": r"approach\d+",
         "session": r"session",
@@ -42,8 +44,9 @@ OPTIONAL = {
     }.items()
 }
 SIMULATED = "# simulated"  # first line of a file whose points were computed, not measured
-TEXT = {"session", "group", "pose", "split", "set_aside"}  # compared but never computed with
+TEXT = {"session", "group", "pose", "split", "set_aside", "tool"}  # never computed with
 OF_JOINT = re.compile(r"(?:approach|tau|qread)(\d+)(?:_\w+)?")
+OF_PAYLOAD = re.compile(r"payload_[xyz]_(?:mm|m)")
 OF_FOOT = re.compile(r"(base\d+_)([xyz])(_\w+)")
 
 
@@ -185,6 +188,12 @@ def useless(header: Sequence[str]) -> dict[str, str]:
         if m := OF_JOINT.fullmatch(name):
             if not 1 <= int(m[1]) <= joints:
                 out[name] = f"the file has no joint {m[1]}"
+        elif OF_PAYLOAD.fullmatch(name):
+            given = {other[8] for other in header if OF_PAYLOAD.fullmatch(other)}
+            if "payload_kg" not in header:
+                out[name] = "the file has no column payload_kg"
+            elif len(given) < 3:
+                out[name] = "the payload's centre needs x, y and z"
         elif m := OF_FOOT.fullmatch(name):
             axes = [o[2] for other in header if (o := OF_FOOT.fullmatch(other)) and o[1] == m[1]]
             if lost := [f"{m[1]}{axis}{m[3]}" for axis in "xyz" if axis not in axes]:
@@ -221,7 +230,7 @@ def optional_kind(name: str) -> tuple[str, re.Match[str] | None]:
 def near(name: str) -> str:
     """A hint when a column's name is close to one that would be used."""
     known = ["order", "time_s", "temperature_C", "payload_kg", "session", "group", "u95_mm"]
-    known += ["pose", "split", "set_aside"]
+    known += ["pose", "split", "set_aside", "tool", "payload_x_mm"]
     known += [f"q{i}_{unit}" for i in range(1, 10) for unit in ("rad", "deg")]
     known += [f"smr{i}_{axis}_mm" for i in (1, 2, 3) for axis in "xyz"]
     match = difflib.get_close_matches(name, known, 1, cutoff=0.75)

@@ -37,6 +37,7 @@ PLAUSIBLE = {  # column: its header, least and largest value in SI, what a heade
     "payload": ("payload_kg", 0.0, 3e3, 1.0),  # the strongest arms carry 2.3 t
     "u95": ("u95_mm", 0.0, 1.0, 1e3),
 }
+OF_PAYLOAD = ("{}_mm", -10.0, 10.0, 1e3)  # of its centre, from the flange
 OF_EACH = {  # the same of columns that joints or targets have each, by what stands before a number
     "tau": ("{}_Nm", -1e5, 1e5, 1.0),  # the strongest joints hold some 1e4 N m
     "base": ("{}_mm", -FARTHEST, FARTHEST, 1e3),
@@ -194,6 +195,7 @@ def check_finite(data: Measurements) -> Measurements:
 def check_columns(data: Measurements) -> Measurements:
     """The data, if their optional columns can be.  Raises DataError."""
     each = {found[0]: OF_EACH[found[1]] for found in map(NUMBERED.fullmatch, data.columns) if found}
+    each |= {name: OF_PAYLOAD for name in data.columns if re.fullmatch(r"payload_[xyz]", name)}
     for name, (header, low, high, scale) in (PLAUSIBLE | each).items():
         values = np.asarray(data.columns.get(name, np.zeros(0)), dtype=float)
         odd = (values < low) | (values > high)
@@ -295,8 +297,9 @@ def measurements_in(file: Rows) -> Measurements:
     again, said = pasted(file, ~blind)
     data = replace(data.take(~blind & ~again), notices=(*data.notices, *notices, *said))
     from minimax_cal.measuring.set_aside import from_column  # which makes measurements itself
+    from minimax_cal.measuring.tools import by_tool
 
-    return from_column(data)
+    return from_column(by_tool(data))
 
 
 def pasted(file: Rows, kept: Array) -> tuple[Array, list[str]]:
@@ -340,8 +343,9 @@ def write_measurements(path: Path | str, data: Measurements) -> None:
 def measurements_text(data: Measurements) -> str:
     """The CSV of measurements, points set aside with why, `SIMULATED` above it where they are."""
     from minimax_cal.measuring.set_aside import whole  # which makes measurements itself
+    from minimax_cal.measuring.tools import side_by_side
 
-    data = whole(data)
+    data = side_by_side(whole(data))
     joints, k = data.q.shape[1], len(data.target_names)
     header = [f"q{i + 1}_{'mm' if data.sliding[i] else 'rad'}" for i in range(joints)]
     header += [f"{name}_{axis}_mm" for name in data.target_names for axis in "xyz"]
@@ -371,7 +375,7 @@ def measurements_text(data: Measurements) -> str:
 def file_column(stem: str) -> tuple[str, float]:
     """Name with its unit, and the factor from SI, of an optional column."""
     exact = {"time": "_s", "temperature": "_C", "payload": "_kg"}
-    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]", stem):
+    if stem == "u95" or re.fullmatch(r"base\d+_[xyz]|payload_[xyz]", stem):
         return f"{stem}_mm", 1e3
     if re.fullmatch(r"tau\d+", stem):
         return f"{stem}_Nm", 1.0

@@ -19,9 +19,10 @@ from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
 from minimax_cal.measuring.measurements import Measurements
 
 COLUMN = "set_aside"
-POINT = re.compile(r"(\d+)(?::(smr\d+))?")
+TARGET = r"smr\d+(?:@[\w.-]+)?"  # smr1, or smr1@gripper where there are several tools
+POINT = re.compile(rf"(\d+)(?::({TARGET}))?")
 # a cell holds one of these for each target, or one for the whole pose
-ENTRY = re.compile(rf"(?:(smr\d+)\s*:)?\s*(.*?)\s*(?:\[({USER}|{FILE}|{TOOL})\])?")
+ENTRY = re.compile(rf"(?:({TARGET})\s*:)?\s*(.*?)\s*(?:\[({USER}|{FILE}|{TOOL})\])?")
 NO_REASON = "no reason was given"
 MOST_LETTERS = 200  # of a reason
 NAMED = 5  # points that a notice names
@@ -114,18 +115,23 @@ def from_column(data: Measurements) -> Measurements:
     groups: dict[tuple[str, str], Array] = {}
     for row, cell in enumerate(cells):
         for target, why, by in entries(str(cell)):
-            if target and target not in data.target_names:
+            if not any(is_meant(target, name) for name in data.target_names):
                 raise DataError(
                     f"{data.source}:{data.line[row]}: column {COLUMN}: no target {target}; there "
                     f"are {', '.join(data.target_names)}"
                 )
             points = groups.setdefault((why, by), np.zeros(data.seen.shape, dtype=bool))
-            points[row] |= [target in ("", name) for name in data.target_names]
+            points[row] |= [is_meant(target, name) for name in data.target_names]
     lines = data.line
     for (why, by), points in groups.items():
         kept = np.isin(lines, data.line)  # rows of which nothing was left are gone
         data = set_aside(data, points[kept], why, by)
     return sound(data)
+
+
+def is_meant(said: str, target: str) -> bool:
+    """Whether a target is meant: by its name, by smr1 for smr1@gripper, or as one of all."""
+    return said in ("", target, target.partition("@")[0])
 
 
 def entries(cell: str) -> list[tuple[str, str, str]]:
@@ -193,8 +199,8 @@ def of_name(data: Measurements, name: str) -> Array:
     if not rows.any():
         lines = f"{data.line.min()} to {data.line.max()}" if data.poses else "none"
         raise OptionError(f"leave out {name}: no pose stands in line {found[1]} (but {lines})")
-    if found[2] and found[2] not in data.target_names:
+    if not any(is_meant(found[2] or "", name) for name in data.target_names):
         known = ", ".join(data.target_names)
         raise OptionError(f"leave out {name}: no such target; there are {known}")
-    targets = np.array([not found[2] or found[2] == target for target in data.target_names])
+    targets = np.array([is_meant(found[2] or "", target) for target in data.target_names])
     return np.asarray(rows[:, None] & targets)

@@ -19,8 +19,9 @@ from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
 from minimax_cal.measuring.measurements import Measurements, check_finite
 from minimax_cal.measuring.set_aside import COLUMN, from_column, set_aside, sound
+from minimax_cal.measuring.tools import by_tool
 
-TEXTS = ("session", "group", "split", "pose", COLUMN)
+TEXTS = ("session", "group", "split", "pose", "tool", COLUMN)
 MARKED = "marked deleted in the tracker's file"
 OF_UNIT = {"u95": LENGTHS, "base": LENGTHS, "qread": ANGLES}  # optional columns with a choice
 MIXED = "mixed"
@@ -129,7 +130,7 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
         simulated=any(is_simulated(r.sheet.text) for r in readings),
     )
     matched = (*(spot.how for spot in places), "")[: len(readings)]
-    data = without_marked(from_column(data), points, places)
+    data = by_tool(without_marked(from_column(data), points, places))
     return Assembly(check_finite(data), readings, meanings, matched)
 
 
@@ -322,7 +323,8 @@ def left_over(column: Column, unit: str, first: str) -> Understood:
 def optional(reading: Reading, column: Column, unit: str, known: str) -> Understood:
     """An optional column of numbers.  Raises DataError where it needs a unit and has none."""
     family = column.family
-    factors = OF_UNIT.get(family, {})
+    centre = family == "payload" and column.meaning != family  # payload_x, beside payload in kg
+    factors = LENGTHS if centre else OF_UNIT.get(family, {})
     if factors and unit not in factors:
         what = f"{unit} is no unit for it" if unit else "has no unit"
         raise DataError(

@@ -19,7 +19,9 @@ TITLE = "columns as mapped"
 SKIP = re.compile(r"(?:-|skip)(?:\*(\d+))?")
 SPAN = re.compile(r"(\d+)(?:-(\d+))?")
 SMR = re.compile(r"smr(\d+)")
-EXACT = re.compile(r"q\d+|smr\d+_[xyz]|payload|tau\d+|approach\d+|qread\d+|base\d+_[xyz]")
+EXACT = re.compile(
+    r"q\d+|smr\d+_[xyz]|payload(?:_[xyz])?|tau\d+|approach\d+|qread\d+|base\d+_[xyz]"
+)
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:

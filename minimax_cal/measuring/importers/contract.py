@@ -16,7 +16,7 @@ from minimax_cal.measuring.importers.sheet import Sheet
 
 TITLE = "minimax-cal CSV"
 JOINT = re.compile(r"q(\d+)")
-OPTIONAL = re.compile(r"payload|tau\d+|approach\d+|qread\d+|base\d+_[xyz]")
+OPTIONAL = re.compile(r"payload(?:_[xyz])?|tau\d+|approach\d+|qread\d+|base\d+_[xyz]")
 KEPT = "kept as it is"
 
 

@@ -122,7 +122,7 @@ LINK_BENDING = Effect(
 def tilted(scene: Scene, mass: Array, com: Array) -> Array:
     """(k, 3, m) motion of the targets when the base turns by the overturning moment."""
     lever = (mass[:, None, None] * centres(scene.links, com)).sum(axis=0)
-    lever = lever + scene.column("payload") * scene.points.mean(axis=0)
+    lever = lever + scene.column("payload") * scene.payload_place
     moment = cross(lever, np.broadcast_to(-G * scene.robot.up[:, None], lever.shape))
     return turned_about(scene, moment, np.zeros((3, 1)))
 

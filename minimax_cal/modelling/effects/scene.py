@@ -164,12 +164,45 @@ class Scene:
 
     @cached_property
     def payload(self) -> Array:
-        """(n, m) torque of the payload, which hangs amid the targets [N m]."""
+        """(n, m) torque of the payload [N m].
+
+        Its centre is that of the columns payload_x ..., else amid the targets.
+        """
+        if not self.column("payload").any():
+            return np.zeros((self.joints, self.poses))
+        return self.hanging(self.payload_centre) * self.column("payload")
+
+    @property
+    def payload_centre(self) -> Array:
+        """(3, m) centre of gravity of the payload in the last frame [m]."""
+        amid = self.target_positions.mean(axis=0)
+        given = [self.data.columns.get(f"payload_{axis}") for axis in "xyz"]
+        if any(column is None for column in given):
+            return np.repeat(amid[:, None], self.poses, axis=1)
+        centre = np.array(given, dtype=float)
+        return np.where(np.isfinite(centre).all(axis=0), centre, amid[:, None])
+
+    @property
+    def payload_place(self) -> Array:
+        """(3, m) centre of gravity of the payload in the base [m]."""
+        along = np.einsum("am,axm->xm", self.payload_centre, self.links.axes)
+        return np.asarray(self.links.origin + along)
+
+    def hanging(self, centre: Array) -> Array:
+        """(n, m) torque of one kilogram on the last link.  centre: (3, m) in its frame [m].
+
+        Affine in the centre: of one in the origin, and of a metre along each axis.
+        """
         one = np.zeros(self.joints)
         one[-1] = 1.0
-        com = np.zeros((self.joints, 3))
-        com[-1] = self.target_positions.mean(axis=0)
-        return self.torque(one, com) * self.column("payload")
+        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        torque = []
+        for end in ends:
+            com = np.zeros((self.joints, 3))
+            com[-1] = end
+            torque.append(self.torque(one, com))
+        slopes = np.array(torque[1:]) - torque[0]
+        return np.asarray(torque[0] + np.einsum("anm,am->nm", slopes, centre))
 
     @cached_property
     def gravity(self) -> Array:
