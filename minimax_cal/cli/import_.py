@@ -46,10 +46,11 @@ TOLD = "What the files do not tell"
 @plain_option(
     TOLD,
     "--columns",
-    default="",
+    multiple=True,
     metavar="MAPPING",
     help="What the columns are, in order: smr1_mm,smr2_mm,smr3_mm,q_deg (skip*2 leaves two out), "
-    "or by place: 1-3=smr1_mm,4-9=q_deg,Temp=temperature_C.",
+    "or by place: 1-3=smr1_mm,4-9=q_deg,Temp=temperature_C. One with joints alone is that of the "
+    "file of joints.",
 )
 @plain_option(
     TOLD,
@@ -82,6 +83,7 @@ TOLD = "What the files do not tell"
     "shift=1@40.. from line 40 on), reverse (points in the opposite order), joints=1:3:2:4:5:6 "
     "(columns of joints 2 and 3 swapped), scale=0.999 (of the points).",
 )
+@click.option("--preview", is_flag=True, help="Show the first rows as they were understood.")
 @SAFE_CELLS
 @JSON
 @QUIET
@@ -95,6 +97,7 @@ def import_command(
     decimal: str | None,
     leave_out: tuple[str, ...],
     mend: tuple[str, ...],
+    preview: bool,
     safe_cells: bool,
     to: Output,
     **chosen: Any,
@@ -122,7 +125,7 @@ def import_command(
     if to.as_json:
         click.echo(json_text(content(found, to.path)), nl=False)
         return 0
-    show(found.files(), *found.columns())
+    show(found.files(), *found.columns(), *([found.preview()] if preview else []))
     click.echo(found.headline() + ("" if to.path else "\nnothing written; add -o FILE"))
     return 0
 

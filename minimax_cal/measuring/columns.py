@@ -16,6 +16,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import check_table, read_raw, text_of
+from minimax_cal.measuring.spreadsheet import csv_of_workbook, is_workbook
 
 UNITS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3}
 MOST = 1e5  # of a joint: 16,000 turns, or 100 km [rad, m]
@@ -93,6 +94,8 @@ class Rows:
 
 def read_rows(path: Path | str) -> Rows:
     """Read a CSV file.  Raises DataError where it is none."""
+    if is_workbook(path):
+        return rows_in(csv_of_workbook(path), path)
     raw = read_raw(path, kind=DataError)
     check_table(raw, path, kind=DataError)
     return rows_in(text_of(raw, path, kind=DataError), path)

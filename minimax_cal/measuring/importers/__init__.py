@@ -13,7 +13,7 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.files import write_whole
-from minimax_cal.ground.tables import Table
+from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.importers.assemble import Assembly, Meaning, assemble
 from minimax_cal.measuring.importers.reading import (
     ANGLES,
@@ -32,16 +32,20 @@ __all__ = ["IMPORTERS", "Imported", "csv_of", "import_files", "read_any", "save"
 # Tried in this order.  `text`: looks at the text alone; `rows`: at header and cells.
 IMPORTERS = {
     "rapid": "text",
+    "krl": "text",
+    "urscript": "text",
     "leica": "rows",
     "robodk": "rows",
     "tracker6d": "rows",
     "contract": "rows",
     "figaroh": "rows",
+    "named": "rows",
     "joint_rows": "rows",
     "smr_files": "rows",
     "columns": "rows",
 }
 MEASURED = re.compile(r"q\d*|(?:smr|base)\d*(?:_[xyz])?|qread\d*|u95|temperature|time")
+OF_JOINTS = re.compile(r"(?:^|[,=])\s*q\d*(?:_|\s*(?:,|$))")
 LAYOUTS = ("", "pose", "target")
 DATES = ("dmy", "mdy", "ymd")
 
@@ -77,6 +81,25 @@ class Imported:
             Table(str(r.sheet.path), header, tuple(map(row_of, meanings)))
             for r, meanings in zip(self.assembly.readings, self.assembly.meanings, strict=True)
         )
+
+    def preview(self, rows: int = 3) -> Table:
+        """The first rows as they were understood, and the last: a column each."""
+        data = self.data
+        some = sorted({*range(min(rows, data.poses)), data.poses - 1})
+        lines: list[tuple[Cell, ...]] = []
+        for i, slides in enumerate(data.sliding):
+            factor, unit = (1e3, "mm") if slides else (180.0 / np.pi, "deg")
+            lines.append((f"joint {i + 1}", unit, *(factor * data.q[row, i] for row in some)))
+        for target, name in enumerate(data.target_names):
+            for axis in range(3):
+                values = [1e3 * float(data.y[row, target, axis]) for row in some]
+                shown = (value if np.isfinite(value) else "" for value in values)
+                lines.append((f"{name} {'xyz'[axis]}", "mm", *shown))
+        for name, column in data.columns.items():
+            lines.append((name, "", *(str(column[row]) for row in some)))
+        header = ("", "unit", *(f"line {data.line[row]}" for row in some))
+        formats = ("", "", *[".4f"] * len(some))
+        return Table("rows as understood", header, tuple(lines), formats)
 
     def headline(self) -> str:
         """What came out, in a line."""
@@ -120,14 +143,18 @@ def read_any(path: Path | str, told: Told, *, joints: bool = False) -> Reading:
     """
     sheet: Sheet = open_text(path)
     whole = False
+    columns = told.joint_columns if joints else told.columns
+    told = replace(told, columns=columns)
     for name, looks_at in IMPORTERS.items():
         module = import_module(f"minimax_cal.measuring.importers.{name}")
         if looks_at == "rows" and not whole:
             sheet, whole = cut(sheet, told.decimal), True
-        mapped = name == "columns" and told.columns and not joints
-        if mapped or (module.fits(sheet, joints) and not (told.columns and not joints)):
+        mapped = name == "columns" and told.columns
+        if mapped or (module.fits(sheet, joints) and not told.columns):
             reading: Reading = module.read(sheet, told)
-            return reading
+            above = [str(line) for line in reading.sheet.preamble]
+            said = f"above the table, and left out: line {', '.join(above)}"
+            return reading.saying(said) if above else reading
     raise DataError(unknown(sheet))
 
 
@@ -152,7 +179,7 @@ def import_files(
     files: Sequence[Path | str],
     joints: Path | str | None = None,
     *,
-    columns: str = "",
+    columns: str | Sequence[str] = "",
     units: str | Sequence[str] | Mapping[str, str] = (),
     layout: str = "",
     decimal: str = "",
@@ -160,14 +187,15 @@ def import_files(
     """Measurements from files as trackers and controllers write them.
 
     files: their paths.  joints: a file of joint values, where the points stand alone.  columns,
-    units, layout, decimal: what the files do not tell (the error asks for it), as q=deg or smr=mm.
+    units, layout, decimal: what the files do not tell (the error asks for it), as q=deg or smr=mm;
+    of columns, a mapping with joints and no points is that of the file of joints.
     The measurements have metres and radians.  Raises DataError, OptionError.
 
     >>> data = mc.import_files(["points.txt"], "joints.txt", units="q=deg,smr=mm").data
     """
     if not files:
         raise OptionError("name a file to import")
-    told = told_by(columns, units, layout, decimal)
+    told = told_by(columns, units, layout, decimal, apart=joints is not None)
     readings = [read_any(path, told) for path in files]
     check_twice(readings)
     points = [reading for reading in readings if reading.smrs]
@@ -211,7 +239,12 @@ def check_twice(readings: Sequence[Reading]) -> None:
 
 
 def told_by(
-    columns: str, units: str | Sequence[str] | Mapping[str, str], layout: str, decimal: str
+    columns: str | Sequence[str],
+    units: str | Sequence[str] | Mapping[str, str],
+    layout: str,
+    decimal: str,
+    *,
+    apart: bool = False,
 ) -> Told:
     """What the user says about files.  Raises OptionError."""
     if layout not in LAYOUTS:
@@ -221,7 +254,17 @@ def told_by(
         raise OptionError(f"decimal={decimal!r}: write comma or point")
     if not isinstance(units, Mapping):
         units = units_of([units] if isinstance(units, str) else units)
-    return Told(columns, units, layout, sign)
+    mappings = [columns] if isinstance(columns, str) else list(columns)
+    of_joints = [
+        text for text in mappings if apart and "smr" not in text and OF_JOINTS.search(text)
+    ]
+    others = [text for text in mappings if text and text not in of_joints]
+    if len(others) > 1 or len(of_joints) > 1:
+        raise OptionError(
+            "columns=: two mappings of one file; give one for the points and, with joints=, one "
+            "for the joints"
+        )
+    return Told("".join(others), "".join(of_joints), units, layout, sign)
 
 
 def file_of_joints(path: Path | str, turns: Sequence[Reading], told: Told) -> Reading:

@@ -13,7 +13,13 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.aside import FILE
 from minimax_cal.measuring.columns import is_simulated
 from minimax_cal.measuring.importers import contract
-from minimax_cal.measuring.importers.join import Places, in_file_order, place, settled
+from minimax_cal.measuring.importers.join import (
+    Places,
+    in_file_order,
+    place,
+    poses_of,
+    settled,
+)
 from minimax_cal.measuring.importers.reading import ANGLES, LENGTHS, Column, Reading, Told
 from minimax_cal.measuring.importers.times import STAMPED, celsius, seconds
 from minimax_cal.measuring.importers.units import decide
@@ -102,9 +108,12 @@ def assemble(points: Sequence[Reading], joints: Reading, told: Told) -> Assembly
     Raises DataError.
     """
     alone = joints not in points
+    if not alone and (apart := poses_of(joints)):
+        joints, alone = apart, True
     points = [settled(reading, joints, told.layout) for reading in in_file_order(list(points))]
     joints = joints if alone else points[0]
-    places = [place(reading, joints, told.layout) for reading in points]
+    placed = [place(reading, joints, told.layout) for reading in points]
+    points, places = [reading for reading, _ in placed], [spot for _, spot in placed]
     poses = len(joints.line)
     raw = raw_of(points, places, joints, told)
     called = callings(points, places)

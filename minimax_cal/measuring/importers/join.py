@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.importers.reading import Reading
+from minimax_cal.measuring.importers.names import Match, match_names, natural, parts_of
+from minimax_cal.measuring.importers.reading import Column, Reading
 
+LEAST_PARTS = 2  # of a name that holds a pose and a target: at least
+MOST_NAMED = 12  # points or poses that a notice names
 RIGID, LOOSE = 0.02, 0.1  # spread of the distances between targets, relative: one body, or not
 
 
@@ -28,14 +31,75 @@ class Places:
     how: str
 
 
-def place(points: Reading, joints: Reading, layout: str) -> Places:
-    """Match rows of points to rows of joints.  Raises DataError naming file and line."""
+def place(points: Reading, joints: Reading, layout: str) -> tuple[Reading, Places]:
+    """Rows of points that have a pose, and where they go.  Raises DataError naming file and line.
+
+    By names where both files have some, else by order.
+    """
     if points is joints:
-        return with_targets(points, np.arange(len(points.line)), "same row")
+        return points, with_targets(points, np.arange(len(points.line)), "same row")
     key, other = points.find("pose"), joints.find("pose")
-    if key and other and set(key.cells) & set(other.cells):
-        return by_key(points, joints)
-    return by_count(points, joints, layout)
+    if not (key and other):
+        return points, by_count(points, joints, layout)
+    check_unique(joints, other)
+    match = match_names(key.cells, other.cells)
+    if match is None:
+        said = (
+            f"names of the points ({key.cells[0]} ...) and of the joints in {joints.sheet.path} "
+            f"({other.cells[0]} ...) have nothing in common: they are matched by order"
+        )
+        return points.saying(said), by_count(points, joints, layout)
+    return by_name(points, joints, match)
+
+
+def check_unique(joints: Reading, key: Column) -> None:
+    """Raise DataError where two poses have one name."""
+    first: dict[str, int] = {}
+    for line, name in zip(joints.line, key.cells, strict=True):
+        if name in first:
+            raise DataError(
+                f"{joints.sheet.path}:{line}: {name!r} stands twice in the key column {key.name} "
+                f"(line {first[name]}); rename or delete one"
+            )
+        first[name] = int(line)
+
+
+def by_name(points: Reading, joints: Reading, match: Match) -> tuple[Reading, Places]:
+    """Points where their names say; those without a pose left out, and what is missing told."""
+    rows = np.array(match.pose)
+    kept = np.flatnonzero(rows >= 0)
+    if len(lost := np.flatnonzero(rows < 0)):
+        key = points.column("pose")
+        named = ", ".join(f"{key.cells[i]} (line {points.line[i]})" for i in lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        points = points.saying(
+            f"{len(lost)} points have no pose of their name in {joints.sheet.path} and are left "
+            f"out: {named}{more}"
+        )
+    points, labels = points.take(kept), [match.label[i] for i in kept]
+    own, slot = labels_of(points)
+    if own == ("",) and len(set(labels)) > 1:
+        own = tuple(sorted(set(labels), key=natural))
+        slot = np.array([own.index(label) for label in labels])
+    check_once(points, rows[kept], slot)
+    spot = Places(rows[kept], slot, own, match.how)
+    return points.saying(*gaps(joints, spot)), spot
+
+
+def gaps(joints: Reading, spot: Places) -> list[str]:
+    """Poses that lack a point, by their names."""
+    seen = np.zeros((len(joints.line), len(spot.names)), dtype=bool)
+    seen[spot.pose, spot.slot] = True
+    names = joints.column("pose").cells
+    out = []
+    for pose in np.flatnonzero(~seen.all(axis=1)):
+        lacking = [spot.names[slot] for slot in np.flatnonzero(~seen[pose])]
+        whole = len(spot.names) == 1 or len(lacking) == len(spot.names)
+        out.append(names[pose] + ("" if whole else f" (target {', '.join(lacking)})"))
+    if not out:
+        return []
+    more = f" and {len(out) - MOST_NAMED} more" if len(out) > MOST_NAMED else ""
+    return [f"no point, left empty: {', '.join(out[:MOST_NAMED])}{more}"]
 
 
 def settled(points: Reading, joints: Reading, layout: str) -> Reading:
@@ -75,6 +139,12 @@ def labels_of(points: Reading) -> tuple[tuple[str, ...], Array]:
 def with_targets(points: Reading, pose: Array, how: str) -> Places:
     """Rows whose pose is known; a target's name says which target."""
     names, slot = labels_of(points)
+    check_once(points, pose, slot)
+    return Places(pose, slot, names, how)
+
+
+def check_once(points: Reading, pose: Array, slot: Array) -> None:
+    """Raise DataError where a target has two points at a pose."""
     seen: dict[tuple[int, int], int] = {}
     for line, at in zip(points.line, zip(pose, slot, strict=True), strict=True):
         if at in seen:
@@ -83,29 +153,29 @@ def with_targets(points: Reading, pose: Array, how: str) -> Places:
                 f"{seen[at]}; delete one, or name the targets in a column target"
             )
         seen[at] = int(line)
-    return Places(pose, slot, names, how)
 
 
-def by_key(points: Reading, joints: Reading) -> Places:
-    """Match by a column both files have."""
-    key, other = points.find("pose"), joints.find("pose")
-    if key is None or other is None:
-        raise DataError(f"{points.sheet.path}: has no key column")
-    row: dict[str, int] = {}
-    for i, name in enumerate(other.cells):
-        if name in row:
-            raise DataError(
-                f"{joints.sheet.path}:{joints.line[i]}: {name!r} stands twice in the key column "
-                f"{other.name}; rename or delete one"
-            )
-        row[name] = i
-    for i, name in enumerate(key.cells):
-        if name not in row:
-            raise DataError(
-                f"{points.sheet.path}:{points.line[i]}: {name!r} is in no row of "
-                f"{joints.sheet.path}; mend column {key.name}, or delete the row"
-            )
-    return with_targets(points, np.array([row[name] for name in key.cells]), f"key {key.name}")
+def poses_of(reading: Reading) -> Reading | None:
+    """Of a table with a row for each point, the rows of its poses; None for one of poses.
+
+    Names tell: P1_1 and P1_2 are two targets at P1, if the joints of both are the same.
+    """
+    key = reading.find("pose")
+    if key is None or reading.find("target") or len(reading.smrs) != 1 or not reading.joints:
+        return None
+    names = [parts_of(cell) for cell in key.cells]
+    joints = list(zip(*(c.cells for c in reading.joints), strict=True))
+    first: dict[tuple[str | int, ...], int] = {}
+    for i, parts in enumerate(names):
+        row = first.setdefault(parts[:-1], i)
+        if len(parts) < LEAST_PARTS or joints[row] != joints[i]:
+            return None
+    if not 2 * len(first) <= len(names) + len(first) // 2 or len(first) < 2:
+        return None
+    poses = reading.take(np.array(sorted(first.values())))
+    stems = tuple("-".join(map(str, parts_of(c)[:-1])) for c in poses.column("pose").cells)
+    columns = tuple(replace(c, cells=stems) if c.meaning == "pose" else c for c in poses.columns)
+    return replace(poses, columns=columns)
 
 
 def by_count(points: Reading, joints: Reading, layout: str) -> Places:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from minimax_cal.measuring.importers.reading import (
-    JOINT,
     Column,
     Reading,
     Told,
     checked,
     joint_names,
+    joint_number,
     named_reading,
     plain,
     stems,
@@ -26,7 +26,7 @@ def fits(sheet: Sheet, joints: bool) -> bool:
     names = stems(sheet)
     if QUATERNION in names:
         return False
-    named = any(JOINT.fullmatch(name) or name.endswith("_joint") for name in names)
+    named = any(joint_number(name) or name.endswith("_joint") for name in names)
     return named and (joints or not {"x", "y", "z"} <= set(names))
 
 
@@ -38,8 +38,7 @@ def read(sheet: Sheet, told: Told) -> Reading:
         def meaning(stem: str) -> str:
             if stem in named:
                 return f"q{named.index(stem) + 1}"
-            found = JOINT.fullmatch(stem)
-            return f"q{found[1]}" if found else plain(stem)
+            return f"q{number}" if (number := joint_number(stem)) else plain(stem)
 
         return named_reading(TITLE, sheet, meaning)
     keyed = bool(sheet.cells) and not any(is_number(row[0]) for row in sheet.cells)

@@ -12,6 +12,7 @@ from minimax_cal.measuring.importers.reading import (
     Column,
     Reading,
     Told,
+    joint_number,
     named_reading,
     plain,
     stems,
@@ -28,7 +29,8 @@ NO = {"", "false", "no", "0", "-", "n", "falsch", "nein", "faux", "non"}
 def fits(sheet: Sheet, joints: bool) -> bool:
     """Whether there are x, y, z and columns only a tracker writes."""
     names = set(stems(sheet))
-    return {"x", "y", "z"} <= names and bool(SIGNS & names)
+    joints_too = sum(map(bool, map(joint_number, names))) > 1
+    return {"x", "y", "z"} <= names and bool(SIGNS & names) and not joints_too
 
 
 def read(sheet: Sheet, told: Told) -> Reading:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from minimax_cal.measuring.importers.reading import (
-    JOINT,
     Column,
     Reading,
     Told,
+    joint_number,
     named_reading,
     plain,
     stems,
@@ -43,6 +43,6 @@ def read(sheet: Sheet, told: Told) -> Reading:
 
 def meaning(stem: str) -> str:
     """Of a column's name."""
-    if found := JOINT.fullmatch(stem):
-        return f"q{found[1]}"
+    if number := joint_number(stem):
+        return f"q{number}"
     return f"smr1_{stem}" if stem in ("x", "y", "z") else plain(stem)

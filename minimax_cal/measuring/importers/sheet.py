@@ -14,12 +14,17 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import check_table, read_raw
+from minimax_cal.measuring.spreadsheet import is_workbook, text_of_workbook
 
 DELIMITERS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "spaces"}
 DECIMALS = {".": "point", ",": "comma"}
 POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?(\d*),(\d+)([eE][-+]?\d+)?")
 COMMENTS = ("#", "%", "//", "!")
+UNIT = re.compile(
+    "mm|m|um|\u00b5m|\u03bcm|cm|in|deg|\u00b0|grad|Grad|rad|mrad|s|ms|\u00b0C|C|K|F|kg|Nm"
+)
+WORKBOOK = "workbook"
 LOOKED_AT = 200  # rows that decide the delimiter
 
 
@@ -28,7 +33,7 @@ class Sheet:
     """A file of rows and columns.
 
     header: names, or empty.  line: (m,) line of the file of each row.  cells: m rows of text.
-    delimiter, decimal: empty where the text has no columns.
+    delimiter, decimal: empty where the text has no columns.  preamble: lines above the table.
     torn: lines that have fewer or more cells, where they were left out.
     """
 
@@ -41,6 +46,7 @@ class Sheet:
     line: Array
     cells: tuple[tuple[str, ...], ...]
     torn: tuple[int, ...] = ()
+    preamble: tuple[int, ...] = ()
 
     @property
     def width(self) -> int:
@@ -51,7 +57,7 @@ class Sheet:
 def open_text(path: Path | str) -> Sheet:
     """A text file, not yet cut into rows and columns.  Raises DataError."""
     path = Path(path)
-    text, encoding = decoded(path)
+    text, encoding = (text_of_workbook(path), WORKBOOK) if is_workbook(path) else decoded(path)
     if not text.strip():
         raise DataError(f"{path}: is empty")
     return Sheet(path, text, encoding, "", "", (), np.empty(0, dtype=int), ())
@@ -69,14 +75,20 @@ def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
         for number, line in enumerate(text.splitlines(), 1)
         if line.strip(" \t,;") and not line.lstrip().startswith(COMMENTS)
     ]
-    delimiter = delimiter_of([line for _, line in numbered[:LOOKED_AT]])
+    delimiter = "\t" if sheet.encoding == WORKBOOK else ""
+    delimiter = delimiter or delimiter_of([line for _, line in numbered[:LOOKED_AT]])
     if not delimiter:
         raise DataError(f"{path}: has no columns that commas, semicolons, tabs or spaces separate")
     rows = [(number, cells_of(path, number, line, delimiter)) for number, line in numbered]
+    above = 0 if most_torn else preamble_of([row for _, row in rows])
+    preamble, rows = tuple(number for number, _ in rows[:above]), rows[above:]
     header: tuple[str, ...] = ()
     if is_header(rows[0][1]):
         _, first = rows.pop(0)
         header = tuple(trimmed(first))
+        if rows and (units := units_in(rows[0][1], len(header))):
+            header = tuple(f"{n} [{u}]" if u else n for n, u in zip(header, units, strict=True))
+            rows.pop(0)
         if not rows:
             raise DataError(f"{path}: holds a header but no rows")
     width = len(header) or Counter(len(trimmed(row)) for _, row in rows).most_common(1)[0][0]
@@ -95,7 +107,23 @@ def cut(sheet: Sheet, decimal: str = "", *, most_torn: float = 0.0) -> Sheet:
     names = header or tuple(f"column {i + 1}" for i in range(width))
     sign = decimal or decimal_of(path, names, line, cells)
     found = replace(sheet, delimiter=delimiter, decimal=sign, header=header, line=line, cells=cells)
-    return replace(found, torn=lost)
+    return replace(found, torn=lost, preamble=preamble)
+
+
+def preamble_of(rows: list[list[str]]) -> int:
+    """How many rows above the table say something else: they are half as long, or shorter."""
+    lengths = [len(trimmed(row)) for row in rows]
+    width = Counter(lengths).most_common(1)[0][0]
+    first = next((i for i, length in enumerate(lengths) if 2 * length > width), 0)
+    return first if first < len(rows) - 1 else 0
+
+
+def units_in(row: list[str], width: int) -> list[str]:
+    """The units of a row that holds nothing else, below the header; else nothing."""
+    cells = [cell.strip("[]() ") for cell in (*row, *[""] * width)][:width]
+    filled = [cell for cell in cells if cell and cell != "-"]
+    known = bool(filled) and all(UNIT.fullmatch(cell) for cell in filled)
+    return [cell if UNIT.fullmatch(cell) else "" for cell in cells] if known else []
 
 
 def decoded(path: Path) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""Points of one target: three columns x, y, z, with or without a header; one file an SMR."""
+"""Points alone: columns x, y, z of a target, or of several; without a header of one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from minimax_cal.measuring.importers.reading import (
     Told,
     named_reading,
     plain,
+    points_of,
     stems,
 )
 from minimax_cal.measuring.importers.sheet import Sheet
 
-TITLE = "points of one target"
-NAMES = {"x": "x", "y": "y", "z": "z"} | {f"{a}{t}": a for a in "xyz" for t in (" pos", "_pos")}
+TITLE = "points"
 
 
 def fits(sheet: Sheet, joints: bool) -> bool:
@@ -24,7 +24,7 @@ def fits(sheet: Sheet, joints: bool) -> bool:
         return False
     if not sheet.header:
         return sheet.width == 3
-    return sorted(NAMES[s] for s in stems(sheet) if s in NAMES) == ["x", "y", "z"]
+    return bool(points_of(stems(sheet)))
 
 
 def read(sheet: Sheet, told: Told) -> Reading:
@@ -36,6 +36,5 @@ def read(sheet: Sheet, told: Told) -> Reading:
             Column(f"column {i + 1}", c.meaning, "", c.cells) for i, c in enumerate(reading.columns)
         )
         return replace(reading, sheet=sheet, columns=columns)
-    return named_reading(
-        TITLE, sheet, lambda stem: f"smr1_{NAMES[stem]}" if stem in NAMES else plain(stem)
-    )
+    points = points_of(stems(sheet))
+    return named_reading(TITLE, sheet, lambda stem: points.get(stem) or plain(stem))
