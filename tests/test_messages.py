@@ -18,8 +18,8 @@ from minimax_cal.cli.running import cli
 
 PACKAGE = ROOT / "minimax_cal"
 FLAG = re.compile(r"(?:^|[\s(`'\"])(?:--[a-z]|-[oq]\b)")
-# whose strings are options of a browser, of Dask, and of the command that a result proposes
-THEIRS = {"pdf.py", "parallel.py", "spans.py"}
+# whose strings are options of a browser, of Dask, and of commands that a message proposes
+THEIRS = {"pdf.py", "parallel.py", "spans.py", "slips.py"}
 
 
 def strings(tree: ast.AST) -> Iterator[ast.Constant]:

@@ -16,6 +16,7 @@ from minimax_cal.measuring.slips import (
     LATE,
     MOST_SHIFT,
     digits_of,
+    left_out_by,
     mend_by,
     slips,
     stale_rows,
@@ -42,7 +43,6 @@ LEAST_SCALE = 7e-4  # a smaller common factor may be the warmth of the arm: alum
 MOST_SCALE = 0.05  # a larger one is another unit, or another arm
 SURE = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
 LEAST_MOVING = 5  # joints whose links have ways enough to differ from a common factor
-NAMED = 12  # lines that a message names
 SHIFTS = tuple(by for size in range(1, MOST_SHIFT + 1) for by in (size, -size))
 NO_ROWS: Array = np.zeros(0, dtype=int)
 
@@ -104,11 +104,6 @@ def few_of(data: Measurements) -> Measurements:
     return data.take(np.linspace(0, data.poses - 1, FEW).astype(int))
 
 
-def lines_of(data: Measurements, rows: Array) -> str:
-    """Lines of some rows, for people and for --leave-out."""
-    return ",".join(str(data.line[row]) for row in rows[:NAMED])
-
-
 def check_fresh(robot: Robot, data: Measurements) -> None:
     """Raise DataError where points are those of the row before, though the arm moved."""
     rows = stale_rows(robot, data)
@@ -116,8 +111,7 @@ def check_fresh(robot: Robot, data: Measurements) -> None:
         raise DataError(
             f"{data.source}:{data.line[rows[0]]}: {len(rows)} rows have the points of the row "
             "before to the last digit, though the joints moved: stale readings; measure them "
-            f"again, or minimax-cal import {data.source} --leave-out {lines_of(data, rows)}"
-            f"{',...' if len(rows) > NAMED else ''} -o mended.csv"
+            f"again, or {left_out_by(data, rows)}"
         )
 
 
@@ -217,9 +211,7 @@ def check_clipped(robot: Robot, data: Measurements) -> None:
                 f"{data.source}: joint {joint + 1} looks clipped at {worst} {unit}: the "
                 f"{at_end.sum()} rows there miss by {1e3 * np.median(away):.3g} mm, the others by "
                 f"{1e3 * np.sqrt(rest.mean_square):.3g} mm; export the joints unclipped, or "
-                f"minimax-cal import {data.source} --leave-out "
-                f"{lines_of(data, np.flatnonzero(at_end))}"
-                f"{',...' if at_end.sum() > NAMED else ''} -o mended.csv"
+                f"{left_out_by(data, np.flatnonzero(at_end))}"
             )
 
 

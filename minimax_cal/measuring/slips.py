@@ -20,6 +20,7 @@ from minimax_cal.robots.robot import Robot
 MOST_SHIFT = 3  # rows that a file is shifted by: a line more or less, seldom two
 INCH = 25.4
 LATE = {1: "one row", 2: "two rows", 3: "three rows"}
+NAMED = 12  # lines that a message names
 STILL = 0.01  # a flange that moved farther leaves no point where it was [m]
 DIGITS = {  # of joint values with so few, the step in rad and what to say
     "whole degrees": np.pi / 180.0,
@@ -82,6 +83,13 @@ def slips(robot: Robot, data: Measurements) -> Iterator[Slip]:
 def mend_by(data: Measurements, how: str) -> str:
     """The command that mends a file."""
     return f"minimax-cal import {data.source} --mend {how} -o mended.csv"
+
+
+def left_out_by(data: Measurements, rows: Array) -> str:
+    """The command that sets rows aside, the first `NAMED` of them at least."""
+    lines = ",".join(str(data.line[row]) for row in rows[:NAMED])
+    more = ",..." if len(rows) > NAMED else ""
+    return f"minimax-cal import {data.source} --leave-out {lines}{more} -o mended.csv"
 
 
 def of_units(robot: Robot, data: Measurements) -> Iterator[tuple[str, Measurements]]:

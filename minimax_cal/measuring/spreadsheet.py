@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from datetime import date, datetime, time
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def text_of_workbook(path: Path | str, mark: str = "\t") -> str:
         sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]
     except Exception as error:  # the reader has no common class for what is no workbook
         raise DataError(f"{path}: is no workbook that can be read ({error})") from error
-    table: list[list[object]] = max(sheets, key=numbers_in, default=[])
+    table = max(sheets, key=numbers_in) if sheets else []
     if not numbers_in(table):
         raise DataError(f"{path}: no sheet of the workbook holds numbers")
     return "\n".join(mark.join(text_of(cell, mark) for cell in row) for row in table) + "\n"
@@ -47,7 +48,7 @@ def csv_of_workbook(path: Path | str) -> str:
     return stream.getvalue()
 
 
-def numbers_in(table: list[list[object]]) -> int:
+def numbers_in(table: Sequence[Sequence[object]]) -> int:
     """How many cells are numbers."""
     return sum(isinstance(cell, int | float) for row in table for cell in row)
 
