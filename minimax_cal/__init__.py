@@ -13,7 +13,10 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.diagnosing.diagnose import diagnose
     from minimax_cal.diagnosing.many import diagnose_many
     from minimax_cal.diagnosing.result import Diagnosis
+    from minimax_cal.dynamics.diagnose import diagnose_motion
+    from minimax_cal.dynamics.evaluate import evaluate_motion
     from minimax_cal.dynamics.logs import read_runs
+    from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
     from minimax_cal.dynamics.run import Run
     from minimax_cal.fitting.calibrate import calibrate
     from minimax_cal.fitting.fit import Fit, load_fit
@@ -67,6 +70,7 @@ __all__ = [
     "Diagnosis",
     "Fit",
     "Measurements",
+    "MotionDiagnosis",
     "OptionError",
     "Options",
     "Robot",
@@ -86,7 +90,9 @@ __all__ = [
     "deliver",
     "diagnose",
     "diagnose_many",
+    "diagnose_motion",
     "evaluate",
+    "evaluate_motion",
     "export",
     "fleet",
     "import_files",
@@ -94,6 +100,7 @@ __all__ = [
     "load_cell",
     "load_commands",
     "load_fit",
+    "load_motion",
     "load_robot",
     "measurements",
     "minimize_max",
@@ -150,6 +157,10 @@ MODULES = {  # name: where it is defined
     "diagnose_many": "diagnosing.many",
     "Run": "dynamics.run",
     "read_runs": "dynamics.logs",
+    "MotionDiagnosis": "dynamics.result",
+    "load_motion": "dynamics.result",
+    "diagnose_motion": "dynamics.diagnose",
+    "evaluate_motion": "dynamics.evaluate",
     "plan": "planning.plan",
     "plan_motion": "planning.motion_plan",
     "Compensation": "correcting.compensate",

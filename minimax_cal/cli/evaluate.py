@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import click
 import numpy as np
 
-from minimax_cal.cli.options import DATA, FIT, RUNG, InGroups, Output, result_options, show
+from minimax_cal.cli.options import DATA, FIT, PATH, RUNG, InGroups, Output, result_options, show
+from minimax_cal.dynamics.evaluate import evaluate_motion
+from minimax_cal.dynamics.result import KIND
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.opened import open_result
 from minimax_cal.fitting.set_aside import aside_sentence, errors_of, with_them
-from minimax_cal.ground.files import json_text
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.files import json_of, json_text, read_text
 from minimax_cal.judging.saved import training_poses
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.accuracy import accuracy
@@ -21,16 +25,41 @@ from minimax_cal.measuring.spans import narrow, outside, spans_in_words
 from minimax_cal.modelling.cell import strangers
 
 
+def kind_of_file(path: Path) -> str:
+    """The kind that a result file says; empty where it says none."""
+    with suppress(CalibrationError, ValueError):
+        content = json_of(read_text(path))
+        return str(content.get("kind", "")) if isinstance(content, dict) else ""
+    return ""
+
+
+def evaluate_logs(motion: Path, logs: tuple[Path, ...], to: Output) -> int:
+    """What a motion diagnosis misses on other logs."""
+    found = evaluate_motion(motion, list(logs))
+    to.notice(*found.notices)
+    if to.deliver(lambda: json_text(found.to_dict())):
+        show(found.table())
+    return 0
+
+
 @click.command(name="evaluate", cls=InGroups)
 @FIT
 @DATA
+@click.argument("more", type=PATH, nargs=-1)
 @RUNG
 @result_options("the accuracy (JSON)")
-def evaluate_command(fit: Path, data: Path, rung: int | None, to: Output) -> int:
+def evaluate_command(
+    fit: Path, data: Path, more: tuple[Path, ...], rung: int | None, to: Output
+) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
 
-    FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.
+    FIT is a calibration, a diagnosis or a relative calibration, as -o wrote it.  Of a motion
+    diagnosis, DATA and MORE are logs, and its torques are judged.
     """
+    if kind_of_file(fit) == KIND:
+        return evaluate_logs(fit, (data, *more), to)
+    if more:
+        raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")
     measured = read_measurements(data)
     opened = open_result(fit, rung)
     cell, _, said = opened.placed_by(measured)

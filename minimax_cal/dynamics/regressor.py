@@ -32,7 +32,7 @@ class Motion:
 def link_axes(links: Chain) -> Array:
     """(n, 3, 3, m) axes x, y, z of each link's own frame in the base, one a row."""
     z = np.concatenate([links.z[1:], links.axes[2:]])
-    return np.stack([cross(links.y, z), links.y, z], axis=1)
+    return np.asarray(np.stack([cross(links.y, z), links.y, z], axis=1))
 
 
 def link_motion(robot: Robot, links: Chain, qd: Array, qdd: Array) -> tuple[Array, Array, Array]:
@@ -103,6 +103,34 @@ def regressor(robot: Robot, motion: Motion) -> Array:
             lever = np.einsum("abm,bm->am", axes[k], lever)
             part[:] = np.einsum("am,apm->pm", z, moment) + np.einsum("am,apm->pm", lever, force)
     return np.asarray(np.moveaxis(np.einsum("ij,i...->j...", robot.turning, out), -1, 0))
+
+
+def inverse_dynamics(robot: Robot, motion: Motion, parameters: Array) -> Array:
+    """(m, n) torque of each joint [N m, N] of known inertial parameters (n, 10).
+
+    Newton and Euler in the base frame: as the regressor's, without its columns.
+    """
+    q, qd, qdd = (part * robot.sign for part in (motion.q, motion.qd, motion.qdd))
+    links = chain(robot.mdh, np.ascontiguousarray(q), robot.prismatic)
+    axes = link_axes(links)
+    rate, change, speeding = link_motion(robot, links, qd, qdd)
+    mass = parameters[:, 0, None, None]
+    first = np.einsum("nabm,na->nbm", axes, parameters[:, 1:4])
+    own = np.empty((robot.joints, 3, 3))
+    for number, (i, j) in enumerate(UPPER):
+        own[:, i, j] = own[:, j, i] = parameters[:, 4 + number]
+
+    def about(w: Array) -> Array:
+        inner = own @ np.einsum("nabm,nbm->nam", axes, w)
+        return np.asarray(np.einsum("nabm,nam->nbm", axes, inner))
+
+    force = mass * speeding + cross(change, first) + cross(rate, cross(rate, first))
+    moment = cross(first, speeding) + about(change) + cross(rate, about(rate))
+    moment = moment + cross(links.after, force)  # about the origin of the base
+    force, moment = (np.cumsum(part[::-1], axis=0)[::-1] for part in (force, moment))
+    turning = links.z * (moment - cross(links.before, force))
+    along = np.where(robot.prismatic[:, None, None], links.z * force, turning)
+    return np.asarray(along.sum(axis=1).T * robot.sign)
 
 
 def link_parameters(mass: float, com: Array, inertia: Array) -> Array:

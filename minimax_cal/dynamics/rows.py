@@ -9,8 +9,8 @@ the speed: these rows are predicted, and never fitted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -34,9 +34,15 @@ QUARTERS = 4  # groups of a trajectory, which err together
 LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
 
+@lru_cache(maxsize=32)
+def filter_sections(rate: float) -> Array:
+    """Second-order sections of the filter at a rate [Hz]."""
+    return np.asarray(butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos"))
+
+
 def smooth(values: Array, rate: float) -> Array:
     """Values (m, ...) after the zero-phase filter.  rate: [Hz]."""
-    sections = butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos")
+    sections = filter_sections(rate)
     pad = min(len(values) - 1, int(rate))
     return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=pad))
 
@@ -132,6 +138,17 @@ class Logs:
         """Derivative in time (M, ...) of values (M, ...), each run for itself."""
         ends = zip(self.start[:-1], self.start[1:], strict=True)
         return np.concatenate([slope(values[a:b], SAMPLE_HZ) for a, b in ends])
+
+    def earlier(self, late: float) -> Logs:
+        """The logs with torques that were logged so much after the motion [s] put back in time."""
+        ends = zip(self.start[:-1], self.start[1:], strict=True)
+        moved = [
+            CubicSpline(self.since[a:b], self.torque[a:b])(
+                np.clip(self.since[a:b] + late, self.since[a], self.since[b - 1])
+            )
+            for a, b in ends
+        ]
+        return replace(self, torque=np.concatenate(moved))  # fmt: skip
 
     def only(self, runs: Sequence[int]) -> Logs:
         """The logs of some runs."""
@@ -237,13 +254,19 @@ class Whitening:
         return np.asarray(np.nonzero(self.kept)[0])
 
     def white(self, rows: Array) -> Array:
-        """Rows (N, ...) with a noise of unit variance and no memory."""
-        shape = (-1, *(1,) * (rows.ndim - 1))
-        own = self.weights[self.joint, self.place]
+        """Rows (N, ...) of all joints with a noise of unit variance and no memory."""
+        joints = range(len(self.kept))
+        parts = [self.white_joint(j, rows[self.joint == j]) for j in joints]
+        return np.concatenate(parts)
+
+    def white_joint(self, joint: int, rows: Array) -> Array:
+        """The same of one joint's rows (k, ...)."""
+        own = self.weights[joint, self.place[self.joint == joint]]
+        own = own.reshape(*own.shape, *(1,) * (rows.ndim - 1))
         out = rows.copy()
         for lag in range(1, AR_ORDER + 1):
-            out[lag:] -= own[lag:, lag - 1].reshape(shape) * rows[:-lag]
-        return np.asarray(out * own[:, AR_ORDER].reshape(shape))
+            out[lag:] -= own[lag:, lag - 1] * rows[:-lag]
+        return np.asarray(out * own[:, AR_ORDER])
 
 
 def in_order(kept: Array, run: Array) -> Array:

@@ -118,6 +118,7 @@ class Sums:
     def __init__(self, columns: Columns, ratios: Array) -> None:
         self.columns, self.ratios = columns, ratios
         self.weights = 1.0 / (1.0 + np.outer(ratios, columns.rows.variance_ratio))
+        self.alike = not columns.rows.variance_ratio.any()  # one noise: ratios change nothing
         self.lines = Lines(len(ratios))
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
@@ -137,6 +138,9 @@ class Sums:
     def spread(self, few: Array, many: Array) -> Array:
         """(f, g, d) weighed products of columns (f, n) and (d, n)."""
         g, n = self.weights.shape
+        if self.alike:
+            one = few @ many.T
+            return np.asarray(np.broadcast_to(one[:, None], (len(few), g, len(many))))
         out = np.empty((len(few), g, len(many)))
         step = max(1, BLOCK // (g * max(n, 1)))
         for i in range(0, len(few), step):

@@ -240,19 +240,45 @@ def as_urdf(model: Any, joints: Sequence[int], source: str) -> UrdfRobot:
               None, nothing)
     )  # fmt: skip
     name = Path(source).stem
-    urdf = Urdf(source, b"", name, "world", tuple(parts), masses(model, data, bodies, poses))
+    carried = masses(model, data, bodies, poses)
+    about = inertias(model, data, bodies, poses)
+    urdf = Urdf(source, b"", name, "world", tuple(parts), carried, about)
     return to_robot(urdf)
+
+
+def holders(model: Any, bodies: Bodies) -> Array:
+    """(nbody,) which joint, from 0, alone carries a body; -1 for none."""
+    holder = np.full(model.nbody, -1)
+    for body in range(1, model.nbody):
+        own = bodies.index(body) if body in bodies else -1
+        holder[body] = max(own, int(holder[model.body_parentid[body]]))
+    return holder
+
+
+def inertias(model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]) -> dict[str, Array]:
+    """Inertia (3, 3) in the link's axes of the same, about its centre of gravity [kg m^2]."""
+    holder, out = holders(model, bodies), {}
+    for i, pose in enumerate(poses):
+        mine = np.flatnonzero(holder == i)
+        total = float(model.body_mass[mine].sum())
+        if total <= 0.0:
+            continue
+        centre = (model.body_mass[mine, None] * data.xipos[mine]).sum(axis=0) / total
+        whole = np.zeros((3, 3))
+        for body in mine:
+            turn, arm = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
+            whole += turn @ np.diag(model.body_inertia[body]) @ turn.T
+            whole += model.body_mass[body] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        if whole.any():
+            out[f"link_{i + 1}"] = pose[:3, :3].T @ whole @ pose[:3, :3]
+    return out
 
 
 def masses(
     model: Any, data: Any, bodies: Bodies, poses: Sequence[Array]
 ) -> dict[str, tuple[float, Array]]:
     """Mass [kg] and centre of gravity in the link's frame [m] of what each joint alone carries."""
-    holder = np.full(model.nbody, -1)
-    for body in range(1, model.nbody):
-        own = bodies.index(body) if body in bodies else -1
-        holder[body] = max(own, int(holder[model.body_parentid[body]]))
-    out = {}
+    holder, out = holders(model, bodies), {}
     for i, pose in enumerate(poses):
         mine = np.flatnonzero(holder == i)
         total = float(model.body_mass[mine].sum())

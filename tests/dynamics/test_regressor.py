@@ -14,6 +14,7 @@ from minimax_cal.dynamics.regressor import (
     Motion,
     base_parameters,
     inertial_parameters,
+    inverse_dynamics,
     regressor,
 )
 from minimax_cal.ground.arrays import Array
@@ -119,6 +120,15 @@ def test_a_urdf_has_the_torques_of_pinocchio(tmp_path: Path) -> None:
         theirs.append(pin.rnea(model, data, np.array(wound), qd, qdd))
     ours = regressor(robot, moved) @ inertial_parameters(robot).ravel()
     assert_allclose(ours, theirs, rtol=0, atol=EXACT * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("slides", [(), (0,), (2, 4)])
+def test_the_recursion_is_the_regressor(slides: tuple[int, ...]) -> None:
+    robot = random_arm(1, slides)
+    moved, phi = motion(robot, 3), inertial_parameters(robot)
+    torque = regressor(robot, moved) @ phi.ravel()
+    found = inverse_dynamics(robot, moved, phi)
+    assert_allclose(found, torque, rtol=0, atol=EXACT * np.abs(torque).max())
 
 
 @pytest.mark.parametrize("slides", [(), (1,)])

@@ -1,0 +1,137 @@
+"""What each effect is worth: every trajectory is predicted by numbers fitted without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.model import FRICTION, RIGID, Normal, held_friction, solve_scaled
+from minimax_cal.dynamics.rows import Logs
+from minimax_cal.dynamics.search import Columns
+from minimax_cal.ground.arrays import Array
+
+NEVER_OUT = -1  # number of the fold of rows that are always fitted
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Fits without each fold of trajectories in turn, and what they miss there.
+
+    raw: (n, R, p) columns as in `Normal`, not whitened.  error: (n, R) torques; early: the same
+    before a delay was taken out.  fold: (R,).  gram: (f, p, p) and pull: (f, p) of the rows fitted
+    without each fold.
+    """
+
+    normal: Normal
+    raw: Array
+    error: Array
+    early: Array
+    fold: Array
+    gram: Array
+    pull: Array
+
+    @staticmethod
+    def of(normal: Normal, error: Array, early: Array, fold: Array) -> LeftOut:
+        """The fits of whitened rows.  fold: (R,) of every row."""
+        own = np.broadcast_to(fold, normal.white.kept.shape)[normal.white.kept]
+        products = [products_of(normal, own == f) for f in range(-1, int(fold.max()) + 1)]
+        gram, pull = (np.array([each[k] for each in products]) for k in (0, 1))
+        return LeftOut(normal, normal.raw, error, early, fold,
+                       gram.sum(axis=0) - gram[1:], pull.sum(axis=0) - pull[1:])  # fmt: skip
+
+    @property
+    def judged(self) -> Array:
+        """(R,) rows that some fit leaves out."""
+        return np.asarray(self.fold >= 0)
+
+    def values(self, parts: Sequence[str]) -> list[Array]:
+        """(p,) values of some parts, of the fit without each fold."""
+        index = self.normal.index(parts)
+        out = []
+        for gram, pull in zip(self.gram, self.pull, strict=True):
+            value = np.zeros(len(pull))
+            value[index] = solve_scaled(gram[np.ix_(index, index)], pull[index])
+            out.append(value)
+        return out
+
+    def missed(
+        self, parts: Sequence[str], *, delayed: bool = True, without: Sequence[int] = ()
+    ) -> Array:
+        """(R, n) what fits of some parts miss at the rows that each leaves out.
+
+        Rows that no fit leaves out are as one of the fits leaves them, and are not `judged`.
+        delayed: whether a delay was taken out.  without: columns that are left out besides.
+        """
+        index = np.setdiff1d(self.normal.index(parts), np.array(without, dtype=int))
+        out = np.zeros(self.error.shape)
+        seen = self.error if delayed else self.early
+        for f in range(len(self.gram)):
+            rows = (self.fold == f) | (self.fold == NEVER_OUT)
+            value = solve_scaled(self.gram[f][np.ix_(index, index)], self.pull[f][index])
+            out[:, rows] = seen[:, rows] - self.raw[:, rows][..., index] @ value
+        missed = np.asarray(out.T)
+        return missed if self.normal.place[FRICTION].start not in index else self.less_held(missed)
+
+    def less_held(self, missed: Array) -> Array:
+        """(R, n) the same less the friction that stays at rest, as the other folds show it."""
+        scene, out = self.normal.columns.scene, missed.copy()
+        for f in range(len(self.gram)):
+            rows = self.fold == f
+            out[rows] -= held_friction(scene, missed, ~rows) * scene.held[rows]
+        return out
+
+    def rms(self, missed: Array, moving: Array | None = None) -> Array:
+        """(n,) of each joint over the rows left out, or the moving ones of them (R, n)."""
+        rows = self.judged[:, None] & (np.ones(missed.shape, bool) if moving is None else moving)
+        count = np.maximum(rows.sum(axis=0), 1)
+        return np.asarray(np.sqrt((missed**2 * rows).sum(axis=0) / count))
+
+
+def products_of(normal: Normal, rows: Array) -> tuple[Array, Array]:
+    """Products of whitened columns among each other and with the error, of some rows (N,)."""
+    matrix = normal.matrix[rows]
+    return matrix.T @ matrix, matrix.T @ normal.error[rows]
+
+
+def folds_of(logs: Logs, share: float, named: Sequence[str]) -> Array:
+    """(R,) fold of every row: runs named are one; else whole runs in turn, about a share each.
+
+    A single run is left out by quarters.
+    """
+    count = len(logs.names)
+    if named:
+        out = np.array([0 if name in named else NEVER_OUT for name in logs.names])
+        return np.asarray(out[logs.run])
+    if count == 1:
+        return np.asarray(logs.quarter)
+    parts = min(count, max(2, round(1.0 / share)))
+    return np.asarray((np.arange(count) % parts)[logs.run])
+
+
+def steps_of(terms: Sequence[Term]) -> list[tuple[str, tuple[Term, ...]]]:
+    """The steps after usual friction: effects in the order found, each at all its places."""
+    done: list[Term] = []
+    out = []
+    for effect in dict.fromkeys(term.effect for term in terms):
+        done += [term for term in terms if term.effect == effect]
+        out.append((effect, tuple(done)))
+    return out
+
+
+def parts_of(terms: Sequence[Term]) -> list[str]:
+    """The parts of a fit with usual friction and some laws."""
+    return [RIGID, FRICTION, *(term.text for term in terms)]
+
+
+def drawn_missed(columns: Columns, error: Array) -> Array:
+    """(R, n) what the model as given misses; with a gain of each joint where none is given."""
+    arm = columns.scene.arm
+    drawn = np.einsum("rjp,p->jr", columns.scene.base_rows, arm.base.T @ arm.drawn)
+    if not arm.shared:
+        drawn *= (drawn * error).sum(axis=1, keepdims=True) / np.maximum(
+            (drawn**2).sum(axis=1, keepdims=True), 1e-300
+        )
+    return np.asarray((error - drawn).T)

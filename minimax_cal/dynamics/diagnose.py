@@ -1,0 +1,542 @@
+"""Diagnose torques along trajectories: what the model lacks, and what each effect is worth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtr
+from threadpoolctl import threadpool_limits
+
+from minimax_cal.dynamics.budget import LeftOut, drawn_missed, folds_of, parts_of, steps_of
+from minimax_cal.dynamics.given import (
+    Payload,
+    gains_of,
+    known_of,
+    ratios_of,
+    runs_of,
+    with_payload,
+)
+from minimax_cal.dynamics.laws import LAWS, USUAL, Term, terms_of
+from minimax_cal.dynamics.links import LinkChange, body_as_given
+from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
+from minimax_cal.dynamics.probes import Unexplained, unexplained
+from minimax_cal.dynamics.result import (
+    Alternative,
+    FrictionCurve,
+    HeldRun,
+    MotionDiagnosis,
+    MotionEffect,
+    MotionStep,
+    NotTestable,
+    Parameter,
+    best_worth,
+)
+from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
+from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.search import Columns, dictionary_of, generous
+from minimax_cal.evidence.alternatives import alternatives
+from minimax_cal.evidence.library import Library
+from minimax_cal.evidence.limits import LEVEL
+from minimax_cal.evidence.selection import Choice, select
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.robots.robot import Robot, load_robot
+
+LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
+LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
+MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
+MATTERS = 0.15  # of the remaining error's square at a joint: structure beyond it is an error
+SPLITS = 2  # of the groups in complementary halves, in which names are sought again
+FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
+SEED = 0  # of the halves
+SHOWN_ROWS = 750  # of the held-out run that is drawn
+CURVE_POINTS = 61
+TUNED_UNITS = {"length": "rad", "seconds": "s"}  # of tuned numbers that are no shares
+LATE = 1e-4  # delays below it move no row [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The laws that trajectories call for.
+
+    columns, choice: of the search.  context: body and friction that the laws were computed with.
+    lacking: effect, place and what is needed of laws that were not tried.
+    """
+
+    columns: Columns
+    context: Body
+    choice: Choice
+    terms: tuple[Term, ...]
+    lacking: tuple[tuple[str, str, str], ...]
+
+
+def diagnose_motion(
+    robot: Robot | str | Path,
+    logs: Sequence[Run | str | Path] | str | Path,
+    *,
+    holdout: float = 0.2,
+    holdout_run: str | Sequence[str] | None = None,
+    payload: Payload | None = None,
+    drive_gain: Sequence[float] | None = None,
+    ratio: float | Sequence[float] | None = None,
+    exclude: Sequence[str] = (),
+    progress: Progress = silent,
+) -> MotionDiagnosis:
+    """Say why the torques of a robot along trajectories are not those of its model.
+
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path; masses, inertias and drive gains of its file are used.
+    logs
+        Files or runs; each is a trajectory.
+    holdout
+        About this share of the trajectories is left out in turn to judge what each effect is worth.
+    holdout_run
+        Names of runs that judge instead, and that neither the search nor a fit sees.
+    payload
+        What the flange is known to carry: its mass [kg] and its centre in the last frame [m].  A
+        mass that a run itself reports counts for that run.
+    drive_gain
+        Torque for one ampere, of each joint [N m/A], where the logs hold currents.
+    ratio
+        Gear ratio, of all joints or of each.
+    exclude
+        Effects that are not to be considered.
+    progress
+        Called with a word on each stage.
+
+    Returns
+    -------
+    MotionDiagnosis
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> print(mc.diagnose_motion("arm.urdf", ["run1.csv", "run2.csv"]).summary())
+    """
+    began = time.perf_counter()
+    arm_of = robot if isinstance(robot, Robot) else load_robot(robot)
+    for name in exclude:
+        if name not in LAWS:
+            raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(LAWS)}")
+    progress("reading logs")
+    runs = runs_of(robot, arm_of, logs)
+    prepared = prepare(with_payload(runs, payload))
+    arm = Arm.of(arm_of, gains_of(arm_of, runs, drive_gain), ratios_of(arm_of, ratio),
+                 known_of(payload), prepared)  # fmt: skip
+    named = named_runs(prepared, holdout_run)
+    if not (named or 0.0 < holdout < 1.0):
+        raise OptionError(f"holdout={holdout:g} must lie between 0 and 1")
+    with threadpool_limits(limits=1, user_api="blas"):
+        made = examined(arm, prepared, folds_of(prepared, holdout, named), exclude, progress)
+    said = tuple(dict.fromkeys(text for run in runs for text in run.notices))
+    return replace(made, notices=(*said, *made.notices), seconds=time.perf_counter() - began)
+
+
+def named_runs(logs: Logs, given: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The runs that judge.  Raises OptionError."""
+    wanted = (given,) if isinstance(given, str) else tuple(given or ())
+    for name in wanted:
+        if name not in logs.names:
+            raise OptionError(f"holdout_run: no run {name!r}; choose {', '.join(logs.names)}")
+    if wanted and len(set(wanted)) == len(logs.names):
+        raise OptionError("holdout_run: leaves no run to learn from; name fewer")
+    return wanted
+
+
+def motion_lacking(logs: Logs) -> Iterator[str]:
+    """Why the motion is too little to name a cause."""
+    if logs.seconds < LEAST_SECONDS:
+        yield (
+            f"{logs.seconds:.0f} s of trajectories; record {LEAST_SECONDS:.0f} s or more, better "
+            "several of different kinds"
+        )
+    peak = float(np.abs(logs.motion.qd).max())
+    if peak < LEAST_PEAK:
+        yield (
+            f"no joint is faster than {peak:.2g} rad/s; record a run that reaches "
+            f"{LEAST_PEAK:g} rad/s or more"
+        )
+
+
+# ---- the search --------------------------------------------------------------------------------
+
+
+def search(arm: Arm, logs: Logs, exclude: Sequence[str]) -> Found:
+    """The laws that the fitted rows of some logs call for."""
+    scene = Scene.of(arm, logs)
+    context = first_body(Columns(scene))
+    columns = Columns(context.in_scene(scene))
+    terms, lacking = terms_of(columns.scene, exclude)
+    white = whitening(logs, generous(columns, terms))
+    library = Library.of(dictionary_of(columns, white), terms, [])
+    choice = select(library, ripple=False)
+    chosen = tuple(one.candidate.term for one in choice.found)
+    hidden = [(effect, "all", "motion in which the rigid body does not imitate it")
+              for effect, _ in choice.library.untestable]  # fmt: skip
+    return Found(columns, context, choice, chosen, (*lacking, *hidden))
+
+
+def fitted(found: Found, columns: Columns) -> Normal:
+    """Rows of what was found, whitened by what it leaves of them."""
+    first = whitening(columns.scene.logs, generous(columns, found.terms))
+    rough = Normal.of(columns, first, found.terms)
+    rest = rough.rest(rough.solve(parts_of(found.terms)))
+    return Normal.of(columns, whitening(columns.scene.logs, rest), found.terms)
+
+
+def frequencies(choice: Choice) -> dict[tuple[str, str], float]:
+    """In which share of complementary halves of the groups each name is found again."""
+    group = choice.library.rows.group
+    count = int(group.max()) + 1
+    rng, found = np.random.default_rng(SEED), list[set[tuple[str, str]]]()
+    for _ in range(SPLITS):
+        half = rng.permutation(count) < count // 2
+        for kept in (half[group], ~half[group]):
+            part = select(choice.part(kept), ripple=False)
+            found.append({one.key for one in part.chosen})
+    keys = {one.key for one in choice.chosen}
+    return {key: float(np.mean([key in one for one in found])) for key in keys}
+
+
+# ---- the answer --------------------------------------------------------------------------------
+
+
+def examined(
+    arm: Arm, logs: Logs, fold: Array, exclude: Sequence[str], progress: Progress
+) -> MotionDiagnosis:
+    """The diagnosis of runs whose rows are judged in folds.  fold: (R,)."""
+    learning = [r for r in range(len(logs.names)) if named_free(fold, logs, r)]
+    too_little = tuple(motion_lacking(logs.only(learning)))
+    progress("searching for causes")
+    found = search(arm, logs.only(learning), exclude)
+    early, late = logs, 0.0
+    for one, (value, _) in zip(found.choice.found, found.choice.estimates, strict=True):
+        if one.candidate.family == "delay" and abs(value[0]) > LATE:
+            late = float(value[0])
+    if late:
+        progress("searching again without the delay")
+        logs = logs.earlier(late)
+        found = search(arm, logs.only(learning), exclude)
+    progress("judging causes on trajectories left out")
+    columns = found.columns
+    if len(learning) < len(logs.names):
+        columns = Columns(found.context.scene(arm, logs))
+    normal = fitted(found, columns)
+    known = columns.error()
+    before = known + (early.y - logs.y).T
+    judge = LeftOut.of(normal, known, before, fold)
+    again = frequencies(found.choice)
+    given, change = body_as_given(normal)
+    effects = [*laws_found(found, normal, judge, again), *usual_found(normal, judge)]
+    if late:
+        effects = with_delay(effects, judge, late, found.terms)
+    if change is not None:
+        effects.insert(0, changed_link(change))
+    value = normal.solve(parts_of(found.terms))
+    left = tuple(unexplained(normal, value))
+    effects.sort(key=lambda one: (one.minor, -gain_of(one)))
+    models, budget = steps(found, normal, judge, late, before)
+    return MotionDiagnosis(
+        unit=logs.unit,
+        verdict=verdict_of(effects, left, too_little),
+        effects=tuple(effects),
+        budget=budget,
+        unexplained=left,
+        not_testable=tuple(not_testable(found, arm)),
+        too_little=too_little,
+        models=models,
+        runs=logs.names,
+        held_out=held_words(logs, fold),
+        held_run=held_run(judge, logs, parts_of(found.terms)),
+        curves=curves(found, normal, judge),
+        notices=tuple(body_notices(arm, given, change, logs)),
+    )
+
+
+def named_free(fold: Array, logs: Logs, run: int) -> bool:
+    """Whether the search sees a run: all are, but those that alone judge."""
+    only_some_judge = bool((fold < 0).any())
+    return not (only_some_judge and fold[logs.run == run][0] >= 0)
+
+
+def held_words(logs: Logs, fold: Array) -> str:
+    """How rows were held out."""
+    if (fold < 0).any():
+        names = dict.fromkeys(logs.names[r] for r in logs.run[fold >= 0])
+        return f"runs kept out: {', '.join(names)}"
+    if len(logs.names) == 1:
+        return "one run: its quarters left out in turn"
+    return "runs left out in turn"
+
+
+def worth_of(judge: LeftOut, whole: Array, missed: Array) -> dict[str, tuple[float, float]]:
+    """Of each joint that changes by a thousandth, the RMS of moving rows without and with it."""
+    moving = judge.normal.columns.scene.logs.moving
+    ends = judge.rms(missed, moving), judge.rms(whole, moving)
+    pairs = {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(zip(*ends, strict=True))}
+    shown = {key: (a, b) for key, (a, b) in pairs.items() if abs(a - b) > 1e-3 * a}
+    return shown or pairs
+
+
+def is_minor(worth: dict[str, tuple[float, float]], before: Array) -> bool:
+    """Whether an effect closes little of what the step before its kind leaves (n,)."""
+    shares = ((a**2 - b**2) / max(before[int(key[1:]) - 1] ** 2, 1e-300)
+              for key, (a, b) in worth.items())  # fmt: skip
+    return bool(max(shares) < MINOR)
+
+
+def laws_found(
+    found: Found, normal: Normal, judge: LeftOut, again: dict[tuple[str, str], float]
+) -> list[MotionEffect]:
+    """The laws that were found, with what each is worth."""
+    every = parts_of(found.terms)
+    value = normal.solve(every)
+    sigma, whole = normal.spread(every, value), judge.missed(every)
+    moving = normal.columns.scene.logs.moving
+    usual = judge.rms(judge.missed(parts_of(())), moving)
+    out = []
+    for number, term in enumerate(found.terms):
+        worth = worth_of(judge, whole, judge.missed([p for p in every if p != term.text]))
+        place = normal.place[term.text]
+        out.append(
+            MotionEffect(
+                term.effect,
+                term.place,
+                parameters_of(term, value[place], sigma[place], normal.columns.scene),
+                worth,
+                others_of(found.choice, number),
+                again[term.key],
+                bool(again[term.key] >= FOUND_AGAIN),
+                is_minor(worth, usual),
+                term.law.family,
+            )
+        )
+    return out
+
+
+def parameters_of(term: Term, value: Array, sigma: Array, scene: Scene) -> tuple[Parameter, ...]:
+    """The numbers of a law in the unit of the log, and those that were tuned."""
+    said = {"t": scene.logs.unit, "": "1"}
+    law = term.law
+    fitted_ones = [
+        Parameter(name, float(v), float(s), said.get(unit, unit.replace("t", scene.logs.unit, 1)))
+        for name, unit, v, s in zip(law.names, law.units, value, sigma, strict=False)
+    ]
+    tuned = [Parameter(name, v, float("nan"), TUNED_UNITS.get(name, "1")) for name, v in term.tuned]
+    return (*fitted_ones, *tuned)
+
+
+def others_of(choice: Choice, number: int) -> tuple[Alternative, ...]:
+    """What else could be an effect that was found."""
+    found = alternatives(choice.benches[number], choice.fits[number])
+    out = []
+    for other, rho2, _ in found:
+        term = other.candidate.term
+        out.append(Alternative(term.effect, term.place, rho2, separating(term)))
+    return tuple(out)
+
+
+def separating(term: Term) -> str:
+    """The run that would tell a law from others."""
+    if term.effect in ("drive_gain", "payload", "link_inertia"):
+        return "a run with a known payload"
+    if term.law.family:
+        return "a run with a slow part and one at full speed"
+    return "longer runs of another kind"
+
+
+def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
+    """Coulomb and viscous friction of each joint, where the rows show them."""
+    terms = normal.terms
+    every = parts_of(terms)
+    value = normal.solve(every)
+    sigma, whole = normal.spread(every, value), judge.missed(every)
+    logs = normal.columns.scene.logs
+    before = judge.rms(judge.missed([RIGID]), logs.moving)
+    start = normal.place[FRICTION].start
+    out = []
+    for number in range(2 * logs.joints):
+        at, joint, kind = start + number, number // 2, USUAL[number % 2]
+        z = value[at] / sigma[at] if sigma[at] > 0.0 else 0.0
+        if float(ndtr(-z)) * 2 * logs.joints > LEVEL:
+            continue
+        worth = worth_of(judge, whole, judge.missed(every, without=(at,)))
+        unit = logs.unit if kind == "coulomb" else f"{logs.unit} s/rad"
+        parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
+        out.append(
+            MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
+                         minor=is_minor(worth, before), family="friction_curve")
+        )  # fmt: skip
+    return out
+
+
+def with_delay(
+    effects: list[MotionEffect], judge: LeftOut, late: float, terms: tuple[Term, ...]
+) -> list[MotionEffect]:
+    """The effects with a delay by which the rows were shifted."""
+    every = parts_of(terms)
+    worth = worth_of(judge, judge.missed(every), judge.missed(every, delayed=False))
+    more = next((e for e in effects if e.effect == "delay"), None)
+    sigma = more.parameters[0].sigma if more else float("nan")
+    whole = late + (more.parameters[0].value if more else 0.0)
+    usual = judge.rms(judge.missed(parts_of(())), judge.normal.columns.scene.logs.moving)
+    shifted = MotionEffect("delay", "all", (Parameter("time", whole, sigma, "s"),), worth,
+                           minor=is_minor(worth, usual))  # fmt: skip
+    return [shifted, *(e for e in effects if e.effect != "delay")]
+
+
+def changed_link(change: LinkChange) -> MotionEffect:
+    """The link whose parameters are not as given."""
+    count = len(change.before)
+    effect = "payload" if change.link == count - 1 else "link_inertia"
+    law = LAWS["payload"]
+    parameters = tuple(
+        Parameter(name, float(v), float(s), unit)
+        for name, unit, v, s in zip(law.names, law.units, change.value, change.sigma, strict=True)
+    )
+    worth = {f"J{j + 1}": (float(a), float(b))
+             for j, (a, b) in enumerate(zip(change.before, change.after, strict=True))}  # fmt: skip
+    others = tuple(Alternative("payload" if k == count - 1 else "link_inertia", f"L{k + 1}", 1.0,
+                               "a run with a known payload") for k in change.others)  # fmt: skip
+    return MotionEffect(effect, f"L{change.link + 1}", parameters, worth, others,
+                        minor=is_minor(worth, change.before))  # fmt: skip
+
+
+def gain_of(one: MotionEffect) -> float:
+    """By how much an effect lowers the relative squares of the joint at which it closes most."""
+    _, (before, after) = best_worth(one)
+    return (before**2 - after**2) / max(before**2, 1e-300)
+
+
+def steps(
+    found: Found, normal: Normal, judge: LeftOut, late: float, before: Array
+) -> tuple[tuple[TorqueModel, ...], tuple[MotionStep, ...]]:
+    """The models of all steps, and the budget."""
+    moving = normal.columns.scene.logs.moving
+    context = found.context
+    budget = []
+
+    def judged(name: str, missed: Array) -> None:
+        ends = judge.rms(missed), judge.rms(missed, moving)
+        budget.append(MotionStep(name, *(tuple(map(float, end)) for end in ends)))
+
+    judged("model as given", drawn_missed(normal.columns, before))
+    judged("rigid body refitted", judge.missed([RIGID], delayed=not late))
+    judged("usual friction refitted", judge.missed(parts_of(()), delayed=not late))
+    models = [
+        normal.rigid_model("rigid body refitted", context),
+        normal.model("usual friction refitted", (), context, 0.0),
+    ]
+    if late:
+        judged("+ delay", judge.missed(parts_of(())))
+        models.append(normal.model("+ delay", (), context, late))
+    for effect, terms in steps_of(found.terms):
+        name = f"+ {effect}"
+        judged(name, judge.missed(parts_of(terms)))
+        models.append(normal.model(name, terms, context, late))
+    return tuple(models), tuple(budget)
+
+
+def verdict_of(
+    effects: Sequence[MotionEffect], left: Sequence[Unexplained], too_little: Sequence[str]
+) -> str:
+    """none, named, one_of or unknown."""
+    main = [e for e in effects if e.established and not e.minor]
+    if too_little or any(one.share > MATTERS for one in left):
+        return "unknown"
+    if not main:
+        return "unknown" if left else "none"
+    first = max(main, key=gain_of)
+    other = [a for a in first.alternatives if family(a.effect) != family(first.effect)]
+    return "one_of" if other else "named"
+
+
+def family(effect: str) -> str:
+    """The family of an effect: forms of one friction curve are one."""
+    return "friction_curve" if effect in USUAL else (LAWS[effect].family or effect)
+
+
+def not_testable(found: Found, arm: Arm) -> Iterator[NotTestable]:
+    """What the logs cannot show, each effect and need once."""
+    needs: dict[tuple[str, str], list[str]] = {}
+    for effect, place, what in found.lacking:
+        needs.setdefault((effect, what), []).append(place)
+    for (effect, what), places in needs.items():
+        joints = {f"J{j + 1}" for j in range(arm.robot.joints)}
+        place = "all" if joints <= set(places) else ", ".join(places)
+        yield NotTestable(effect, place, what)
+    if not arm.known.any():
+        yield NotTestable("drive_gain", "all", "a known payload: without one a common error of all "
+                          "drive gains and masses are the same")  # fmt: skip
+
+
+def body_notices(arm: Arm, given: bool, change: LinkChange | None, logs: Logs) -> Iterator[str]:
+    """What is to be known of masses and gains."""
+    if logs.unit == CURRENT and not arm.shared:
+        yield (
+            "currents are judged in A: without drive gains each joint has masses of its own; give "
+            "drive_gain= to test joint flexibility, drive gains and the masses of the model"
+        )
+    elif not arm.drawn.any():
+        yield "the model gives no masses: the rigid body is the one that the torques show"
+    elif not given and change is None:
+        yield "the masses of the model are not this arm's: the rigid body was refitted"
+
+
+def held_run(judge: LeftOut, logs: Logs, parts: Sequence[str]) -> HeldRun:
+    """A stretch of a run as a fit without it predicts it."""
+    run = int(logs.run[np.argmax(judge.judged)])
+    rows = np.flatnonzero((logs.run == run) & judge.judged)[:SHOWN_ROWS]
+    measured = judge.error.T[rows]
+    predicted = measured - judge.missed(parts)[rows]
+
+    def listed(values: Array) -> tuple[tuple[float, ...], ...]:
+        return tuple(tuple(float(f"{v:.5g}") for v in column) for column in values.T)
+
+    time_s = tuple(float(v) for v in np.round((rows - rows[0]) / ROW_HZ, 4))
+    return HeldRun(logs.names[run], time_s, listed(measured), listed(predicted))
+
+
+def form_of(term: Term, sense: Array, share: Array) -> Array:
+    """(v,) friction per unit of a form of the curve over speed; 0 of what is no function of it.
+
+    sense, share: (v,) soft sign of the speed, and its size over the largest.
+    """
+    tuned = dict(term.tuned)
+    if term.effect == "degressive":
+        return np.asarray(sense * share ** tuned["power"])
+    if term.effect == "stribeck":
+        return np.asarray(sense * np.exp(-((share / tuned["speed"]) ** 2)))
+    return share if term.effect == "asymmetry" else np.zeros_like(share)
+
+
+def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve, ...]:
+    """Friction over the speed of each joint, and its spread over fits without each fold."""
+    arm, every = normal.columns.scene.arm, parts_of(found.terms)
+    values = np.array([normal.solve(every), *judge.values(every)])
+    out = []
+    for j in range(arm.robot.joints):
+        v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
+        sense, share = np.tanh(v / arm.soft[j]), np.abs(v) / arm.fastest[j]
+        at = normal.place[FRICTION].start + 2 * j
+        drawn = np.outer(values[:, at], sense) + np.outer(values[:, at + 1], v)
+        for term in (t for t in found.terms if t.place == f"J{j + 1}"):
+            amount = values[:, normal.place[term.text].start]
+            drawn += np.outer(amount, form_of(term, sense, share))
+        folds = drawn[1:]
+        wide = np.sqrt((len(folds) - 1) * folds.var(axis=0))  # jackknife
+        listed = (tuple(map(float, part)) for part in (v, drawn[0], wide))
+        out.append(FrictionCurve(f"J{j + 1}", *listed))
+    return tuple(out)

@@ -1,0 +1,105 @@
+"""A motion diagnosis on logs that no fit saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.given import runs_of
+from minimax_cal.dynamics.model import TorqueModel
+from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
+from minimax_cal.dynamics.rows import Logs, prepare
+from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.scene import Scene
+from minimax_cal.dynamics.search import Columns
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.tables import Cell, Table
+
+
+@dataclass(frozen=True)
+class MotionStepError:
+    """What a step misses, by joint: RMS of all rows, and of those that move."""
+
+    name: str
+    rms: tuple[float, ...]
+    rms_moving: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class MotionEvaluation:
+    """How well each step of a motion diagnosis predicts torques of other logs [unit]."""
+
+    unit: str
+    steps: tuple[MotionStepError, ...]
+    runs: tuple[str, ...]
+    notices: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more."""
+        last = self.steps[-1]
+        return {
+            "schema": 1,
+            "kind": "motion_evaluation",
+            "unit": self.unit,
+            "rms": list(last.rms),
+            "rms_moving": list(last.rms_moving),
+            "rungs": [{"name": one.name, "rms": list(one.rms), "rms_moving": list(one.rms_moving)}
+                      for one in self.steps],
+            "runs": list(self.runs),
+            "notices": list(self.notices),
+        }  # fmt: skip
+
+    def table(self) -> Table:
+        """RMS of all rows by joint, step by step."""
+        joints = [f"J{j + 1}" for j in range(len(self.steps[0].rms))]
+        rows: tuple[tuple[Cell, ...], ...] = tuple((one.name, *one.rms) for one in self.steps)
+        title = f"RMS torque [{self.unit}] on {', '.join(self.runs)}, all rows"
+        return Table(title, ("step", *joints), rows, ("", *[".3g"] * len(joints)))
+
+
+def missed(model: TorqueModel, logs: Logs, columns: Columns) -> Array:
+    """(R, n) what a model misses.  columns: of a scene with its context."""
+    seen = logs.earlier(model.delay) if model.delay else logs
+    return np.asarray(seen.y - model.predict(columns))
+
+
+def evaluate_motion(
+    motion: MotionDiagnosis | str | Path, logs: Sequence[Run | str | Path] | str | Path
+) -> MotionEvaluation:
+    """RMS torque that a motion diagnosis misses on other logs; nothing is fitted.
+
+    motion: loaded, or its path.  logs: files or runs.  Both sides pass the 8 Hz zero-phase filter,
+    at 25 rows a second.  Raises CalibrationError for wrong input.
+
+    >>> print(mc.evaluate_motion("motion.json", ["other.csv"]).table())
+    """
+    found = motion if isinstance(motion, MotionDiagnosis) else load_motion(motion)
+    arm = found.arm
+    runs = runs_of(arm.robot, arm.robot, logs)
+    if runs[0].unit != found.unit:
+        raise OptionError(
+            f"{runs[0].source}: is in {runs[0].unit}, the diagnosis in {found.unit}; give logs of "
+            "the same kind"
+        )
+    prepared = prepare(runs)
+    if not arm.known.any():
+        prepared = replace(prepared, payload=np.full_like(prepared.payload, np.nan))
+    scene = Scene.of(arm, prepared)
+    columns: dict[int, Columns] = {}
+    steps = []
+    for model in found.models:
+        if id(model.context) not in columns:
+            columns[id(model.context)] = Columns(model.context.in_scene(scene))
+        off = missed(model, prepared, columns[id(model.context)])
+        count = np.maximum(prepared.moving.sum(axis=0), 1)
+        moving = np.sqrt((off**2 * prepared.moving).sum(axis=0) / count)
+        whole = np.sqrt((off**2).mean(axis=0))
+        steps.append(MotionStepError(model.name, tuple(map(float, whole)),
+                                     tuple(map(float, moving))))  # fmt: skip
+    said = tuple(text for run in runs for text in run.notices)
+    return MotionEvaluation(found.unit, tuple(steps), prepared.names, said)

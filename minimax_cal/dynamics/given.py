@@ -1,0 +1,89 @@
+"""What people give for a motion diagnosis: logs, a payload, drive gains and gear ratios."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.dynamics.logs import read_runs
+from minimax_cal.dynamics.regressor import link_parameters
+from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.urdf import is_urdf, load_urdf
+
+Payload = tuple[float, tuple[float, float, float]]
+
+
+def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:
+    """Names of the joints, of a URDF."""
+    if isinstance(robot, Robot) or not is_urdf(robot):
+        return ()
+    return tuple(joint.name for joint in load_urdf(robot).chain if joint.moves)
+
+
+def runs_of(
+    given: Robot | str | Path, robot: Robot, logs: Sequence[Run | str | Path] | str | Path
+) -> tuple[Run, ...]:
+    """The runs, of this robot and of one unit.  Raises CalibrationError."""
+    listed = [logs] if isinstance(logs, str | Path) else list(logs)
+    paths = [one for one in listed if not isinstance(one, Run)]
+    runs = [one for one in listed if isinstance(one, Run)]
+    if paths:
+        runs += read_runs(paths, joint_names(given))
+    if not runs:
+        raise OptionError("logs: name a file or more; each is a trajectory")
+    for run in runs:
+        if run.joints != robot.joints:
+            raise OptionError(
+                f"{run.source}: has {run.joints} joints, {robot.name} has {robot.joints}; give the "
+                "log of this arm"
+            )
+        if run.unit != runs[0].unit:
+            raise OptionError(
+                f"{run.source}: is in {run.unit}, {runs[0].source} in {runs[0].unit}; diagnose "
+                "currents and torques apart"
+            )
+    return tuple(runs)
+
+
+def with_payload(runs: Sequence[Run], payload: Payload | None) -> list[Run]:
+    """The runs with the mass at the flange, where they say none themselves."""
+    if payload is None:
+        return [replace(run, payload=None) for run in runs]
+    return [run if run.payload is not None else replace(run, payload=payload[0]) for run in runs]
+
+
+def known_of(payload: Payload | None) -> Array:
+    """(10,) inertial parameters of what the flange carries, per kilogram."""
+    return np.zeros(10) if payload is None else link_parameters(
+        1.0, np.array(payload[1], dtype=float), np.zeros(6)
+    )  # fmt: skip
+
+
+def gains_of(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -> Array:
+    """(n,) torque per unit of the log; empty where currents have no gains.  Raises OptionError."""
+    n = robot.joints
+    if runs[0].unit != CURRENT:
+        if given is not None:
+            raise OptionError(f"drive_gain: {runs[0].source} holds torques, not currents; leave it")
+        return np.ones(n)
+    own = robot.drive_gain
+    gain = np.array(own if given is None else given, dtype=float)
+    if given is not None and (gain.shape != (n,) or not np.all(gain > 0.0)):
+        raise OptionError(f"drive_gain must be {n} positive numbers, N m per A, one for each joint")
+    return gain if gain.size and np.isfinite(gain).all() else np.zeros(0)
+
+
+def ratios_of(robot: Robot, given: float | Sequence[float] | None) -> Array:
+    """(n,) gear ratios.  Raises OptionError."""
+    if given is None:
+        return robot.ratio
+    values = np.atleast_1d(np.array(given, dtype=float))
+    if values.shape not in ((1,), (robot.joints,)) or not np.all(values != 0.0):
+        raise OptionError(f"ratio must be a number, or one for each of {robot.joints} joints")
+    return np.array(np.broadcast_to(values, robot.joints))

@@ -1,0 +1,205 @@
+"""A model of joint torques: rigid body, usual friction and named laws, and its fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.rows import Logs, Whitening
+from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.search import RIDGE, Columns, least_squares
+from minimax_cal.ground.arrays import Array
+
+RIGID, FRICTION = "rigid", "usual"  # parts of a fit beside the laws
+
+
+def solve_scaled(gram: Array, pull: Array) -> Array:
+    """(p,) least squares by products (p, p) and (p,); columns alike share what they explain."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    unit = gram / np.outer(scale, scale) + RIDGE * np.eye(len(gram))
+    return np.asarray(np.linalg.solve(unit, pull / scale) / scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What fitted numbers say of the arm itself.
+
+    rigid: (n, 10 n) inertial parameters by joint, equal rows where joints share them.
+    usual: (n, 2) Coulomb [unit of the log] and viscous friction [the same, s/rad].
+    """
+
+    rigid: Array
+    usual: Array
+
+    def scene(self, arm: Arm, logs: Logs) -> Scene:
+        """The scene of some logs, with this load and friction."""
+        return self.in_scene(Scene.of(arm, logs))
+
+    def in_scene(self, scene: Scene) -> Scene:
+        """A scene with this load and friction."""
+        coulomb, viscous = self.usual.T
+        friction = scene.sense * coulomb + scene.logs.motion.qd * viscous
+        return scene.with_body(self.rigid, friction)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueModel:
+    """Torques of an arm, as fitted.
+
+    body: of the fit.  terms: its laws, value: (d,) of each.  context: the body by which the laws
+    know load and friction.  held: (n,) friction that stays when a joint stops [unit of the log].
+    delay: by which torques are logged after the motion [s].
+    """
+
+    name: str
+    arm: Arm
+    body: Body
+    terms: tuple[Term, ...]
+    value: tuple[Array, ...]
+    context: Body
+    held: Array
+    delay: float
+
+    def predict(self, columns: Columns) -> Array:
+        """(R, n) torques in the unit of the log.  columns: of a scene with this context."""
+        logs = columns.scene.logs
+        base = self.body.rigid @ self.arm.base
+        rigid = np.einsum("rjp,jp->jr", columns.scene.base_rows, base)
+        friction = columns.usual() @ self.body.usual.ravel()
+        out = rigid + friction + logs.filtered(columns.scene.known_torque).T
+        for term, value in zip(self.terms, self.value, strict=True):
+            joints, rows = columns.rows_of(term)
+            out[joints] += rows @ value
+        return np.asarray(out.T + self.held * columns.scene.held)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Whitened rows of rigid body, usual friction and laws, ready for fits of any of their columns.
+
+    raw: (n, R, p) of all rows, not whitened.  matrix: (N, p).  error: (N,).  place: which columns
+    belong to what.  group: (N,).
+    """
+
+    columns: Columns
+    white: Whitening
+    terms: tuple[Term, ...]
+    raw: Array
+    matrix: Array
+    error: Array
+    place: dict[str, slice]
+    group: Array
+
+    @staticmethod
+    def of(columns: Columns, white: Whitening, terms: Sequence[Term]) -> Normal:
+        """Of all rows that are fitted."""
+        parts = {RIGID: columns.rigid(), FRICTION: columns.usual()}
+        parts |= {term.text: columns.at_all(term) for term in terms}
+        ends = np.cumsum([0, *(part.shape[2] for part in parts.values())])
+        spans = map(slice, map(int, ends[:-1]), map(int, ends[1:]))
+        kept = white.kept
+        raw = np.concatenate(list(parts.values()), axis=2)
+        matrix = white.white(raw[kept])
+        error = white.white(columns.error()[kept])
+        group = np.broadcast_to(columns.scene.logs.quarter, kept.shape)[kept]
+        return Normal(columns, white, tuple(terms), raw, matrix, error,
+                      dict(zip(parts, spans, strict=True)), group)  # fmt: skip
+
+    def index(self, parts: Sequence[str]) -> Array:
+        """(q,) columns of some parts."""
+        return np.concatenate([np.arange(self.matrix.shape[1])[self.place[p]] for p in parts])
+
+    @cached_property
+    def gram(self) -> Array:
+        """(p, p) products of the columns."""
+        return np.asarray(self.matrix.T @ self.matrix)
+
+    @cached_property
+    def pull(self) -> Array:
+        """(p,) products of columns and error."""
+        return np.asarray(self.matrix.T @ self.error)
+
+    def solve(self, parts: Sequence[str]) -> Array:
+        """(p,) values of some parts, 0 elsewhere."""
+        index = self.index(parts)
+        out = np.zeros(len(self.gram))
+        out[index] = solve_scaled(self.gram[np.ix_(index, index)], self.pull[index])
+        return out
+
+    def rest(self, value: Array) -> Array:
+        """(N,) what values leave of the rows, not whitened."""
+        kept = self.white.kept
+        return np.asarray(self.columns.error()[kept] - self.raw[kept] @ value)
+
+    def spread(self, parts: Sequence[str], value: Array) -> Array:
+        """(p,) standard deviations of the values of some parts, of rows that err by groups.
+
+        The larger of that of white noise and of the sandwich over groups [Liang and Zeger 1986].
+        """
+        index = self.index(parts)
+        gram = self.gram[np.ix_(index, index)]
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        unit = gram / np.outer(scale, scale) + RIDGE * np.eye(len(index))
+        inverse = cho_solve(cho_factor(unit), np.eye(len(index)))
+        rest = self.error - self.matrix @ value
+        dof = max(len(rest) - len(index), 1)
+        count = int(self.group.max()) + 1
+        score = np.array([rest[self.group == g] @ self.matrix[self.group == g][:, index]
+                          for g in range(count)]) / scale @ inverse  # fmt: skip
+        sandwich = (score**2).sum(axis=0) * count / max(count - 1, 1)
+        plain = np.diag(inverse) * float(rest @ rest) / dof
+        out = np.zeros(len(value))
+        out[index] = np.sqrt(np.maximum(sandwich, plain)) / scale
+        return out
+
+    def body(self, value: Array) -> Body:
+        """Rigid body and friction of values (p,); the body is the nearest to the drawing."""
+        arm, n = self.columns.scene.arm, self.columns.scene.logs.joints
+        drawn, base = arm.drawn, arm.base
+        each = value[self.place[RIGID]].reshape(-1, base.shape[1])
+        rigid = drawn + (each - base.T @ drawn) @ base.T
+        usual = value[self.place[FRICTION]].reshape(n, 2)
+        return Body(np.broadcast_to(rigid, (n, len(drawn))), usual)
+
+    def model(self, name: str, terms: Sequence[Term], context: Body, delay: float) -> TorqueModel:
+        """The fit of rigid body, usual friction and some laws."""
+        value = self.solve([RIGID, FRICTION, *(t.text for t in terms)])
+        found = tuple(value[self.place[t.text]] for t in terms)
+        scene = self.columns.scene
+        held = held_friction(scene, (self.columns.error() - self.raw @ value).T)
+        body = self.body(value)
+        return TorqueModel(name, scene.arm, body, tuple(terms), found, context, held, delay)
+
+    def rigid_model(self, name: str, context: Body) -> TorqueModel:
+        """The fit of the rigid body alone."""
+        body = self.body(self.solve([RIGID]))
+        arm = self.columns.scene.arm
+        return TorqueModel(name, arm, body, (), (), context, np.zeros(len(body.usual)), 0.0)
+
+
+def held_friction(scene: Scene, missed: Array, rows: Array | None = None) -> Array:
+    """(n,) friction that stays when a joint stops, by what a fit misses (R, n); never below 0.
+
+    rows: (R,) that count, all if None.
+    """
+    some = slice(None) if rows is None else rows
+    held = scene.held[some]
+    size = np.maximum((held**2).sum(axis=0), 1e-300)
+    return np.asarray(np.maximum((held * missed[some]).sum(axis=0) / size, 0.0))
+
+
+def first_body(columns: Columns) -> Body:
+    """Rigid body and usual friction by plain least squares on the rows that are fitted."""
+    rigid, usual = columns.rigid(), columns.usual()
+    kept = columns.scene.logs.fitted.T
+    matrix = np.concatenate([rigid, usual], axis=2)[kept]
+    value = least_squares(matrix, columns.error()[kept])
+    arm, n = columns.scene.arm, columns.scene.logs.joints
+    each = value[: rigid.shape[2]].reshape(-1, arm.base.shape[1])
+    body = arm.drawn + (each - arm.base.T @ arm.drawn) @ arm.base.T
+    return Body(np.broadcast_to(body, (n, len(arm.drawn))), value[rigid.shape[2] :].reshape(n, 2))

@@ -1,0 +1,355 @@
+"""What trajectories say of an arm's torques: a record, its file, its words and its tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import LAWS, USUAL, Term
+from minimax_cal.dynamics.model import Body, TorqueModel
+from minimax_cal.dynamics.probes import Unexplained
+from minimax_cal.dynamics.scene import Arm
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError
+from minimax_cal.ground.files import finite, json_of, json_text, number, read_text, write_whole
+from minimax_cal.ground.records import reading
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.robots.robot import robot_from_dict
+
+KIND = "motion_diagnosis"
+SCHEMA = 1
+WORDS = {"coulomb": "Coulomb friction", "viscous": "viscous friction",
+         "link_inertia": "mass or inertia of a link"}  # fmt: skip
+WORDS |= {name: law.words for name, law in LAWS.items()}
+SENTENCES = {
+    "named": "Cause identified",
+    "one_of": "Ambiguous cause",
+    "unknown": "Unexplained",
+    "none": "No cause beyond the rigid body",
+}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of an effect, with its standard deviation."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another effect that explains the same.  rho2: similarity.  separate_with: what would tell."""
+
+    effect: str
+    place: str
+    rho2: float
+    separate_with: str
+
+
+@dataclass(frozen=True)
+class MotionEffect:
+    """An effect that the torques show.
+
+    worth: of each joint that it changes, the held-out RMS without and with it.  frequency: share
+    of the halves of the data in which it is found again, NaN where that was not asked.
+    established: whether it is confirmed.  minor: whether it matters little beside usual friction.
+    """
+
+    effect: str
+    place: str
+    parameters: tuple[Parameter, ...]
+    worth: Mapping[str, tuple[float, float]]
+    alternatives: tuple[Alternative, ...] = ()
+    frequency: float = math.nan
+    established: bool = True
+    minor: bool = False
+    family: str = ""
+
+    @property
+    def words(self) -> str:
+        """For people, as `joint flexibility at J2`."""
+        return f"{WORDS[self.effect]} at {self.place}"
+
+
+@dataclass(frozen=True)
+class MotionStep:
+    """A step of the error budget.  holdout_rms: of all rows, holdout_rms_moving: by joint."""
+
+    name: str
+    holdout_rms: tuple[float, ...]
+    holdout_rms_moving: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class NotTestable:
+    """An effect that the logs cannot show, and the run that would."""
+
+    effect: str
+    place: str
+    needs: str
+
+
+@dataclass(frozen=True)
+class HeldRun:
+    """A stretch of a run, measured and predicted by a fit without it: times and (n, k) torques."""
+
+    name: str
+    time: tuple[float, ...]
+    measured: tuple[tuple[float, ...], ...]
+    predicted: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class FrictionCurve:
+    """Friction of a joint over its speed, with a standard deviation over fits without each fold."""
+
+    place: str
+    speed: tuple[float, ...]
+    torque: tuple[float, ...]
+    sigma: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionDiagnosis:
+    """Why the torques of an arm are not those of its model, and how far each effect closes the gap.
+
+    unit: "N m" or "A", of torques.  models: a fit of each step of the budget but the first.
+    too_little: why the motion is too little to name anything, empty where it is enough.
+    """
+
+    unit: str
+    verdict: str
+    effects: tuple[MotionEffect, ...]
+    budget: tuple[MotionStep, ...]
+    unexplained: tuple[Unexplained, ...]
+    not_testable: tuple[NotTestable, ...]
+    too_little: tuple[str, ...]
+    models: tuple[TorqueModel, ...]
+    runs: tuple[str, ...]
+    held_out: str
+    held_run: HeldRun
+    curves: tuple[FrictionCurve, ...]
+    notices: tuple[str, ...]
+    seconds: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"<MotionDiagnosis of {self.arm.robot.name}: {self.headline()}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        return f"<p>{escape(self.headline())}</p>\n{self.summary().html()}"
+
+    @property
+    def arm(self) -> Arm:
+        """The arm, and how its torques are read."""
+        return self.models[-1].arm
+
+    @property
+    def main(self) -> tuple[MotionEffect, ...]:
+        """Confirmed effects that matter, by what they are worth."""
+        return tuple(e for e in self.effects if e.established and not e.minor)
+
+    def headline(self) -> str:
+        """The verdict in a sentence or two."""
+        if self.too_little:
+            return f"Too little motion to name a cause: {self.too_little[0]}."
+        said = SENTENCES[self.verdict]
+        if self.main:
+            said += f": {grouped(self.main)}"
+        if self.unexplained and self.verdict in ("named", "unknown"):
+            worst = self.unexplained[0]
+            said += (
+                f". {worst.size:.3g} {self.unit} at {worst.place} follow the {worst.follows} and "
+                "have no name"
+            )
+        return f"{said}."
+
+    def summary(self) -> Table:
+        """The error budget: held-out RMS of each joint, step by step."""
+        joints = [f"J{j + 1}" for j in range(len(self.budget[0].holdout_rms))]
+        rows: tuple[tuple[Cell, ...], ...] = tuple(
+            (step.name, *step.holdout_rms) for step in self.budget
+        )
+        title = f"Held-out RMS torque [{self.unit}], all rows ({self.held_out})"
+        return Table(title, ("step", *joints), rows, ("", *[".3g"] * len(joints)))
+
+    def effects_table(self) -> Table:
+        """The effects, the most valuable first."""
+        rows = []
+        for one in self.effects:
+            p = max(one.parameters, key=lambda each: abs(each.value) / (each.sigma or 1.0))
+            joint, (before, after) = best_worth(one)
+            sure = "yes" if one.established else "possible"
+            rows.append((one.words, f"{p.value:.3g} ± {p.sigma:.1g} {p.unit}",
+                         f"{joint}: {before:.3g} to {after:.3g}", sure))  # fmt: skip
+        header = ("effect", "value", f"held-out RMS, moving [{self.unit}]", "confirmed")
+        return Table("Effects", header, tuple(rows), ("", "", "", ""))
+
+    def unexplained_table(self) -> Table:
+        """What has no name, by joint."""
+        rows = tuple((u.place, u.follows, u.size, u.noise) for u in self.unexplained)
+        header = ("joint", "follows", f"size [{self.unit}]", f"remaining error [{self.unit}]")
+        return Table("Unexplained", header, rows, ("", "", ".3g", ".3g"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back."""
+        listed = {
+            name: [plain_record(one) for one in getattr(self, name)]
+            for name in ("effects", "budget", "unexplained", "not_testable", "curves")
+        }
+        arm = self.arm
+        return {
+            "schema": SCHEMA,
+            "kind": KIND,
+            "robot": arm.robot.to_dict(),
+            "verdict": self.verdict,
+            "headline": self.headline(),
+            "unit": self.unit,
+            **listed,
+            "too_little_motion": list(self.too_little),
+            "runs": list(self.runs),
+            "held_out": self.held_out,
+            "arm": {name: [finite(v) for v in getattr(arm, name).tolist()] for name in ARM},
+            "models": [model_dict(model) for model in self.models],
+            "held_run": asdict(self.held_run),
+            "notices": list(self.notices),
+            "seconds": self.seconds,
+        }
+
+    def json(self) -> str:
+        """The JSON, as `save` writes it."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the diagnosis as JSON."""
+        write_whole(path, self.json())
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "motion diagnosis") -> MotionDiagnosis:
+        """The diagnosis of a file.  Raises CalibrationError."""
+        if content.get("kind") != KIND or content.get("schema") != SCHEMA:
+            raise CalibrationError(
+                f"{source}: is no motion diagnosis of this version; write it with minimax-cal "
+                "torques"
+            )
+        with reading(source):
+            robot = robot_from_dict(content["robot"], source)
+            parts = (np.array([number(v) for v in content["arm"][k]]) for k in ARM)
+            arm = Arm(robot, *parts)
+            return MotionDiagnosis(
+                unit=content["unit"],
+                verdict=content["verdict"],
+                effects=tuple(effect_of(one) for one in content["effects"]),
+                budget=tuple(MotionStep(one["name"], tuple(one["holdout_rms"]),
+                                        tuple(one["holdout_rms_moving"]))
+                             for one in content["budget"]),
+                unexplained=tuple(Unexplained(**one) for one in content["unexplained"]),
+                not_testable=tuple(NotTestable(**one) for one in content["not_testable"]),
+                too_little=tuple(content["too_little_motion"]),
+                models=tuple(model_of(one, arm) for one in content["models"]),
+                runs=tuple(content["runs"]),
+                held_out=content["held_out"],
+                held_run=HeldRun(**content["held_run"]),
+                curves=tuple(FrictionCurve(**one) for one in content["curves"]),
+                notices=tuple(content["notices"]),
+                seconds=content["seconds"],
+            )  # fmt: skip
+
+
+ARM = ("gain", "ratio", "soft", "fastest", "known")  # numbers of an arm beside its robot
+
+
+def grouped(effects: tuple[MotionEffect, ...]) -> str:
+    """Effects in words, each once with all its places."""
+    places: dict[str, list[str]] = {}
+    for one in effects:
+        places.setdefault(WORDS[one.effect], []).append(one.place)
+    usual = [WORDS[name] for name in USUAL]
+    order = sorted(places, key=lambda words: words in usual)  # what a toolbox has comes last
+    return "; ".join(f"{words} at {', '.join(sorted(places[words]))}" for words in order)
+
+
+def best_worth(one: MotionEffect) -> tuple[str, tuple[float, float]]:
+    """The joint at which an effect closes most, and the RMS without and with it."""
+    return max(one.worth.items(), key=lambda item: item[1][0] ** 2 - item[1][1] ** 2)
+
+
+def plain_record(one: Any) -> dict[str, Any]:
+    """A record for JSON; null where there is no number."""
+    found: dict[str, Any] = finite_only(asdict(one))
+    return found
+
+
+def finite_only(content: Any) -> Any:
+    """Data without NaN."""
+    if isinstance(content, Mapping):
+        return {key: finite_only(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite_only(value) for value in content]
+    return finite(content) if isinstance(content, float) else content
+
+
+def effect_of(content: Mapping[str, Any]) -> MotionEffect:
+    """An effect of a file."""
+    known = {f.name for f in fields(MotionEffect)}
+    kept = {key: value for key, value in content.items() if key in known}
+    kept["parameters"] = tuple(
+        Parameter(p["name"], p["value"], number(p["sigma"]), p["unit"]) for p in kept["parameters"]
+    )
+    kept["alternatives"] = tuple(Alternative(**a) for a in kept["alternatives"])
+    kept["worth"] = {key: (float(a), float(b)) for key, (a, b) in kept["worth"].items()}
+    kept["frequency"] = number(kept["frequency"])
+    return MotionEffect(**kept)
+
+
+def model_dict(model: TorqueModel) -> dict[str, Any]:
+    """A model for JSON: parameters that joints share once."""
+
+    def body(one: Body) -> dict[str, Any]:
+        rows = one.rigid[:1] if model.arm.shared else one.rigid
+        return {"rigid": rows.tolist(), "usual": one.usual.tolist()}
+
+    terms = [
+        {"effect": t.effect, "place": t.place, "tuned": dict(t.tuned), "value": v.tolist()}
+        for t, v in zip(model.terms, model.value, strict=True)
+    ]
+    return {"name": model.name, "body": body(model.body), "context": body(model.context),
+            "terms": terms, "held": model.held.tolist(), "delay": model.delay}  # fmt: skip
+
+
+def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
+    """A model of a file."""
+    n = arm.robot.joints
+
+    def body(part: Mapping[str, Any]) -> Body:
+        rigid = np.broadcast_to(np.array(part["rigid"], dtype=float), (n, 10 * n))
+        return Body(rigid, np.array(part["usual"], dtype=float).reshape(n, 2))
+
+    terms = tuple(
+        Term(t["effect"], t["place"], tuple((k, float(v)) for k, v in t["tuned"].items()))
+        for t in content["terms"]
+    )
+    value: tuple[Array, ...] = tuple(np.array(t["value"], dtype=float) for t in content["terms"])
+    return TorqueModel(content["name"], arm, body(content["body"]), terms, value,
+                       body(content["context"]), np.array(content["held"], dtype=float),
+                       float(content["delay"]))  # fmt: skip
+
+
+def load_motion(path: Path | str) -> MotionDiagnosis:
+    """A motion diagnosis that `save` wrote.  Raises CalibrationError."""
+    try:
+        content = json_of(read_text(path))
+    except ValueError as error:
+        raise CalibrationError(f"{path}: is not JSON ({error})") from error
+    if not isinstance(content, Mapping):
+        raise CalibrationError(f"{path}: is no motion diagnosis")
+    return MotionDiagnosis.from_dict(content, str(path))

@@ -1,0 +1,80 @@
+"""The picture of a motion diagnosis: torques of a held-out run, friction curves, error budget."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from minimax_cal.dynamics.result import MotionDiagnosis
+from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, plain_ticks, save
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ROW_INCHES = 1.7  # of a joint
+
+
+def save_motion(found: MotionDiagnosis, path: Path | str) -> None:
+    """Draw a motion diagnosis.  path: its suffix, one of `figures.PICTURES`, is the format."""
+    save(motion_figure(found), Path(path))
+
+
+def motion_figure(found: MotionDiagnosis) -> Figure:
+    """One row a joint: measured and predicted torque, friction over speed, budget."""
+    joints = len(found.budget[0].holdout_rms)
+    figure = new_figure(12, 1.2 + ROW_INCHES * joints)
+    cells = figure.subplots(joints, 3, squeeze=False, width_ratios=(2.2, 1.0, 1.2))
+    for j in range(joints):
+        draw_torques(cells[j, 0], found, j)
+        draw_curve(cells[j, 1], found, j)
+        draw_budget(cells[j, 2], found, j)
+        if j < joints - 1:
+            cells[j, 0].tick_params(labelbottom=False)
+    title = f"held-out torque [{found.unit}], {found.held_run.name}"
+    cells[0, 0].set_title(title, fontsize="small")
+    cells[0, 1].set_title(f"friction [{found.unit}] over speed", fontsize="small")
+    cells[0, 2].set_title(f"held-out RMS, moving [{found.unit}]", fontsize="small")
+    cells[-1, 0].set_xlabel("time [s]")
+    cells[-1, 1].set_xlabel("speed [rad/s]")
+    cells[0, 0].legend(frameon=False, ncols=2, fontsize="x-small", loc="upper right")
+    figure.suptitle(textwrap.fill(found.headline(), 110), fontweight="bold", fontsize="medium")
+    return figure
+
+
+def draw_torques(axes: Axes, found: MotionDiagnosis, j: int) -> None:
+    """Measured and predicted torque of a joint."""
+    run = found.held_run
+    axes.plot(run.time, run.measured[j], color=BEFORE, lw=1.4, label="measured")
+    axes.plot(run.time, run.predicted[j], color=AFTER, lw=0.8, label="predicted without this run")
+    axes.set_ylabel(f"J{j + 1}")
+    axes.grid(visible=True, alpha=0.3)
+
+
+def draw_curve(axes: Axes, found: MotionDiagnosis, j: int) -> None:
+    """Friction of a joint with a band of two standard deviations."""
+    curve = found.curves[j]
+    speed, torque, sigma = (np.array(part) for part in (curve.speed, curve.torque, curve.sigma))
+    axes.fill_between(speed, torque - 2.0 * sigma, torque + 2.0 * sigma, color=AFTER, alpha=0.25)
+    axes.plot(speed, torque, color=AFTER, lw=1.2)
+    axes.axhline(0.0, color="grey", lw=0.6)
+    axes.grid(visible=True, alpha=0.3)
+
+
+def draw_budget(axes: Axes, found: MotionDiagnosis, j: int) -> None:
+    """What each step leaves at a joint."""
+    left = np.array([step.holdout_rms_moving[j] for step in found.budget])
+    at = np.arange(len(left))
+    axes.plot(left, at, "o-", color="black", ms=3, lw=0.8)
+    if (positive := left[left > 0.0]).size:
+        axes.set_xscale("log")
+        plain_ticks(axes.xaxis, positive)
+    names = [step.name.replace("_", " ") for step in found.budget]
+    axes.set_yticks(at, [textwrap.shorten(name, 24, placeholder="...") for name in names],
+                    fontsize=5.5)  # fmt: skip
+    axes.set_ylim(len(left) - 0.5, -0.5)
+    axes.tick_params(axis="x", labelsize="x-small")
+    axes.grid(visible=True, axis="x", alpha=0.3)
