@@ -20,7 +20,7 @@ from minimax_cal.dynamics.given import (
     runs_of,
     with_payload,
 )
-from minimax_cal.dynamics.laws import LAWS, USUAL, Term, terms_of
+from minimax_cal.dynamics.laws import ANGLE, CURVE, LAWS, USUAL, Term, terms_of
 from minimax_cal.dynamics.links import LinkChange, body_as_given
 from minimax_cal.dynamics.model import FRICTION, RIGID, Body, Normal, TorqueModel, first_body
 from minimax_cal.dynamics.probes import Unexplained, unexplained
@@ -221,10 +221,10 @@ def examined(
     too_little = tuple(motion_lacking(logs.only(learning)))
     progress("searching for causes")
     found = search(arm, logs.only(learning), exclude)
-    early, late = logs, 0.0
-    for one, (value, _) in zip(found.choice.found, found.choice.estimates, strict=True):
+    early, late, unsure = logs, 0.0, 0.0
+    for one, (value, sigma) in zip(found.choice.found, found.choice.estimates, strict=True):
         if one.candidate.family == "delay" and abs(value[0]) > LATE:
-            late = float(value[0])
+            late, unsure = float(value[0]), float(sigma[0])
     if late:
         progress("searching again without the delay")
         logs = logs.earlier(late)
@@ -239,13 +239,15 @@ def examined(
     judge = LeftOut.of(normal, known, before, fold)
     again = frequencies(found.choice)
     given, change = body_as_given(normal)
-    effects = [*laws_found(found, normal, judge, again), *usual_found(normal, judge)]
-    if late:
-        effects = with_delay(effects, judge, late, found.terms)
-    if change is not None:
-        effects.insert(0, changed_link(change))
     value = normal.solve(parts_of(found.terms))
     left = tuple(unexplained(normal, value))
+    if any(one.share > MATTERS for one in left):
+        change = None  # what has no name could be what makes the masses look wrong
+    effects = [*laws_found(found, normal, judge, again), *usual_found(normal, judge)]
+    if late:
+        effects = with_delay(effects, judge, late, unsure, found.terms)
+    if change is not None:
+        effects.insert(0, changed_link(change))
     effects.sort(key=lambda one: (one.minor, -gain_of(one)))
     models, budget = steps(found, normal, judge, late, before)
     return MotionDiagnosis(
@@ -377,19 +379,23 @@ def usual_found(normal: Normal, judge: LeftOut) -> list[MotionEffect]:
         parameter = Parameter("friction", float(value[at]), float(sigma[at]), unit)
         out.append(
             MotionEffect(kind, f"J{joint + 1}", (parameter,), worth,
-                         minor=is_minor(worth, before), family="friction_curve")
+                         minor=is_minor(worth, before), family=CURVE)
         )  # fmt: skip
     return out
 
 
 def with_delay(
-    effects: list[MotionEffect], judge: LeftOut, late: float, terms: tuple[Term, ...]
+    effects: list[MotionEffect],
+    judge: LeftOut,
+    late: float,
+    unsure: float,
+    terms: tuple[Term, ...],
 ) -> list[MotionEffect]:
-    """The effects with a delay by which the rows were shifted."""
+    """The effects with a delay by which the rows were shifted, and its standard deviation [s]."""
     every = parts_of(terms)
     worth = worth_of(judge, judge.missed(every), judge.missed(every, delayed=False))
     more = next((e for e in effects if e.effect == "delay"), None)
-    sigma = more.parameters[0].sigma if more else float("nan")
+    sigma = more.parameters[0].sigma if more else unsure
     whole = late + (more.parameters[0].value if more else 0.0)
     usual = judge.rms(judge.missed(parts_of(())), judge.normal.columns.scene.logs.moving)
     shifted = MotionEffect("delay", "all", (Parameter("time", whole, sigma, "s"),), worth,
@@ -458,14 +464,24 @@ def verdict_of(
         return "unknown"
     if not main:
         return "unknown" if left else "none"
-    first = max(main, key=gain_of)
-    other = [a for a in first.alternatives if family(a.effect) != family(first.effect)]
-    return "one_of" if other else "named"
+    beyond_usual = [e for e in main if e.effect not in USUAL]
+    first = max(beyond_usual or main, key=gain_of)
+    same = [e for e in beyond_usual if is_form_of(e, first.effect, first.place)]
+    forms_of_angle = len(same) > 1 and family(first.effect) == ANGLE
+    others = [a for a in first.alternatives if not is_form_of(a, first.effect, first.place)]
+    return "one_of" if others or forms_of_angle else "named"
+
+
+def is_form_of(one: MotionEffect | Alternative, effect: str, place: str) -> bool:
+    """Whether an effect is another form of one at its place: of one curve over speed or angle."""
+    return (family(one.effect), one.place) == (family(effect), place)
 
 
 def family(effect: str) -> str:
     """The family of an effect: forms of one friction curve are one."""
-    return "friction_curve" if effect in USUAL else (LAWS[effect].family or effect)
+    if effect in USUAL:
+        return CURVE
+    return LAWS[effect].family or effect if effect in LAWS else effect
 
 
 def not_testable(found: Found, arm: Arm) -> Iterator[NotTestable]:

@@ -212,7 +212,7 @@ def turns(scene: Scene, j: int) -> str:
     return "a joint that turns" if scene.arm.robot.prismatic[j] else moves(scene, j)
 
 
-CURVE = "friction_curve"
+CURVE, ANGLE = "friction_curve", "torque_by_angle"
 LAWS: dict[str, Law] = {
     "degressive": Law(degressive, ("friction",), ("t",), "viscous friction that levels off",
                       by_number("power", 0.25, 0.5, 0.7), nonnegative=True, family=CURVE),
@@ -233,14 +233,14 @@ LAWS: dict[str, Law] = {
     "drive_gain": Law(lambda s, j, c: s.load[:, [j]], ("share",), ("",), "drive gain",
                       needs=has_gains, typical=0.2, of_torque=False),
     "torque_offset": Law(lambda s, j, c: np.ones((len(s.load), 1)), ("offset",), ("t",),
-                         "torque offset"),
+                         "torque offset", family=ANGLE),
     "torque_ripple": Law(ripple, ("cos", "sin"), ("t", "t"), "torque ripple of the gear",
                          lambda s, j: [{"multiple": 1.0}, {"multiple": 2.0}], has_ratio,
                          repeats=True),
     "cable": Law(cable, ("first", "second"), ("t/rad", "t/rad^2"), "cable or spring",
-                 lambda s, j: [{"order": 1.0}, {"order": 2.0}], moves),
+                 lambda s, j: [{"order": 1.0}, {"order": 2.0}], moves, family=ANGLE),
     "gravity_spring": Law(gravity_spring, ("cos", "sin"), ("t", "t"), "gravity compensator",
-                          needs=turns),
+                          needs=turns, family=ANGLE),
     "payload": Law(payload, ("mass", *(f"moment_{k}" for k in "xyz"),
                              *(f"inertia_{k}" for k in ("xx", "xy", "xz", "yy", "yz", "zz"))),
                    ("kg", *("kg m",) * 3, *("kg m^2",) * 6), "payload that changes between runs",

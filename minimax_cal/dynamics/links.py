@@ -10,10 +10,12 @@ from scipy.special import fdtrc
 from minimax_cal.dynamics.budget import parts_of
 from minimax_cal.dynamics.model import FRICTION, Normal
 from minimax_cal.dynamics.regressor import PER_LINK
+from minimax_cal.evidence.noise import inflation
 from minimax_cal.ground.arrays import Array
 
 CONTRADICTS = 1e-4  # p-value below which rows contradict a body that is not refitted
 ALIKE = 12.0  # of log likelihood, twice: links that explain as much
+SURE = 4.0  # standard deviations by which a parameter of a changed link differs from the given
 LINK = "link"  # part of a fit: parameters of the link that may have changed
 
 
@@ -33,9 +35,15 @@ class LinkChange:
     others: tuple[int, ...]
 
 
-def contradiction(left: float, full: float, columns: int, dof: int) -> float:
-    """p-value of what fewer parameters leave.  left, full: squares; columns: that are fewer."""
-    ratio = max(left - full, 0.0) / max(columns, 1) / (full / dof)
+def contradiction(left: Array, full: Array, group: Array, columns: int, dof: int) -> float:
+    """p-value of what fewer parameters leave, by rows and by groups of rows.
+
+    left, full: (N,) whitened rest of the fit with fewer parameters, and of the other.  group: (N,).
+    columns: parameters that are fewer.  dof: of the other.
+    """
+    more = max(float(left @ left - full @ full), 0.0)
+    wide = inflation(left - full, left, group, dof)
+    ratio = more / max(columns, 1) / (float(full @ full) / dof) / wide
     return float(fdtrc(max(columns, 1), dof, ratio))
 
 
@@ -50,7 +58,7 @@ def body_as_given(normal: Normal) -> tuple[bool, LinkChange | None]:
         return False, None
     every = parts_of(normal.terms)
     value = normal.solve(every)
-    full = float(((normal.error - normal.matrix @ value) ** 2).sum())
+    full = normal.error - normal.matrix @ value
     free, dof = arm.base.shape[1], len(normal.error) - len(value)
     rows = np.moveaxis(logs.filtered(scene.regressor), 1, 0)
     links = white.white(rows[white.kept])
@@ -61,20 +69,22 @@ def body_as_given(normal: Normal) -> tuple[bool, LinkChange | None]:
     spans = {k: np.r_[:count, count + PER_LINK * k : count + PER_LINK * (k + 1)]
              for k in range(logs.joints)}  # fmt: skip
 
-    def left(index: Array) -> float:
+    def left(index: Array) -> Array:
         found = np.linalg.lstsq(matrix[:, index], error, rcond=None)[0]
-        return float(((error - matrix[:, index] @ found) ** 2).sum())
+        return np.asarray(error - matrix[:, index] @ found)
 
     given = left(np.arange(count))
-    if contradiction(given, full, free, dof) > CONTRADICTS:
+    if contradiction(given, full, normal.group, free, dof) > CONTRADICTS:
         return True, None
-    squares = {k: left(index) for k, index in spans.items()}
+    rest = {k: left(index) for k, index in spans.items()}
+    squares = {k: float(part @ part) for k, part in rest.items()}
     best = min(squares, key=lambda k: squares[k])
-    if contradiction(squares[best], full, free - PER_LINK, dof) < CONTRADICTS:
+    if contradiction(rest[best], full, normal.group, free - PER_LINK, dof) < CONTRADICTS:
         return False, None
     limit = squares[best] * np.exp(ALIKE / len(error))
     alike = tuple(k for k, square in squares.items() if k != best and square < limit)
-    return False, changed(normal, rows, error, best, alike)
+    change = changed(normal, rows, error, best, alike)
+    return False, change if np.any(np.abs(change.value) > SURE * change.sigma) else None
 
 
 def changed(

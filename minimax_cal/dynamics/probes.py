@@ -17,7 +17,7 @@ from minimax_cal.dynamics.scene import Scene
 from minimax_cal.evidence.noise import inflation
 from minimax_cal.ground.arrays import Array
 
-LEVEL = 0.005  # chance that noise alone is called structure, of all probes at all joints
+LEVEL = 0.001  # chance that noise alone is called structure, of all probes at all joints
 RANK = 1e-4  # of a probe's largest direction beside the model: smaller ones are no test
 BUMPS = 5  # smooth steps over the range of a driver
 

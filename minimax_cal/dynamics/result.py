@@ -345,7 +345,10 @@ def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
 
 
 def load_motion(path: Path | str) -> MotionDiagnosis:
-    """A motion diagnosis that `save` wrote.  Raises CalibrationError."""
+    """A motion diagnosis that `save` wrote.  path: of its JSON.  Raises CalibrationError.
+
+    >>> motion = mc.load_motion("motion.json")
+    """
     try:
         content = json_of(read_text(path))
     except ValueError as error:

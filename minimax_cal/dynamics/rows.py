@@ -23,6 +23,7 @@ from minimax_cal.ground.arrays import Array
 
 SAMPLE_HZ = 100.0  # of what the columns are computed from
 ROW_HZ = 25.0  # of rows
+THIN = 2  # every second row is fitted: near the filter's cutoff, noise of fewer rows is whiter
 CUTOFF_HZ, FILTER_ORDER = 8.0, 4  # of the zero-phase filter [Butterworth]
 REVERSAL_S = 0.1  # about rest and reversals, without a fit
 REST = 0.01  # of the joint's largest speed: below it the joint is at rest
@@ -119,8 +120,10 @@ class Logs:
 
     @cached_property
     def fitted(self) -> Array:
-        """(R, n) True for rows that are fitted: moving, and not close to a gap or an end."""
-        return self.moving & ~self.gap[self.picked, None]
+        """(R, n) True for rows that are fitted: every THIN-th, moving, no gap or end close by."""
+        number = (self.picked - self.start[self.run]) // int(SAMPLE_HZ / ROW_HZ)
+        some = (number % THIN == 0) & ~self.gap[self.picked]
+        return np.asarray(self.moving & some[:, None])
 
     @cached_property
     def y(self) -> Array:
@@ -270,10 +273,11 @@ class Whitening:
 
 
 def in_order(kept: Array, run: Array) -> Array:
-    """(N,) rows of the same joint and run that went before without a gap, at most AR_ORDER."""
+    """(N,) fitted rows of the same joint and run just before, at most AR_ORDER."""
     out = np.zeros(kept.shape, dtype=int)
-    for i in range(1, kept.shape[1]):
-        out[:, i] = np.where(kept[:, i - 1] & (run[i] == run[i - 1]), out[:, i - 1] + 1, 0)
+    for i in range(THIN, kept.shape[1]):
+        before = i - THIN
+        out[:, i] = np.where(kept[:, before] & (run[i] == run[before]), out[:, before] + 1, 0)
     return np.asarray(np.minimum(out, AR_ORDER)[kept])
 
 

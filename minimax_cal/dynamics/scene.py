@@ -23,7 +23,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import Robot
 
 KEPT = ("regressor", "base_rows", "known_torque", "sense", "held", "since_reversal")
-SOFT = 0.005  # of a joint's largest speed: where friction changes its sign
+SOFT = 0.0025  # of a joint's largest speed: where friction changes its sign
 
 
 @dataclass(frozen=True, eq=False)

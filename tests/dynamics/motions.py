@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
+import minimax_cal as mc
+from minimax_cal.dynamics.regressor import (
+    Motion,
+    inertial_parameters,
+    inverse_dynamics,
+    link_parameters,
+)
 from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.arrays import Array
+from minimax_cal.robots.robot import robot_from_dict
+
+NOISE = 0.1  # of a torque sample [N m]
+RATE = 100.0  # [Hz]
+Extra = Callable[[Motion, Array, Array], Array]  # of motion, rigid torque and time: more torque
 
 
 def fourier(
@@ -26,3 +40,49 @@ def fourier(
 def run_of(name: str, time: Array, q: Array, torque: Array, unit: str = "N m") -> Run:
     """A run that logs positions and torques only."""
     return Run(name, f"{name}.csv", time, q, None, None, torque, unit)
+
+
+def three_joints() -> mc.Robot:
+    """An arm of three joints: a vertical axis, two parallel ones, and a wrist's weight."""
+    half = np.pi / 2.0
+    joints = [
+        {"a": 0.0, "d": 0.4, "theta": 0.0, "alpha": half, "mass_kg": 8.0, "com_mm": [0, -90, 20]},
+        {"a": 0.5, "d": 0.0, "theta": 0.0, "alpha": 0.0, "mass_kg": 6.0, "com_mm": [-240, 10, 60]},
+        {"a": 0.4, "d": 0.1, "theta": 0.0, "alpha": half, "mass_kg": 3.0, "com_mm": [-180, 0, 20]},
+    ]
+    about = [[0.05, 0, 0, 0.04, 0, 0.05], [0.02, 0, 0, 0.2, 0, 0.2], [0.01, 0, 0, 0.06, 0, 0.06]]
+    for joint, inertia in zip(joints, about, strict=True):
+        joint["inertia"] = inertia
+    units = {"length": "m", "angle": "rad"}
+    return robot_from_dict({"name": "three joints", "units": units, "joints": joints})
+
+
+def simulated(
+    extra: Extra | None = None,
+    *,
+    seed: int = 0,
+    runs: int = 3,
+    seconds: float = 20.0,
+    carried: float = 0.0,
+    friction: bool = True,
+    loaded: Sequence[int] | None = None,
+) -> list[Run]:
+    """Runs of the arm with usual friction, noise, and something more.
+
+    carried: kg at the flange, 50 mm along z of the last frame, in all runs or those in loaded.
+    """
+    rng, robot, out = np.random.default_rng(seed), three_joints(), []
+    for number in range(runs):
+        time = np.arange(0.0, seconds, 1.0 / RATE)
+        motion = Motion(*fourier(rng, time, 3, 0.1 + 0.05 * (number % 3)))
+        body = inertial_parameters(robot)
+        if loaded is None or number in loaded:
+            body[-1] += link_parameters(carried, np.array([0.0, 0.0, 0.05]), np.zeros(6))
+        rigid = inverse_dynamics(robot, motion, body)
+        torque = rigid + NOISE * rng.normal(size=rigid.shape)
+        if friction:
+            torque += np.sign(motion.qd) * [4.0, 3.0, 1.5] + motion.qd * [3.0, 4.0, 1.0]
+        if extra is not None:
+            torque += extra(motion, rigid, time)
+        out.append(run_of(f"run{number}", time, motion.q, torque))
+    return out

@@ -49,7 +49,8 @@ def test_rows_at_rest_near_reversals_and_gaps_are_not_fitted() -> None:
     speed = np.stack([np.interp(at, time, column) for column in qd.T], axis=1)
     flips = np.diff(np.sign(speed), axis=0) != 0
     assert not (logs.moving[1:] & flips)[at[1:] < 9.0].any()
-    assert logs.fitted[at < 9.0].mean() > 0.5
+    assert logs.fitted[at < 9.0].mean() > 0.25
+    assert not logs.fitted[1::2].any()
 
 
 def test_runs_stand_one_after_another() -> None:
@@ -76,13 +77,16 @@ def test_noise_is_white_after_whitening_across_gaps_too() -> None:
     logs = prepare([log(seed, seconds=120.0)[0] for seed in (5, 6)])
     rng = np.random.default_rng(7)
     size = np.array([0.5, 2.0, 7.0])
-    noise = np.stack([remembering(rng, len(logs.picked)) for _ in size]) * size[:, None]
+    noise = np.zeros((3, len(logs.picked)))
+    for run in range(2):  # as the rows that are fitted remember each other
+        rows = np.flatnonzero(logs.run == run)[::2]
+        noise[:, rows] = np.stack([remembering(rng, len(rows)) for _ in size]) * size[:, None]
     rest = noise[logs.fitted.T]
     white = whitening(logs, rest)
     out = white.white(rest)
     for j in range(3):
         mine, place = out[white.joint == j], white.place[white.joint == j]
-        assert mine.std() == pytest.approx(1.0, abs=0.03)
+        assert mine.std() == pytest.approx(1.0, abs=0.06)
         for lag in (1, 2, 3):
             here = np.flatnonzero(place >= lag)
             assert abs((mine[here] * mine[here - lag]).mean()) < 4.0 / np.sqrt(len(here))

@@ -1,0 +1,241 @@
+"""Simulated arms whose torques hold one effect that nobody told: is it named, and how large?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import run
+from dynamics.motions import Extra, simulated, three_joints
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
+from minimax_cal.dynamics.rows import ROW_HZ
+from minimax_cal.ground.arrays import Array
+
+ARM = three_joints()
+
+
+def at(j: int, law: Extra) -> Extra:
+    """More torque at one joint."""
+
+    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+        out = np.zeros_like(rigid)
+        out[:, j] = law(motion, rigid, time)
+        return out
+
+    return more
+
+
+def compliant(j: int, compliance: float) -> Extra:
+    """A joint that turns back by its torque."""
+
+    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+        by = np.zeros_like(rigid)
+        by[:, j] = -compliance * rigid[:, j]
+        rate = np.gradient(by, time, axis=0)
+        change = np.gradient(rate, time, axis=0)
+        moved = Motion(motion.q + by, motion.qd + rate, motion.qdd + change)
+        return inverse_dynamics(ARM, moved, inertial_parameters(ARM)) - rigid
+
+    return more
+
+
+def late(seconds: float) -> Extra:
+    """Torques that are logged after the motion, to the first order."""
+
+    def more(motion: Motion, rigid: Array, time: Array) -> Array:
+        friction = np.sign(motion.qd) * [4.0, 3.0, 1.5] + motion.qd * [3.0, 4.0, 1.0]
+        return -seconds * np.gradient(rigid + friction, time, axis=0)
+
+    return more
+
+
+SINGLE = {
+    "load_friction:J2": (
+        at(1, lambda m, r, t: 0.07 * np.abs(r[:, 1]) * np.sign(m.qd[:, 1])), "share", 0.07, 0.05,
+    ),
+    "armature:J3": (at(2, lambda m, r, t: 0.3 * m.qdd[:, 2]), "inertia", 0.3, 0.02),
+    "joint_flexibility:J2": (compliant(1, 4e-4), "compliance", 4e-4, 0.1),
+    "delay:all": (late(0.006), "time", 0.006, 0.05),
+    "cable:J1": (at(0, lambda m, r, t: 1.5 * m.q[:, 0]), "first", 1.5, 0.03),
+    "torque_ripple:J1": (at(0, lambda m, r, t: 0.5 * np.cos(50.0 * m.q[:, 0])), "cos", 0.5, 0.1),
+}  # fmt: skip
+
+
+def names(found: mc.MotionDiagnosis) -> set[str]:
+    """What is confirmed and matters, beside usual friction."""
+    return {f"{e.effect}:{e.place}" for e in found.main if e.effect not in ("coulomb", "viscous")}
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_one_effect_is_named_with_its_size(name: str) -> None:
+    extra, parameter, value, off = SINGLE[name]
+    found = mc.diagnose_motion(ARM, simulated(extra, seed=3), ratio=50.0)
+    assert found.verdict == "named"
+    assert names(found) == {name}
+    (effect,) = (e for e in found.effects if f"{e.effect}:{e.place}" == name)
+    (number,) = (p for p in effect.parameters if p.name == parameter)
+    assert number.value == pytest.approx(value, rel=off)
+    before, after = max(effect.worth.values(), key=lambda pair: pair[0] - pair[1])
+    assert after < 0.8 * before
+    usual = {f"{e.effect}:{e.place}" for e in found.effects if e.effect in ("coulomb", "viscous")}
+    assert usual == {f"{kind}:J{j}" for kind in ("coulomb", "viscous") for j in (1, 2, 3)}
+
+
+def test_a_rigid_body_alone_has_no_cause() -> None:
+    found = mc.diagnose_motion(ARM, simulated(friction=False, seed=3))
+    assert (found.verdict, found.effects, found.unexplained) == ("none", (), ())
+    given, refitted, *_ = found.budget
+    assert_allclose(given.holdout_rms, refitted.holdout_rms, rtol=0.05)  # the masses are right
+
+
+def test_a_payload_that_nobody_told_is_the_last_link() -> None:
+    found = mc.diagnose_motion(ARM, simulated(carried=2.0, seed=3))
+    (effect,) = (e for e in found.effects if e.effect == "payload")
+    mass = effect.parameters[0]
+    assert effect.place == "L3"
+    assert mass.value == pytest.approx(2.0, rel=0.03)
+    assert abs(mass.value - 2.0) < 4.0 * mass.sigma
+
+
+def test_a_known_payload_tells_the_drive_gains() -> None:
+    """Currents of drives that are all 5 % weaker than given: with a known load that shows."""
+    runs = simulated(carried=3.0, seed=3, loaded=[0, 2])
+    gain = np.array([10.0, 12.0, 8.0])
+    amperes = [
+        mc.Run(r.name, r.source, r.time, r.q, None, None, r.torque / (0.95 * gain), "A",
+               0.0 if r.name == "run1" else 3.0)
+        for r in runs
+    ]  # fmt: skip
+    given = {"drive_gain": gain, "payload": (3.0, (0.0, 0.0, 0.05))}
+    found = mc.diagnose_motion(ARM, amperes, **given)  # type: ignore[arg-type]
+    gains = {e.place: e.parameters[0].value for e in found.effects if e.effect == "drive_gain"}
+    assert "J2" in gains
+    assert gains["J2"] == pytest.approx(1.0 / 0.95 - 1.0, abs=0.02)
+    assert found.unit == "A"
+
+
+def test_what_has_no_law_is_unexplained() -> None:
+    strange = at(1, lambda m, r, t: np.sin(2.0 * m.q[:, 0]) * np.cos(m.q[:, 2]))
+    found = mc.diagnose_motion(ARM, simulated(strange, seed=3))
+    assert found.verdict == "unknown"
+    worst = found.unexplained[0]
+    assert (worst.place, worst.follows) == ("J2", "other joints")
+    assert 0.0 < worst.size < worst.noise
+    assert "J2 follow the other joints and have no name" in found.headline()
+
+
+def test_too_little_motion_is_said_before_any_name() -> None:
+    short = mc.diagnose_motion(ARM, simulated(runs=1, seconds=20.0, seed=1))
+    assert short.verdict == "unknown"
+    assert short.headline().startswith("Too little motion to name a cause: 20 s")
+    assert short.held_out == "one run: its quarters left out in turn"
+
+
+def test_a_run_kept_out_is_seen_by_nothing() -> None:
+    """Its own torques change what is said of it, and no number of the model."""
+    runs = simulated(SINGLE["armature:J3"][0], seed=5)
+    other = simulated(seed=77)[2]
+    one = mc.diagnose_motion(ARM, runs, holdout_run="run2")
+    two = mc.diagnose_motion(ARM, [*runs[:2], other], holdout_run="run2")
+    assert one.held_out == "runs kept out: run2"
+    assert [m.terms for m in one.models] == [m.terms for m in two.models]
+    assert one.budget[-1].holdout_rms[2] < 0.3 * two.budget[-1].holdout_rms[2]
+
+
+def csv_of(folder: Path, runs: list[mc.Run]) -> list[Path]:
+    """The runs as files of this project."""
+    out = []
+    for each in runs:
+        n = each.joints
+        head = ["t_s", *(f"q{j + 1}_rad" for j in range(n)), *(f"tau{j + 1}_Nm" for j in range(n))]
+        rows = np.column_stack([each.time, each.q, each.torque])
+        path = folder / f"{each.name}.csv"
+        np.savetxt(path, rows, delimiter=",", header=",".join(head), comments="", fmt="%.7g")
+        out.append(path)
+    return out
+
+
+def test_the_command_writes_what_evaluate_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ARM.save(tmp_path / "arm.json")
+    runs = simulated(SINGLE["load_friction:J2"][0], seed=4, runs=4)
+    *learn, new = csv_of(tmp_path, runs)
+    motion = tmp_path / "motion.json"
+    assert run("torques", tmp_path / "arm.json", *learn, "-o", motion, "--json", "-q") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == json.loads(motion.read_text())
+    assert (said["kind"], said["verdict"], said["unit"]) == ("motion_diagnosis", "named", "N m")
+    assert said["effects"][0]["worth"].keys() <= {"J1", "J2", "J3"}
+    assert [step["name"] for step in said["budget"]][-1] == "+ load_friction"
+    assert run("evaluate", motion, new, "--json") == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert len(judged["rms"]) == len(judged["rms_moving"]) == 3
+    assert judged["rungs"][-1]["rms"] == judged["rms"]
+    claimed = np.array(said["budget"][-1]["holdout_rms_moving"])
+    assert (np.array(judged["rms_moving"]) < 1.2 * claimed).all()
+    assert run("torques", tmp_path / "arm.json", *learn) == 0
+    out = capsys.readouterr().out
+    assert "friction in proportion to the load at J2" in out
+    assert run("evaluate", motion, new) == 0
+    assert "usual friction refitted" in capsys.readouterr().out
+
+
+def test_a_file_holds_the_whole_diagnosis(tmp_path: Path) -> None:
+    found = mc.diagnose_motion(ARM, simulated(SINGLE["delay:all"][0], seed=3))
+    found.save(tmp_path / "a.json")
+    again = mc.load_motion(tmp_path / "a.json")
+    again.save(tmp_path / "b.json")
+    one, two = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert {**one, "robot": 0} == {**two, "robot": 0}
+    fresh = simulated(SINGLE["delay:all"][0], seed=9)
+    here, there = (mc.evaluate_motion(each, fresh) for each in (found, again))
+    assert_allclose(here.steps[-1].rms, there.steps[-1].rms, rtol=1e-9)
+    assert here.steps[-1].rms_moving[1] < 1.3 * found.budget[-1].holdout_rms_moving[1]
+    assert found.held_run.time[1] == pytest.approx(1.0 / ROW_HZ)
+    (tmp_path / "c.json").write_text(json.dumps({**one, "schema": 2}))
+    with pytest.raises(mc.CalibrationError, match="is no motion diagnosis of this version"):
+        mc.load_motion(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"drive_gain": [1.0, 2.0, 3.0]}, "holds torques, not currents"),
+        ({"exclude": ["stiction"]}, "no effect 'stiction'"),
+        ({"holdout_run": "run9"}, "no run 'run9'; choose run0, run1"),
+        ({"holdout_run": ["run0", "run1"]}, "leaves no run to learn from"),
+        ({"holdout": 1.5}, "must lie between 0 and 1"),
+        ({"ratio": [1.0, 2.0]}, "one for each of 3 joints"),
+    ],
+)
+def test_what_cannot_be_is_one_line(more: dict[str, object], said: str) -> None:
+    with pytest.raises(mc.OptionError, match=said):
+        mc.diagnose_motion(ARM, simulated(runs=2), **more)  # type: ignore[arg-type]
+
+
+def test_the_command_says_what_an_option_must_be(capsys: pytest.CaptureFixture[str]) -> None:
+    for option, value, said in (
+        ("--payload", "two", "--payload 'two': give KG@x,y,z in kg and m, as 2@0,0,0.05"),
+        ("--drive-gain", "1,x", "--drive-gain '1,x': give numbers separated by commas"),
+    ):
+        assert run("torques", "ur10", "run.csv", option, value) == 2
+        assert said.split("'")[0].strip() in capsys.readouterr().err
+
+
+def test_the_picture_shows_every_joint() -> None:
+    pytest.importorskip("matplotlib")
+    from minimax_cal.reporting.plots.motion import motion_figure
+
+    found = mc.diagnose_motion(ARM, simulated(seed=2, runs=2))
+    cells = motion_figure(found).axes
+    assert len(cells) == 9
+    measured, predicted = (line.get_ydata() for line in cells[0].lines)
+    off = np.asarray(measured) - np.asarray(predicted)
+    assert np.sqrt(np.mean(off**2)) < 3.0 * found.budget[-1].holdout_rms[0]
+    assert_allclose(cells[2].lines[0].get_xdata()[-1], found.budget[-1].holdout_rms_moving[0])
