@@ -28,7 +28,6 @@ from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import ENOUGH, STRUCTURE
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.evidence.selection import Choice
-from minimax_cal.evidence.stability import NOT_ASKED
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
 from minimax_cal.modelling.dictionary import arm_library
@@ -49,8 +48,8 @@ class Causes:
     faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
     traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether structure is left that matters, or names that change with the poses.  met: as `Repeats`
-    has it.  maps: of joints, sought beside the effects, once there is a ladder.
+    whether structure is left that matters, or names that change with the poses.  maps: of joints,
+    sought beside the effects, once there is a ladder.
     """
 
     faults: tuple[Fault, ...]
@@ -61,7 +60,6 @@ class Causes:
     traces: tuple[Trace, ...]
     untestable: tuple[tuple[str, str], ...]
     wary: bool
-    met: float = NOT_ASKED
     maps: Mapped = NO_MAPS
 
     @property
@@ -106,11 +104,10 @@ def found_again(study: Study, causes: Causes) -> Causes:
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
-    again = judged_again(found, choice, study)
-    effects = again.findings
+    effects = judged_again(found, choice, study)
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(study, choice, causes.traces) is not None
-    return replace(causes, effects=effects, wary=wary, met=again.met)
+    return replace(causes, effects=effects, wary=wary)
 
 
 def believed(causes: Causes, scene: Scene) -> list[Finding]:
@@ -121,12 +118,11 @@ def believed(causes: Causes, scene: Scene) -> list[Finding]:
 
 
 def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes, scene: Scene) -> bool:
-    """Whether an effect is a best guess that is in no model.
+    """Whether an effect is a best guess that is in no model: a wave by itself.
 
-    Names that are one must help the poses without which they were sought, and none is a wave by
-    itself.  terms: of the effect, every: of all that were found with it.
+    terms: of the effect, every: of all that were found with it.
     """
-    return causes.wary and (causes.met > 1.0 or lone(terms, every, scene))
+    return causes.wary and lone(terms, every, scene)
 
 
 def lone(terms: Sequence[Term], every: Sequence[Term], scene: Scene) -> bool:

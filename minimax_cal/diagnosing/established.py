@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,27 +12,19 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.dictionary import Key
 from minimax_cal.evidence.limits import CERTAIN, FREQUENT, HALF
 from minimax_cal.evidence.selection import Choice
-from minimax_cal.evidence.stability import NOT_ASKED, Repeats, repeated
+from minimax_cal.evidence.stability import Repeats, repeated
 from minimax_cal.measuring.grouping import clusters
 
 
-@dataclass(frozen=True)
-class Again:
-    """The findings with how often each is found again, and `Repeats.met`."""
-
-    findings: tuple[Finding, ...]
-    met: float
-
-
-def judged_again(findings: Sequence[Finding], whole: Choice, study: Study) -> Again:
+def judged_again(findings: Sequence[Finding], whole: Choice, study: Study) -> tuple[Finding, ...]:
     """The findings, sought again in subsamples of the poses.
 
     whole: what was chosen on all poses.
     """
     if not findings:
-        return Again((), NOT_ASKED)
+        return ()
     found = repeated(whole, np.repeat(clusters(study.data), study.rows.width))
-    return Again(tuple(judged(one, whole, found) for one in findings), found.met)
+    return tuple(judged(one, whole, found) for one in findings)
 
 
 def judged(finding: Finding, whole: Choice, repeats: Repeats) -> Finding:

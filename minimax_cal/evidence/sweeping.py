@@ -7,8 +7,6 @@ once, so that nothing that a search asks of a part looks at rows again.
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 
 from minimax_cal.evidence.noise import FREE, Noise, costs, noise_of, told_apart, triangles
@@ -77,14 +75,9 @@ class Swept:
         """(d, N) candidates' columns less what geometry imitates."""
         return np.asarray(self.columns.clear[self.columns.fixed + index])
 
-    @cached_property
-    def nuisance(self) -> Array:
+    def geometry(self) -> Array:
         """(r, N) the geometry's columns, as the combinations that the rows tell apart."""
         return np.asarray(self.span.T @ self.columns.clear[: self.columns.fixed - 1])
-
-    def geometry(self) -> Array:
-        """(r, N) as `nuisance`."""
-        return self.nuisance
 
     def dof(self, index: Array) -> int:
         """Degrees of freedom beside the geometry and some of the candidates' columns."""

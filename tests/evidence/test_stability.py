@@ -22,7 +22,7 @@ A, B, C = ("a", "x"), ("b", "x"), ("c", "x")
 
 
 def repeats(*names: set[tuple[str, str]], asked: int | None = None) -> Repeats:
-    return Repeats(tuple(map(frozenset, names)), asked or len(names), 1.0)
+    return Repeats(tuple(map(frozenset, names)), asked or len(names))
 
 
 def test_a_frequency_is_the_share_of_subsamples_that_find_one_of_the_names() -> None:
@@ -108,7 +108,6 @@ def test_a_law_of_any_domain_is_found_again_and_a_faint_one_less_often(
     assert found.frequency({("law 3", "x")}) == 1.0
     assert found.frequency({("law 7", "x")}) < 1.0
     assert found.frequency({("law 1", "x")}) < 0.5
-    assert found.met < 0.7
 
 
 def test_rows_too_few_for_their_geometry_are_not_asked(rng: np.random.Generator) -> None:
@@ -116,7 +115,6 @@ def test_rows_too_few_for_their_geometry_are_not_asked(rng: np.random.Generator)
     found = repeated(whole, whole.library.rows.group)
     assert found.names == ()
     assert np.isnan(found.frequency({("law 3", "x")}))
-    assert np.isnan(found.met)
 
 
 def test_subsamples_do_not_depend_on_what_was_drawn_before(
