@@ -30,6 +30,10 @@ COMMANDS: dict[str, dict[str, Entry]] = {
             "calibrate",
             "Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.",
         ),
+        "identify": (
+            "identify",
+            "Make a robot file where nothing is drawn, from the measurements in DATA.",
+        ),
         "relative": (
             "relative",
             "Calibrate ROBOT without coordinates, from the lengths, closures or poses in DATA.",

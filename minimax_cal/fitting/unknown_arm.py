@@ -1,0 +1,155 @@
+"""A robot file for an arm of which nothing is drawn: its joints' types, and measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.fitting.options import Progress, silent
+from minimax_cal.fitting.start import search
+from minimax_cal.fitting.sweeps import Axis, axes_of, lacking_sweeps, links_of_axes
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.model import model_of
+from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.robots.transforms import link
+from minimax_cal.solvers.status import Status
+
+TYPES = {"revolute": False, "r": False, "prismatic": True, "p": True}
+MOST_JOINTS = 12
+RIGHT = 0.5 * np.pi
+TRIALS, ROUNDS = 8, 2  # of arms drawn at random, and of starts of each
+GUESS = 0.3  # length of a link that is sought; lengths are solved for [m]
+CLOSE = 2e-3  # of the points' spread: a fit that misses by less has found the arm
+SWEEPS, SEARCH = "sweeps of single joints", "a search over random poses"
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownArm:
+    """robot: as identified, `rough`.  fit: of all measurements by it.  way: how it was found."""
+
+    robot: Robot
+    fit: Fit
+    way: str
+
+    @property
+    def status(self) -> Status:
+        """How the numbers ended.
+
+        Where sweeps alone reach the noise, a fit is no better than they are, and as good.
+        """
+        better = self.fit.status is not Status.NO_BETTER
+        return self.fit.status if better else Status.CONVERGED
+
+    def headline(self) -> str:
+        """How it was found and how well it fits, in a line."""
+        rms, poses = self.fit.accuracy["holdout"].rms_mm, self.fit.accuracy["holdout"].poses
+        return (
+            f"{self.robot.joints} joints, found by {self.way}: RMS {rms:.3g} mm at {poses} "
+            "poses held out"
+        )
+
+
+def types_of(joints: str | Sequence[str]) -> Array:
+    """(n,) True where a joint slides.  joints: revolute or prismatic each.  Raises OptionError."""
+    names = [n.strip().lower() for n in (joints.split(",") if isinstance(joints, str) else joints)]
+    wrong = [name for name in names if name not in TYPES]
+    if wrong or not 1 <= len(names) <= MOST_JOINTS:
+        raise OptionError(
+            f"joints={','.join(names)!r}: write revolute or prismatic for each joint from the base "
+            "on, as joints='revolute,revolute,prismatic'"
+        )
+    return np.array([TYPES[name] for name in names])
+
+
+def identify_arm(
+    data: Measurements,
+    joints: str | Sequence[str],
+    name: str = "identified arm",
+    progress: Progress = silent,
+) -> UnknownArm:
+    """The geometry of an arm that nothing is drawn of.
+
+    data: measurements; best with sweeps, rows in which one joint alone moves, of every joint.
+    joints: revolute or prismatic each.  Raises CalibrationError for wrong input; how the numbers
+    ended is in the result's `status`.
+    """
+    sliding = types_of(joints)
+    if data.q.shape[1] != len(sliding):
+        raise OptionError(
+            f"joints= names {len(sliding)} joints, but {data.source} has {data.q.shape[1]} joint "
+            "columns"
+        )
+    if (odd := data.sliding != sliding).any():
+        number = int(np.argmax(odd)) + 1
+        kind = "slides" if sliding[number - 1] else "turns"
+        raise DataError(
+            f"{data.source}: joint {number} {kind}; name its column q{number}_"
+            f"{'mm' if sliding[number - 1] else 'deg'}"
+        )
+    lacking = lacking_sweeps(data, sliding)
+    progress("axes")
+    if not lacking:
+        robot, way = rough(name, links_of_axes(axes_of(data, sliding)), sliding), SWEEPS
+    else:
+        robot, way = searched(name, data, sliding, lacking), SEARCH
+    fit = calibrate(robot, data, "sum", allow_large_changes=True, progress=progress)
+    return UnknownArm(replace(robot, mdh=fit.cell.robot.mdh), fit, way)
+
+
+def rough(name: str, mdh: Array, sliding: Array) -> Robot:
+    """An arm whose geometry is a first guess."""
+    keys = ("a", "d", "theta", "alpha", "beta")
+    rows = [
+        dict(zip(keys, map(float, row), strict=True)) | ({"type": "prismatic"} if slides else {})
+        for row, slides in zip(mdh, sliding, strict=True)
+    ]
+    units = {"length": "m", "angle": "rad"}
+    return robot_from_dict({"name": name, "units": units, "nominal": "rough", "joints": rows})
+
+
+def plain_links(mdh: Array, sliding: Array) -> Array:
+    """The same arm in links of common normals, short ones between parallel axes: (n, 5)."""
+    at, axes = np.eye(4), []
+    for row, slides in zip(mdh, sliding, strict=True):
+        axes.append(Axis(at[:3, 2], at[:3, 3], bool(slides)))
+        at = at @ link(row)
+    return links_of_axes(axes)
+
+
+def searched(name: str, data: Measurements, sliding: Array, lacking: Sequence[int]) -> Robot:
+    """The best of arms with square axes drawn at random.  Raises DataError where none fits.
+
+    Lengths need no guess: they are solved for at every step (`SumOfSquares.reduced`).
+    """
+    rng = np.random.default_rng(0)
+    n, points = len(sliding), float(data.seen.sum())
+    spread = float(np.sqrt(np.nanvar(data.y, axis=0).sum(axis=-1).max()))
+    best, least = None, np.inf
+    for _ in range(TRIALS):
+        mdh = np.zeros((n, 5))
+        mdh[:, 0] = GUESS
+        mdh[:, 2] = RIGHT * rng.integers(-1, 3, n)
+        mdh[:, 3] = RIGHT * rng.integers(-1, 2, n)
+        mdh[-1] = 0.0
+        robot = rough(name, mdh, sliding)
+        model = model_of(robot, data)
+        first = search(model, mdh, points, CLOSE * spread, ROUNDS)
+        miss = float(np.sqrt(first.cost[0] / points))
+        if miss < least:
+            best, least = rough(name, plain_links(first.x.mdh[0], sliding), sliding), miss
+        if least < CLOSE * spread:
+            break
+    if best is None or least >= CLOSE * spread:
+        named = ", ".join(str(j + 1) for j in lacking)
+        raise DataError(
+            f"{data.source}: no arm of these joints fits (the best misses by {1e3 * least:.3g} mm);"
+            f" measure sweeps of joint {named}: rows in which it alone moves, five or more over 20 "
+            "degrees, all others at rest"
+        )
+    return best
