@@ -47,15 +47,17 @@ def robots_command(robot: str | None, as_json: bool, schema: str | None) -> int:
 
 
 def links_table(robot: Robot) -> Table:
-    """Links and limits in millimetres and degrees."""
+    """Links and limits in millimetres and degrees, in the convention of the robot's file."""
     (length, mm), (angle, deg) = turned_for_people("m"), turned_for_people("rad")
     scale = np.array([length if name in LENGTHS else angle for name in MDH_NAMES])
     rows: list[tuple[Cell, ...]] = []
-    for i, (link, slides) in enumerate(zip(robot.mdh, robot.prismatic, strict=True)):
+    own, _ = robot.notation.written(robot.mdh, robot.prismatic)
+    for i, (link, slides) in enumerate(zip(own, robot.prismatic, strict=True)):
         ends = (length if slides else angle) * np.array([robot.lower[i], robot.upper[i]])
         numbers = [*(scale * link).tolist(), *ends.tolist()]
         rows.append((f"J{i + 1}", *numbers, mm if slides else deg))
     units = (f"{name} {mm if name in LENGTHS else deg}" for name in MDH_NAMES)
     header = ("joint", *units, "from", "to", "in")
     formats = ("", *[".3f"] * 5, *[".1f"] * 2, "")
-    return Table(f"{robot.name}: links and limits", header, tuple(rows), formats)
+    craig = " (modified DH)" if robot.notation.modified else ""
+    return Table(f"{robot.name}: links and limits{craig}", header, tuple(rows), formats)

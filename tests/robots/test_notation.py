@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from minimax_cal.cli.robots import links_table
 from minimax_cal.correcting.export import export
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import robot_from_dict
@@ -185,6 +186,21 @@ def test_a_simulated_arm_is_calibrated_to_its_noise(name: str, rng: np.random.Ge
                 assert row[key] == pytest.approx(truth["joints"][i][key], abs=0.2), parameter.name
     q = driven(robot, rng, 20)
     assert_allclose(fit.robot.pose(q), flange(content, q), rtol=0, atol=1e-12)
+
+
+def test_options_and_tables_speak_of_the_files_rows(rng: np.random.Generator) -> None:
+    robot = robot_from_dict(CRAIG)
+    data = measured(bent(CRAIG, rng), robot, rng)
+    fit = mc.calibrate(robot, data, "sum", fix="a3", holdout=0.2)
+    found = {p.name: p for p in fit.parameters}
+    assert "a1" not in found
+    assert (found["a3"].value, found["a3"].reason) == (0.432, "fixed by the user")
+    assert found["a4"].identifiable
+    assert found["theta2"].nominal == pytest.approx(-np.pi / 2)
+    with pytest.raises(mc.OptionError, match="no parameter called 'a1'"):
+        mc.calibrate(robot, data, "sum", fix="a1")
+    rows = links_table(robot).rows
+    assert rows[2][1:4] == pytest.approx((432.0, 149.0, 0.0))
 
 
 def test_craigs_table_read_as_standard_is_another_arm(rng: np.random.Generator) -> None:
