@@ -128,7 +128,7 @@ SPANS = (1.0, float(np.pi))  # poses within so far of zero [rad]
 
 def study_of(study: Study, count: int = 200) -> dict[float, list[Result]]:
     """The trials of each span."""
-    count = 12 if study.quick else count
+    count = 4 if study.quick else count
     return {
         span: study.sweep(run, trials(study.seed, count, span), f"poses within {span:.2f} rad")
         for span in SPANS

@@ -748,18 +748,21 @@ def shrink_picture(rows: Sequence[Row]) -> Figure:
 
 # ---- the study -----------------------------------------------------------------------------------
 
+SPARSE = 4  # of the cases of --quick, each so many-th by itself
+
 
 @click.command()
 @study_options("blind_gap")
 @click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
-@click.option("--every", type=int, default=1, show_default=True, help="Run each N-th case alone.")
-def main(study: Study, only: tuple[str, ...], every: int) -> None:
+@click.option("--every", type=int, help="Run each N-th case alone [default: 1; with --quick 4].")
+def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Blind judgement of diagnose."""
     cases = plan(study.seed, QUICK if study.quick else Size())
     conditions = tuple(dict.fromkeys(case.condition for case in cases))
     for name in only:
         if name not in conditions:
             raise OptionError(f"--only {name}: choose {', '.join(conditions)}")
+    every = (SPARSE if study.quick else 1) if every is None else every
     if every < 1:
         raise OptionError(f"--every {every}: give a whole number, 1 or more")
     cases = [case for case in cases if not only or case.condition in only][::every]

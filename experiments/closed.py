@@ -87,7 +87,7 @@ def line(name: str, shares: Sequence[Share]) -> tuple[Item, ...]:
 @click.option("--runs", type=click.IntRange(3), default=400, show_default=True)
 def main(study: Study, runs: int) -> None:
     """The interval of the share closed, on poses that were not used."""
-    seeds = [study.seed + number for number in range(6 if study.quick else runs)]
+    seeds = [study.seed + number for number in range(2 if study.quick else runs)]
     found = study.sweep(run, seeds, "arms")
     pairs = [(seed, share) for seed, share in zip(seeds, found, strict=True) if share]
     groups = [(f"lambda {power:.0f}", [s for n, s in pairs if n % len(POWERS) == i])

@@ -200,7 +200,7 @@ def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
 def main(study: Study, poses: int) -> None:
     """How far simulated arms are from real ones, before and after."""
     names = ("ur10",) if study.quick else ("ur10", "irb2600", "seven_axes")
-    poses = 80 if study.quick else poses
+    poses = 50 if study.quick else poses
     trials = [Trial(name, poses, study.seed + i) for i, name in enumerate(names)]
     trials += [Trial("ur10", poses, study.seed, known=False)]
     results = study.sweep(run, trials, "arms")

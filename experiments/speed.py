@@ -347,7 +347,7 @@ def timed(
     """Seconds of everything by name, and peak memory [GB] by poses x targets."""
     seconds: dict[str, float] = {}
     memory: dict[str, float] = {}
-    sizes = ((1000, 3), (100000, 1), (1000000, 1))[: 2 if quick else 3]
+    sizes = ((1000, 3), (10000, 1)) if quick else ((1000, 3), (100000, 1), (1000000, 1))
     cases = ((100, 3),) if quick else ((100, 3), (600, 3), (1200, 1), (2000, 3))
     if "races" in parts:
         seconds |= races(seed, 3 if quick else repeats, quick=quick)

@@ -128,7 +128,7 @@ def row_of(arm: str, kind: str, results: Sequence[Result]) -> tuple[TableCell, .
 @click.option("--trials", "count", type=int, default=100, show_default=True)
 def main(study: Study, count: int) -> None:
     """Rates at which a check finds a shifted joint, and at which it cries wolf."""
-    count = 4 if study.quick else count
+    count = 2 if study.quick else count
     jobs = trials(study, count)
     results = study.sweep(run, jobs, "checks")
     rows = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems_qp import MAROS_MESZAROS, maros_meszaros
 
-from qp_backends import Problem, Status, accuracy, solve
+from qp_backends import Problem, Status, accuracy, child, solve
 from qp_backends.registry import fallback_order
 
 FILES = sorted(MAROS_MESZAROS.glob("*.mat"))
@@ -50,6 +50,15 @@ def test_dense_and_sparse_data_have_the_same_optimum():
             assert other.solved
             best = accuracy(thin, other).objective
             np.testing.assert_allclose(accuracy(dense, one).objective, best, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["GOULDQP3", "QPCBOEI2", "QSCAGR25"])
+def test_daqp_answers_what_its_own_settings_answer(name, monkeypatch):
+    """In this process, whose start would take longer than the answer; its finer tolerance cycles."""
+    monkeypatch.setattr(child, "run", None)
+    problem = maros_meszaros(MAROS_MESZAROS / f"{name}.mat")
+    solution = solve(problem, "daqp", tolerance=1e-6, time_limit=5.0, fallback=False)
+    assert solution.solved
 
 
 @pytest.mark.slow
