@@ -16,7 +16,7 @@ method.  What is told is RMSE(φ) over the optimum of the exact SQP, minus one.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -161,8 +161,8 @@ def algorithm_1(problem: MinimaxProblem, x: State, outer: int, *, search: bool) 
     return values
 
 
-def course_of(job: Job) -> Course:
-    """All ways on one arm."""
+def course_of(job: Job, backends: Sequence[str] = OURS) -> Course:
+    """All ways on one arm, and our own search with some backends."""
     problem, start = problem_of(job, "squared")
     exact, _ = problem_of(job, "two-sided")  # the same set, with gradients that do not vanish
     best = minimax.solve(exact, start, partial(solve_qp, name="daqp", tolerance=QP_TOLERANCE)).value
@@ -175,7 +175,8 @@ def course_of(job: Job) -> Course:
         for way, search in WAYS.items()
     }
     ours = {
-        name: over(minimax.solve(exact, start, partial(solve_qp, name=name)).value) for name in OURS
+        name: over(minimax.solve(exact, start, partial(solve_qp, name=name)).value)
+        for name in backends
     }
     return Course(ways, ours)
 

@@ -304,14 +304,14 @@ def misses(found: Sequence[Criterion], each: int) -> Table:
     )  # fmt: skip
 
 
-SPARSE = 24  # of the cases of --quick, each so many-th by itself
+SPARSE = 40  # of the cases of --quick, each so many-th by itself
 
 
 @click.command()
 @study_options("machine_gap")
 @click.option("--only", multiple=True, help="A condition to run, such as pair; may be repeated.")
 @click.option(
-    "--every", type=int, help="Run each N-th case alone [default: 1; with --quick 24, in seconds]."
+    "--every", type=int, help="Run each N-th case alone [default: 1; with --quick 40, in seconds]."
 )
 def main(study: Study, only: tuple[str, ...], every: int | None) -> None:
     """Names on arms as shops have them."""

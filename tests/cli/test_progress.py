@@ -70,7 +70,7 @@ def test_files_by_their_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run(*command, "-o", tmp_path / "fit.json", "-q") == 0
     assert "written" not in capsys.readouterr().err
     for name, start in (("map.json", "{"), ("map.svg", "<?xml")):
-        assert run("map", tmp_path / "fit.json", "--bins", 8, "-o", tmp_path / name) == 0
+        assert run("map", tmp_path / "fit.json", "--bins", 4, "-o", tmp_path / name) == 0
         assert (tmp_path / name).read_text().startswith(start)
     assert json.loads((tmp_path / "map.json").read_text())
     capsys.readouterr()

@@ -184,7 +184,7 @@ def test_numbers_that_do_not_work_out_are_exit_code_1(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # lengths under the joint values of other poses: no geometry explains them
-    header, *lines = files["wires_3"].read_text().splitlines()
+    header, *lines = files["wires_3"].read_text().splitlines()[:41]
     cells = [line.split(",") for line in lines]
     order = np.random.default_rng(0).permutation(len(cells))
     mixed = [",".join(row[:6] + cells[k][6:]) for row, k in zip(cells, order, strict=True)]

@@ -72,7 +72,7 @@ def random_problem(seed: int, n: int, p: int, constraints: int, w: int = 3) -> L
 
 
 sizes = st.tuples(st.integers(0, 2**31), st.integers(1, 30), st.integers(1, 6), st.integers(0, 3))
-slow = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+slow = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @slow

@@ -277,7 +277,7 @@ def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
     made = with_spans(robot, (0, 1, 2), 0.0)
     fit = mc.calibrate(robot, made.data, "sum")
     words = fit.beyond.plan.split()
-    proposed = mc.plan(robot, poses=int(words[words.index("--poses") + 1]), candidates=300)
+    proposed = mc.plan(robot, poses=int(words[words.index("--poses") + 1]), candidates=150)
     rng = np.random.default_rng(0)
     y = made.cell.predict(proposed.q)
     data = measurements(proposed.q, y + 2e-5 * rng.normal(size=y.shape))

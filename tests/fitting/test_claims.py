@@ -31,7 +31,7 @@ def test_a_fit_that_contradicts_its_data_has_failed_and_writes_no_robot(
     robot: mc.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, out = tmp_path / "d.csv", tmp_path / "fit.json"
-    mc.write_measurements(data, mirrored(simulate(robot, 60, 2, seed=5).data))
+    mc.write_measurements(data, mirrored(simulate(robot, 110, 2, seed=5).data))
     assert run("calibrate", "irb2600", data, "--objective", "sum", "--json", "-o", out) == 1
     fit = mc.Fit.from_dict(json.loads(capsys.readouterr().out))
     assert not out.exists()

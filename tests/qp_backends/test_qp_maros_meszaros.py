@@ -54,7 +54,7 @@ def test_dense_and_sparse_data_have_the_same_optimum():
 
 @pytest.mark.parametrize("name", ["GOULDQP3", "QPCBOEI2", "QSCAGR25"])
 def test_daqp_answers_what_its_own_settings_answer(name, monkeypatch):
-    """In this process, whose start would take longer than the answer; its finer tolerance cycles."""
+    """In this process: another takes longer to start; and where a finer tolerance cycles."""
     monkeypatch.setattr(child, "run", None)
     problem = maros_meszaros(MAROS_MESZAROS / f"{name}.mat")
     solution = solve(problem, "daqp", tolerance=1e-6, time_limit=5.0, fallback=False)
