@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
+import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -29,6 +31,7 @@ def environment(packages: Iterable[str] = ()) -> Table:
         ("cores", str(os.cpu_count())),
         ("threads", os.environ.get("OMP_NUM_THREADS", "as the libraries choose")),
         ("python", platform.python_version()),
+        *([("commit", commit())] if commit() else []),
     ]
     for package in (*PACKAGES, *packages):
         try:
@@ -36,6 +39,16 @@ def environment(packages: Iterable[str] = ()) -> Table:
         except PackageNotFoundError:
             continue
     return Table("made on", ("what", "value"), tuple(rows))
+
+
+@functools.cache
+def commit() -> str:
+    """The version of this checkout, with -dirty if files differ from it; nothing without git."""
+    command = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty")
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def processor() -> str:

@@ -4,6 +4,7 @@ import importlib
 import re
 import runpy
 import shlex
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -243,3 +244,38 @@ def test_every_picture_is_made_by_a_command() -> None:
         folder = figure.rpartition("/")[0]  # `papers` runs others, each in a folder of its name
         for name in filter(None, (study, folder)):
             assert (ROOT / "experiments" / f"{name}.py").exists(), name
+
+
+STAMP = re.compile(r"^Figures: (version|several versions up to) `([0-9a-f]{7})`\.$", re.MULTILINE)
+# Pages whose tables came from runs of several versions: a page that is made again leaves the list.
+SEVERAL = {
+    "accuracy", "backends", "blind_study", "external", "papers", "planning", "relative", "simulator",
+    "speed",
+}  # fmt: skip
+
+
+def figured_pages() -> dict[str, str]:
+    """Text of each page by name whose figures a study prints."""
+    texts = {page.stem: page.read_text(encoding="utf-8") for page in DOCS.glob("*.md")}
+    shown = (name for name, text in texts.items() if re.search(r"-m experiments[ .][a-z]", text))
+    # the list is compared with what the command writes, and mathematics has no figures
+    return {name: texts[name] for name in shown if name not in ("errata", "mathematics")}
+
+
+def test_every_page_of_figures_is_of_one_version() -> None:
+    stamps = {name: STAMP.findall(text) for name, text in figured_pages().items()}
+    assert {name: len(found) for name, found in stamps.items() if len(found) != 1} == {}
+    assert {name for name, ((kind, _),) in stamps.items() if kind != "version"} == SEVERAL
+
+
+def test_the_versions_of_figures_are_commits() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("no git repository here")
+    stamps = {stamp for text in figured_pages().values() for _, stamp in STAMP.findall(text)}
+    known = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-list", "--all", "--abbrev-commit", "--abbrev=7"],
+        capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    if len(known) < 100:
+        pytest.skip("a shallow clone")
+    assert {stamp for stamp in stamps if not any(one.startswith(stamp) for one in known)} == set()
