@@ -371,7 +371,7 @@ def test_points_that_stand_out_are_named() -> None:
 
 
 def test_another_robot_is_doubted() -> None:
-    _, seen = measured("irb2600", "wires_3")
+    seen = SIMULATORS["wires_3"](Arm.of("irb2600", 0, 0.0), np.random.default_rng(5), 45, 0.0)
     fit = relative("irb120", seen.data)
     assert any("the nominal robot misses by" in notice for notice in fit.notices)
     assert any("implausibly large changes" in notice for notice in fit.notices)

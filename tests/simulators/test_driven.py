@@ -80,7 +80,11 @@ def measured(folder: Path, model: Path) -> mc.Fit:
     return fit
 
 
-@pytest.fixture(scope="module", params=[(5000.0,) * 6, (5000.0,) * 3 + (500.0,) * 3, (500.0,) * 6])
+@pytest.fixture(scope="module", params=[
+    pytest.param((5000.0,) * 6, marks=pytest.mark.slow),
+    (5000.0,) * 3 + (500.0,) * 3,
+    pytest.param((500.0,) * 6, marks=pytest.mark.slow),
+])  # fmt: skip
 def case(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, mc.Fit, SimulatorGap]:
