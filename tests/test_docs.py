@@ -210,6 +210,21 @@ def test_pages_print_what_they_say(
             assert (tmp_path / made).stat().st_size > 1000, made
 
 
+def test_what_corrected_targets_are_worth_is_what_the_page_prints(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code, said = (
+        next(
+            text
+            for kind, text in blocks(DOCS / "compensate.md")
+            if kind == language and sign in text
+        )
+        for language, sign in (("python", "made.cell"), ("text", "held out: RMS"))
+    )
+    exec(compile(code, "compensate.md", "exec"), {})
+    assert printed(words(said), words(capsys.readouterr().out))
+
+
 def test_numbers_in_the_words_of_the_tutorial_stand_in_what_it_prints() -> None:
     text = (DOCS / "tutorial.md").read_text()
     printed_numbers = [
