@@ -13,7 +13,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +22,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import minimax_cal as mc
 from minimax_cal.cli import main
+from minimax_cal.ground.errors import CalibrationError
 
 from .cases import Case, case
 from .known import disagreement
@@ -99,13 +101,16 @@ def judged(one: Case) -> tuple[str, str]:
         return "unclear", f"warning {first.message} at {first.filename}:{first.lineno}"
     if "not enough memory" in err:
         return "memory", err[-300:]
-    return manners(one, code, out, err) or truth(one, code, out, err) or (kind_of(code), "")
+    found = manners(one, code, out, err) or truth(one, code, out, err)
+    return found or (unread(one) if not code else None) or (kind_of(code), "")
 
 
 def outputs(arguments: tuple[str, ...]) -> set[str]:
     """Files that a command may replace: named as an output, and not as an input too."""
     pairs = pairwise(arguments)
-    named = [word for flag, word in pairs if flag in ("-o", "--output", "--figure", "--truth")]
+    named = [
+        word for flag, word in pairs if flag in ("-o", "--output", "--figure", "--truth", "--write")
+    ]
     return {word for word in named if arguments.count(word) == named.count(word)}
 
 
@@ -173,11 +178,55 @@ def truth(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
     return None
 
 
+def still(path: Path) -> None:
+    """A model is compiled and stays finite for half a second.  Raises ValueError."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, min(2_000, int(0.5 / model.opt.timestep) + 1))
+    warned = mujoco.mjtWarning
+    if any(data.warning[kind].number for kind in (warned.mjWARN_BADQPOS, warned.mjWARN_BADQACC)):
+        raise ValueError("it is unstable")
+
+
+def measured(path: Path) -> None:
+    """Measurements, or logs of motions, are read.  Raises CalibrationError."""
+    is_log = path.read_text(encoding="utf-8-sig").startswith("t_s,")
+    mc.read_runs([path]) if is_log else mc.read_measurements(path)
+
+
+def robot(path: Path) -> None:
+    """A robot is read.  Raises CalibrationError."""
+    mc.load_robot(path)
+
+
+READERS: dict[tuple[str, str], Callable[[Path], None]] = {  # of what a command writes, by ending
+    ("import", ".csv"): measured,
+    ("simulate", ".csv"): measured,
+    ("gap", ".xml"): still,
+    ("export --to json", ".json"): robot,
+    ("export --to urdf", ".urdf"): robot,
+}
+
+
+def unread(one: Case) -> tuple[str, str] | None:
+    """What a success wrote and its own reader refuses."""
+    form = [word for flag, word in pairwise(one.arguments) if flag == "--to"]
+    command = " --to ".join([one.command, *form[-1:]])
+    for name in outputs(one.arguments):
+        reader = READERS.get((command, Path(name).suffix))
+        if reader and Path(name).is_file():
+            try:
+                reader(Path(name))
+            except (ValueError, CalibrationError) as error:
+                return "silently wrong", f"{name} was written and is not read: {error}"
+    return None
+
+
 @cache
 def good_accuracy(fit: str) -> float:
     """What `evaluate` says of the unbroken files [mm]."""
-    import minimax_cal as mc
-
     with tempfile.TemporaryDirectory() as folder:
         for name in (fit, "data.csv"):
             (Path(folder) / name).write_bytes(material()[name])

@@ -36,6 +36,10 @@ MANY, FRESH = 10_000, 20260707
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits are those of POSIX")
 
 
+WILD = """<mujoco><worldbody><body><joint axis="0 1 0" stiffness="-1e6"/>
+<geom size="0.1" pos="0.3 0 0" mass="1"/></body></worldbody></mujoco>"""  # parses, and runs away
+
+
 def bad(found: list[Outcome]) -> list[Outcome]:
     return [each for each in found if each.kind not in GOOD]
 
@@ -132,6 +136,29 @@ def test_the_judge_sees(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert judge(monkeypatch, tmp_path, command, expect) == kind
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("import a.csv -o out.csv", "q1_rad,smr1_x_mm"),
+        ("export fit.json --to urdf -o out.urdf", "<robot"),
+        ("export fit.json --to json -o out.json", "{}"),
+        ("gap arm.xml data.csv --write out.xml", WILD),
+    ],
+)
+def test_what_is_written_is_read_again(
+    words: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "<mujoco" in text:
+        pytest.importorskip("mujoco")
+
+    def command(_: Any) -> None:
+        Path(words.split()[-1]).write_text(text)
+        raise SystemExit(0)
+
+    kind = judge(monkeypatch, tmp_path, command, arguments=tuple(words.split()))
+    assert kind == "silently wrong"
 
 
 def test_the_independent_code_agrees_and_catches() -> None:
