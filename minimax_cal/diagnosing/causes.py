@@ -9,24 +9,16 @@ import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
 from minimax_cal.diagnosing.established import asked, judged_again, mostly_loose, often
-from minimax_cal.diagnosing.lack_of_fit import (
-    Named,
-    Trace,
-    chance_of,
-    explained,
-    heard,
-    rest_of,
-    structure,
-)
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.what_remains import left_by, loudest
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Candidate, Library
-from minimax_cal.evidence.limits import ENOUGH, STRUCTURE
-from minimax_cal.evidence.noise import restricted
+from minimax_cal.evidence.limits import ENOUGH
+from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
 from minimax_cal.fitting.options import Progress
 from minimax_cal.measuring.faults import Fault, in_lines, looks_read_back
@@ -37,7 +29,6 @@ from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
 from minimax_cal.modelling.periodogram import elsewhere, in_company
 
-FEW = 2  # parameters of an effect whose motions are looked at each by itself
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
 
@@ -47,8 +38,8 @@ class Causes:
 
     faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
-    traces: of what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether structure is left that matters, or names that change with the poses.  maps: of joints,
+    left: what they leave.  untestable: effects, and what the data lack for them.  wary:
+    whether anything is left that matters, or names that change with the poses.  maps: of joints,
     sought beside the effects, once there is a ladder.
     """
 
@@ -57,7 +48,7 @@ class Causes:
     exclude: tuple[str, ...]
     choice: Choice
     effects: tuple[Finding, ...]
-    traces: tuple[Trace, ...]
+    left: tuple[Remains, ...]
     untestable: tuple[tuple[str, str], ...]
     wary: bool
     maps: Mapped = NO_MAPS
@@ -77,36 +68,31 @@ def causes_of(
     """
     progress("effects")
     lib, choice = chosen(study, exclude)
-    traces = left_by(study, choice)
-    left = chance_of(traces) < STRUCTURE  # each joint would absorb it
-    plain, study = study, weighed_anew(study, choice.known, each=not left)
+    clear = loudest(left_by(study, choice)) is None  # or each joint would absorb it
+    plain, study = study, weighed_anew(study, choice.known, each=clear)
     if study is not plain:
         progress("effects beside noises that differ")
         lib, choice = chosen(study, exclude, choice.chosen)
-        traces = left_by(study, choice)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
         exclude = (*exclude, *play)
         lib, choice = chosen(study, exclude)
-        traces = left_by(study, choice)
-    if choice.noise.variance < study.rows.exact**2:
-        traces = (Trace("rounding", 1.0, 0.0),)
-    every, told = (*faults, *read_back), lib.untestable
-    causes = Causes(every, lib, tuple(exclude), choice, (), traces, told, wary=False)
+    every, told, left = (*faults, *read_back), lib.untestable, left_by(study, choice)
+    causes = Causes(every, lib, tuple(exclude), choice, (), left, told, wary=False)
     return study, found_again(study, causes)
 
 
 def found_again(study: Study, causes: Causes) -> Causes:
     """The causes with their effects as findings: rivals, and how often each is found again.
 
-    And whether what these leave has structure that matters, or most of them change with the poses.
+    And whether what these leave matters, or most of them change with the poses.
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     effects = judged_again(found, choice, study)
     change = mostly_loose(effects, [found for found in effects if found.established])
-    wary = (change and asked(effects)) or loudest(study, choice, causes.traces) is not None
+    wary = (change and asked(effects)) or loudest(causes.left) is not None
     return replace(causes, effects=effects, wary=wary)
 
 
@@ -149,41 +135,18 @@ def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
              for one in columns]  # fmt: skip
     study = replace(study, rows=study.rows.beside(study.rows.of(np.concatenate(usual))))
     lib, choice = chosen(study, causes.exclude)
-    traces = left_by(study, choice)
-    return found_again(study, replace(causes, library=lib, choice=choice, traces=traces))
-
-
-def left_by(study: Study, choice: Choice) -> tuple[Trace, ...]:
-    """Traces of what the effects leave, whatever the masses are that they were told with."""
-    return structure(study.scene, study.rows, choice.noise, choice.doubted, named_in(choice))
-
-
-def loudest(study: Study, choice: Choice, traces: Sequence[Trace]) -> Trace | None:
-    """The structure that matters, beside what the effects explain and beside the noise."""
-    return heard(traces, explained(study.rows, choice), study.rows.count)
+    left = left_by(study, choice)
+    return found_again(study, replace(causes, library=lib, choice=choice, left=left))
 
 
 def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
-    """The causes with the traces of what their effects and some maps leave together.
+    """The causes with what their effects and some maps leave together.
 
     Names that changed with the poses are no longer there to be wary of: the maps are.
     """
-    fields = [term.columns(study.scene).displacement(study.scene) for term in maps]
-    known = np.concatenate([causes.choice.doubted, *map(study.rows.of, fields)], axis=1)
-    noise = restricted(study.rows, known)
-    traces = structure(study.scene, study.rows, noise, known, named_in(causes.choice))
-    wary = loudest(study, causes.choice, traces) is not None
-    return replace(causes, traces=traces, wary=wary)
-
-
-def named_in(choice: Choice) -> list[Named]:
-    """The effects selected with their motions: of few parameters each its own, else together."""
-    out = []
-    for candidate, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
-        motion = choice.library.columns[:, candidate.main].T
-        whole = value @ motion
-        out.append(Named(candidate.term, motion if len(motion) <= FEW else whole[None], whole))
-    return out
+    fields = [study.rows.of(term.columns(study.scene).displacement(study.scene)) for term in maps]
+    left = left_by(study, causes.choice, np.concatenate(fields, axis=1) if fields else None)
+    return replace(causes, left=left, wary=loudest(left) is not None)
 
 
 def chosen(
@@ -210,7 +173,7 @@ def read_back_fault(study: Study, choice: Choice) -> list[Fault]:
     """
     if not any(EFFECTS[c.term.effect].of_move for c in choice.chosen):
         return []
-    rest = rest_of(study.rows, choice.noise, choice.known)
+    rest = rest_of(study.rows, choice.noise, choice.known, study.rows.width)
     error = np.moveaxis(study.rows.back(rest.rows / rest.root), -1, 1)
     error = np.where(study.model.seen[..., None], error, np.nan)
     error = error @ study.fit.state.rotation.T

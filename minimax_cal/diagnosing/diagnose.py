@@ -189,9 +189,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
     progress("remainder")
     rest = remainder(ladder.last, floor)
-    verdict, structure_left = judged(findings, causes, study, ladder, rest)
+    verdict, structure_left = judged(findings, causes)
     noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
-    known = known_noise(ladder, last, floor, clean.data, robot.repeatability)
+    known = known_noise(ladder.last, floor, clean.data, robot.repeatability)
     verdict, unexplained = answered(verdict, structure_left[0], findings, known)
     beyond = NOT_ASKED
     if not options.quick:

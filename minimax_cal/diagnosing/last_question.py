@@ -13,18 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from minimax_cal.diagnosing.gap import Judges, Ladder
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.remainder import joint_units
 from minimax_cal.diagnosing.result import Finding
+from minimax_cal.evidence.limits import MAX_JOINT_JITTER
 from minimax_cal.fitting.intervals import rms_interval
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import noise_between
-from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate
+from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordinate, wider
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 
-MAX_JOINT_REPEATABILITY = 1.5e-5  # of a sound joint, where no data sheet says [rad]: 5 to 15 urad
 MAX_OVER_NOISE = 1.1  # error, or scatter of visits, over the noise that may be: less is no matter
 ABOVE_NOISE = "the remaining error is above the known noise"
 ONLY_MINOR = "every confirmed cause is minor, and the remaining error is above the known noise"
@@ -35,10 +34,9 @@ class Known:
     """What is known of the noise beneath a final model, as RMS distances [mm].
 
     highest: that instrument, visits and sound joints may add up to; NaN where nothing tells.
-    remaining: lower 95 % limit of the model's error on new poses, less what the choice of training
-    poses adds.  visits: lower 97.5 % limit of the scatter of repeated poses, NaN without.
-    expected: what instrument and sound joints would show there, NaN where the instrument is not
-    known.
+    remaining: lower 95 % limit of the model's error but for what its own fit takes.
+    visits: lower 97.5 % limit of the scatter of repeated poses, NaN without.  expected: what
+    instrument and sound joints would show there at most, NaN where the instrument is not known.
     """
 
     highest: float
@@ -59,24 +57,25 @@ class Known:
         return not self.visits > MAX_OVER_NOISE * self.expected
 
 
-def known_noise(
-    ladder: Ladder, judges: Judges, floor: Floor, data: Measurements, repeatability: float
-) -> Known:
+def known_noise(last: Joint, floor: Floor, data: Measurements, repeatability: float) -> Known:
     """What is known of the noise beneath the last step.
 
     data: without faults.  repeatability: of the arm by its data sheet, NaN unknown [m].
     """
-    last = ladder.last
-    joints = 0.0 if math.isfinite(repeatability) else usual_scatter(last)
+    sound = usual_scatter(last)
+    arm = 1e3 * repeatability if math.isfinite(repeatability) else sound
     between = noise_between(data)
-    instrument = of_coordinate(between[0]) if between else math.nan
+    instrument = of_coordinate(between[0]) * wider(between[1]) if between else math.nan
     repeats = floor.source == REPEATS
-    highest = floor.high if repeats else math.hypot(floor.high, joints)
+    joints = 0.0 if repeats or math.isfinite(repeatability) else sound
+    expected = math.hypot(instrument, max(arm, sound))
     return Known(
-        highest=highest if floor.certain else math.nan,
-        remaining=remaining_mm(last, judges),
+        highest=float(np.fmin(math.hypot(floor.high, joints), expected if repeats else math.nan))
+        if floor.certain
+        else math.nan,
+        remaining=remaining_mm(last),
         visits=least_visits(data, last.cell.error(data)) if repeats else math.nan,
-        expected=math.hypot(instrument, usual_scatter(last)),
+        expected=expected,
     )
 
 
@@ -84,7 +83,7 @@ def usual_scatter(last: Joint) -> float:
     """RMS distance by which sound joints miss their place at these poses, at most [mm]."""
     scene = last.study.scene
     arm = scene.jacobian * joint_units(scene)[:, None, None, None]
-    return 1e3 * MAX_JOINT_REPEATABILITY * float(np.sqrt((arm**2).sum(axis=(0, 2)).mean()))
+    return 1e3 * MAX_JOINT_JITTER * float(np.sqrt((arm**2).sum(axis=(0, 2)).mean()))
 
 
 def least_visits(data: Measurements, error: Array) -> float:
@@ -101,18 +100,17 @@ def least_visits(data: Measurements, error: Array) -> float:
     return 1e3 * math.sqrt(float(square.mean()) * free / float(chdtri(free, 0.025)))
 
 
-def remaining_mm(last: Joint, judges: Judges) -> float:
-    """Lower 95 % limit of the RMS distance that the last step leaves on new poses [mm].
+def remaining_mm(last: Joint) -> float:
+    """Lower 95 % limit of the RMS distance that the last step leaves [mm].
 
-    Without what its parameters err by: with n numbers and p parameters the mean square on new poses
-    is (n + p) / n times that of the noise.
+    On the poses of the fit, over their degrees of freedom: elsewhere errors of the parameters
+    count, which no noise tells.
     """
-    error = judges.errors(last.cell)
-    group = clusters(judges.held)
-    low = rms_interval(error, group, rng=np.random.default_rng(0)).low
-    count = 3.0 * float(np.count_nonzero(last.study.data.seen))
-    taken = max(count - last.poses.left_free, 0.0)
-    return 1e3 * float(np.nan_to_num(low)) * math.sqrt(count / (count + taken))
+    data = last.study.data
+    low = rms_interval(last.cell.error(data), clusters(data), rng=np.random.default_rng(0)).low
+    count = 3.0 * float(np.count_nonzero(data.seen))
+    free = last.poses.left_free
+    return 1e3 * float(np.nan_to_num(low)) * math.sqrt(count / free) if free >= 1.0 else 0.0
 
 
 def answered(

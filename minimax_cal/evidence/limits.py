@@ -46,16 +46,10 @@ INSTEAD = 0.2  # share of the subsamples in which a name takes another's place: 
 # ---- what is unknown -----------------------------------------------------------------------------
 
 STRUCTURE = 0.005  # chance that noise alone is called structure: the other half of the budget
-MATTERS = 0.015  # share of what was explained below which structure is of no account: laws of
-# machines are not quite ours (study, saturating and loaded forms), real arms leave 1 %
-WORTH = 0.01  # of the noise: structure that lowers the RMS by less than half a percent is of no
-# account (study: cubic loads leave 0.015 to 0.019 beside a compliance, a creeping base 0.0095)
-SCATTER = 10.0  # degrees of freedom by which a motion is taken to scatter as all do, before its own
-# are asked (study of seed 2071, each third outside the library: 1 of 36 fewer is unknown)
+WORTH = 0.02  # share of the square of what is left that a component must have to matter
+MAX_JOINT_JITTER = 1.5e-5  # of a sound joint, where no data sheet says [rad]: 5 to 15 urad
 CREDIBLE = 3.0  # sigmas by which masses may be off to explain what a name leaves: with the true law
 # they are by up to 2, without it by 3.3 to 9 (twelve and eighteen simulated UR10s)
-MUCH = 0.2  # of the noise: what tentative effects alone may tell on an arm that has nothing (study:
-# 0.02 where the base only creeps; 2.1 where the one law that was there is in no library)
 CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
 HALF = 0.5  # of the predictable gap, which what is established must close; of an effect, below
 # which a part of the poses is no test of it

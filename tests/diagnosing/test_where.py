@@ -21,14 +21,12 @@ from minimax_cal.diagnosing.where.mean_squares import (
     shape_scatter,
 )
 from minimax_cal.diagnosing.where.residual import (
-    TOGETHER,
-    evened,
     joint_rows,
     residual_of,
-    times_before,
 )
 from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
 from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
+from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import from_means, groups

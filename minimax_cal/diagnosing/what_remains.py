@@ -1,0 +1,63 @@
+"""Is anything left?  What effects leave of an arm's errors, asked by `evidence.remains`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import MAX_JOINT_JITTER, STRUCTURE, WORTH
+from minimax_cal.evidence.noise import Noise, Problem, restricted
+from minimax_cal.evidence.remains import Remains, remains, rest_of
+from minimax_cal.evidence.selection import Choice
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.scene import Scene
+from minimax_cal.modelling.remaining import components
+from minimax_cal.modelling.rows import Rows
+
+FEW = 2  # parameters of an effect whose motions are asked each by itself
+NOTHING = Remains("nothing", "anything", 0.0, 1.0, 0.0)
+
+
+def left_by(study: Study, choice: Choice, more: Array | None = None) -> tuple[Remains, ...]:
+    """What effects leave, the loudest first, whatever the masses are that they were told with.
+
+    more: (N, q) columns that were fitted besides.
+    """
+    if choice.noise.variance < study.rows.exact**2:
+        return (NOTHING,)
+    known = choice.doubted if more is None else np.concatenate([choice.doubted, more], axis=1)
+    return left_over(study.scene, study.rows, known, motions(choice))
+
+
+def left_over(
+    scene: Scene, rows: Rows, known: Array, named: Sequence[tuple[str, Array]] = ()
+) -> tuple[Remains, ...]:
+    """What geometry and known columns (N, q) leave.  named: motions as `components` has them."""
+    noise = anchored(restricted(rows, known), rows)
+    asked = list(components(scene, rows, named))
+    return remains(rest_of(rows, noise, known, rows.width), asked) or (NOTHING,)
+
+
+def anchored(noise: Noise, rows: Problem) -> Noise:
+    """The noise, its joints no worse than sound ones are: more is lack of fit."""
+    most = MAX_JOINT_JITTER**2 * rows.size / noise.variance
+    return replace(noise, ratio=min(noise.ratio, most))
+
+
+def motions(choice: Choice) -> list[tuple[str, Array]]:
+    """The effects with the rows of their motions: of few parameters each its own, else together."""
+    out = []
+    for candidate, (value, _) in zip(choice.chosen, choice.estimates, strict=True):
+        motion = choice.library.columns[:, candidate.main]
+        whole = (motion @ value)[:, None]
+        out.append((candidate.term.label, motion if motion.shape[1] <= FEW else whole))
+    return out
+
+
+def loudest(left: Sequence[Remains]) -> Remains | None:
+    """What certainly remains and matters; None where nothing does."""
+    loud = [one for one in left if one.p < STRUCTURE and one.share > WORTH]
+    return loud[0] if loud else None

@@ -1,0 +1,198 @@
+"""Does anything remain?  One test of all that might, whatever its law.
+
+What a fit leaves is asked for motions that follow smooth functions of something: components of
+variance [Rao and Kleffe 1988].  A component's score is the squared length of its products with the
+rows; simulated white rows tell how large it is by chance, and how large the largest of all.  A
+motion may scatter more than the rest, and a visit be off by itself, which is no such function:
+flipped signs of whole visits [Winkler et al. 2014] must not score as much either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from minimax_cal.evidence.evened import evened
+from minimax_cal.evidence.noise import Noise, Problem
+from minimax_cal.ground.arrays import Array
+
+DRAWS = 499  # of rows, and of signs: the least chance that is told is 0.002
+AUDIBLE, ASKED = 0.5, 40  # chance above which none is asked about scatter, and how many at most
+SCATTERS = 0.05  # chance by flipped signs above which a motion scatters, and follows nothing
+SHOWN = 6  # components that are told at most
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """What may remain: motions of a place that follow functions of a driver.
+
+    motion: (N, d) rows per unit.  feature: (w, f, m) of the visits, f functions or a square root of
+    their covariance in each of w ways, of which the loudest counts.
+    """
+
+    place: str
+    driver: str
+    motion: Array
+    feature: Array
+
+
+@dataclass(frozen=True)
+class Remains:
+    """A component that remains.
+
+    score: as that of a standard normal variable.  p: chance that any of all components scores so
+    much on white rows; 1 where any that is loud does by flipped signs.  share: of the square of
+    what is left, as far as this component tells it.
+    """
+
+    place: str
+    driver: str
+    score: float
+    p: float
+    share: float
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.place} with {self.driver}"
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What is left, white under the null hypothesis.
+
+    rows: (N,).  basis: (N, p) orthonormal span of all that was fitted.  root: (N,) square roots of
+    the weights.  dof: degrees of freedom.  group: (m,) of visits to one pose, from 0.  width: of
+    rows a visit.
+    """
+
+    rows: Array
+    basis: Array
+    root: Array
+    dof: int
+    group: Array
+    width: int
+
+    @property
+    def total(self) -> float:
+        """Its square."""
+        return float(self.rows @ self.rows)
+
+    def even(self) -> Array:
+        """(N,) the rows as large as they were before the fit."""
+        m, r = len(self.rows) // self.width, self.width
+        spread = np.broadcast_to(np.eye(r), (m, r, r))
+        basis = self.basis.reshape(m, r, -1)
+        return evened(self.rows.reshape(m, r), basis, spread, self.group).reshape(-1)
+
+    def without(self, rows: Array) -> Array:
+        """Rows (N, b) without what was fitted."""
+        return np.asarray(rows - self.basis @ (self.basis.T @ rows))
+
+    def felt(self, motion: Array, rows: Array) -> Array:
+        """(d, m, b) products at each visit of motions (N, d) with rows (N, b)."""
+        shape = len(self.group), self.width, -1
+        moved = scaled(self, motion).reshape(shape)
+        return np.einsum("mwd,mwb->dmb", moved, rows.reshape(shape), optimize=True)
+
+
+def rest_of(rows: Problem, noise: Noise, known: Array, width: int) -> Rest:
+    """Weighted rows without the span of nuisance and known columns (N, q)."""
+    root = np.sqrt(noise.weights(rows))
+    columns = np.concatenate([rows.basis, known], axis=1) * root[:, None]
+    norm = np.linalg.norm(columns, axis=0)
+    basis = np.linalg.qr(columns[:, norm > 0] / norm[norm > 0])[0]
+    rest = rows.error * root
+    rest = rest - basis @ (basis.T @ rest)
+    dof = rows.count - basis.shape[1]
+    return Rest(rest, basis, root, dof, rows.group[::width], width)
+
+
+def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
+    """Components that the rest may hold, the loudest first, each with the chance of it."""
+    rng = np.random.default_rng(0)
+    moving = [one for one in components if np.any(one.motion)]
+    if not moving:
+        return ()
+    drawn = rng.normal(size=(len(rest.rows), DRAWS)) * (rest.root > 0.0)[:, None]
+    white = scores_of(rest, moving, rest.without(drawn) * np.sqrt(rest.total / max(rest.dof, 1)))
+    score, chance = largest(white)
+    order = np.argsort(-score).tolist()
+    loud = sorted([i for i in order if chance[i] < AUDIBLE][:ASKED] or order[:1])
+    signs = np.repeat(rng.choice((-1.0, 1.0), (len(rest.group), DRAWS)), rest.width, axis=0)
+    flipped = rest.without(signs * rest.even()[:, None])
+    _, by_signs = largest(scores_of(rest, [moving[i] for i in loud], flipped))
+    told = [
+        (1.0 if scatter > SCATTERS else float(chance[i]), -float(score[i]), i)
+        for i, scatter in zip(loud, by_signs, strict=True)
+    ]
+    return tuple(
+        Remains(moving[i].place, moving[i].driver, -minus, p, share_of(rest, moving[i], white[i]))
+        for p, minus, i in sorted(told)[:SHOWN]
+    )
+
+
+def scores_of(rest: Rest, components: Sequence[Component], drawn: Array) -> Array:
+    """(c, 1 + DRAWS) squared products of components with the rows, and with drawn rows (N, b)."""
+    every, out = np.concatenate([rest.rows[:, None], drawn], axis=1), []
+    for _, same in groupby(components, key=lambda one: id(one.motion)):
+        several = list(same)
+        felt = rest.felt(several[0].motion, every)
+        out += [score_of(one.feature, felt) for one in several]
+    return np.array(out)
+
+
+def score_of(feature: Array, felt: Array) -> Array:
+    """(b,) the largest squared product of the ways (w, f, m) with what is felt (d, m, b)."""
+    ways, count, visits = feature.shape
+    told = feature.reshape(-1, visits) @ felt
+    return np.asarray((told**2).reshape(len(felt), ways, count, -1).sum(axis=(0, 2)).max(axis=0))
+
+
+def largest(scores: Array) -> tuple[Array, Array]:
+    """(c,) scores as of a standard normal variable, and chance that the largest of all is so large.
+
+    scores: (c, 1 + DRAWS), the first of the rows, the others by chance.
+    """
+    score = standardised(scores)
+    most = np.sort(score[:, 1:].max(axis=0))
+    return score[:, 0], 1.0 - np.searchsorted(most, score[:, 0]) / (DRAWS + 1.0)
+
+
+def standardised(scores: Array) -> Array:
+    """(c, 1 + DRAWS) scores, each row as of a standard normal variable if by chance.
+
+    By the cube root of Wilson and Hilferty [1931], the degrees of freedom by the moments.
+    """
+    mean, spread = scores[:, 1:].mean(axis=1)[:, None], scores[:, 1:].var(axis=1)[:, None]
+    unit = 2.0 / 9.0 * spread / np.maximum(2.0 * mean**2, 1e-300)  # 2 / 9 of one over the freedom
+    root = np.cbrt(scores / np.maximum(mean, 1e-300))
+    return np.asarray((root - 1.0 + unit) / np.sqrt(np.maximum(unit, 1e-300)))
+
+
+def scaled(rest: Rest, motion: Array) -> Array:
+    """(N, e) weighted motions of one size each, without those that were fitted."""
+    weighed = motion * rest.root[:, None]
+    size = np.linalg.norm(weighed, axis=0)
+    return np.asarray(weighed[:, size > 0.0] / size[size > 0.0])
+
+
+def share_of(rest: Rest, one: Component, scores: Array) -> float:
+    """Share of the rest's square that a component has, by its score beyond chance.
+
+    With z features of variance v, E|z'r|^2 is that by chance plus v |z'z|^2 (MINQUE).  scores:
+    (1 + DRAWS,) its own and those by chance.
+    """
+    motion, feature = scaled(rest, one.motion), one.feature
+    if len(feature) > 1:
+        told = [float(score_of(way[None], rest.felt(one.motion, rest.rows[:, None]))[0])
+                for way in feature]  # fmt: skip
+        feature = feature[[int(np.argmax(told))]]
+    spread = np.repeat(feature[0].T, rest.width, axis=0)
+    columns = rest.without((spread[:, :, None] * motion[:, None]).reshape(len(motion), -1))
+    gram = columns.T @ columns if columns.shape[1] < len(columns) else columns @ columns.T
+    variance = float(scores[0] - scores[1:].mean()) / max(float((gram**2).sum()), 1e-300)
+    return max(variance, 0.0) * float(np.trace(gram)) / max(rest.total, 1e-300)

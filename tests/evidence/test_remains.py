@@ -1,0 +1,94 @@
+"""Does anything remain: false alarms, what is found, and how large it is said to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from minimax_cal.evidence.noise import Noise, Problem, orthonormal
+from minimax_cal.evidence.remains import Component, Rest, remains, rest_of
+from minimax_cal.ground.arrays import Array
+
+VISITS, WIDTH = 80, 6
+PLAIN = Noise(0.0, 1.0, 0.0)
+
+
+def problem(rng: np.random.Generator, error: Array) -> Problem:
+    """Rows beside eight nuisance columns."""
+    rows = VISITS * WIDTH
+    return Problem(
+        error=error,
+        basis=orthonormal(rng.normal(size=(rows, 8))),
+        variance_ratio=np.ones(rows),
+        size=1.0,
+        group=np.repeat(np.arange(VISITS), WIDTH),
+        measured=np.ones(rows, dtype=bool),
+        exact=1e-9,
+    )
+
+
+def asked(rng: np.random.Generator) -> list[Component]:
+    """Four places, three drivers each."""
+    x = rng.uniform(-1.0, 1.0, (3, VISITS))
+    drivers = {f"driver {i + 1}": np.array([[u, u**2, np.cos(3.0 * u)]]) for i, u in enumerate(x)}
+    out = []
+    for place in "ABCD":
+        motion = rng.normal(size=(VISITS * WIDTH, 1))
+        out += [Component(place, name, motion, f) for name, f in drivers.items()]
+    return out
+
+
+def rest(rng: np.random.Generator, error: Array) -> Rest:
+    """What is left of an error."""
+    none = np.zeros((len(error), 0))
+    return rest_of(problem(rng, error), PLAIN, none, WIDTH)
+
+
+def test_noise_is_called_remains_as_often_as_the_level_says() -> None:
+    rng = np.random.default_rng(5)
+    chances = []
+    for _ in range(60):
+        what = asked(rng)
+        chances.append(remains(rest(rng, rng.normal(size=VISITS * WIDTH)), what)[0].p)
+    rare = np.mean(np.array(chances) < 0.05)
+    assert rare < 0.14  # 0.05 + 3 sigma
+
+
+def test_a_motion_that_scatters_by_itself_is_no_remainder() -> None:
+    rng = np.random.default_rng(6)
+    chances = []
+    for _ in range(25):
+        what = asked(rng)
+        shaken = what[0].motion[:, 0] * np.repeat(rng.normal(size=VISITS), WIDTH)
+        error = rng.normal(size=VISITS * WIDTH) + 5.0 * shaken
+        error[:WIDTH] += 40.0  # and one visit that is off
+        chances.append(remains(rest(rng, error), what)[0].p)
+    assert np.mean(np.array(chances) < 0.05) < 0.15
+
+
+@pytest.mark.parametrize("size", [0.35, 1.0])
+def test_what_is_there_is_found_with_its_place_driver_and_size(size: float) -> None:
+    rng = np.random.default_rng(7)
+    what = asked(rng)
+    true = what[4]
+    field = true.motion[:, 0] * np.repeat(true.feature[0, 0], WIDTH)
+    field *= size / np.sqrt(np.mean(field**2))
+    found = remains(rest(rng, rng.normal(size=VISITS * WIDTH) + field), what)[0]
+    assert (found.place, found.driver) == (true.place, true.driver)
+    assert found.name == f"{true.place} with {true.driver}"
+    assert found.p < 0.005
+    assert found.share == pytest.approx(size**2 / (1.0 + size**2), rel=0.5)
+
+
+def test_what_was_fitted_does_not_remain() -> None:
+    rng = np.random.default_rng(8)
+    what = asked(rng)
+    field = what[4].motion[:, 0] * np.repeat(what[4].feature[0, 0], WIDTH)
+    rows = problem(rng, rng.normal(size=VISITS * WIDTH) + 3.0 * field)
+    beside = rest_of(rows, PLAIN, field[:, None], WIDTH)
+    assert remains(beside, what)[0].p > 0.01
+    assert beside.dof == VISITS * WIDTH - 9
+    fixed = [replace(one, motion=np.zeros_like(one.motion)) for one in what]
+    assert remains(beside, fixed) == ()
