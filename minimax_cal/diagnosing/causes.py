@@ -90,6 +90,7 @@ def found_again(study: Study, causes: Causes) -> Causes:
     """
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
+    found = [with_untested(one, study.scene, causes.exclude) for one in found]
     effects = judged_again(found, choice, study)
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(causes.left) is not None
@@ -262,6 +263,24 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
         ),
         fixed=columns.fixed,
     )
+
+
+def with_untested(found: Finding, scene: Scene, exclude: Sequence[str]) -> Finding:
+    """A finding with its relatives that the data lack something for: they may be it as well.
+
+    Relatives turn a joint by what drives it; of how much alike they are nothing is known.
+    """
+    if found.term.place.startswith("L"):  # a link that bends turns no joint
+        return found
+    own = EFFECTS[found.term.effect]
+    lacking = [
+        Alternative(name, found.term.place, 1.0, 0.0, 0.0, f"give {other.needs(scene)}")
+        for name, other in EFFECTS.items()
+        if (other.moves, other.follows) == (own.moves, own.follows)
+        and name not in (own.name, *exclude)
+        and other.needs(scene)
+    ]
+    return replace(found, alternatives=(*found.alternatives, *lacking)) if lacking else found
 
 
 def whole(finding: Finding, every: Sequence[Term], scene: Scene) -> Finding:

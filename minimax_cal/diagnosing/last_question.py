@@ -36,7 +36,7 @@ class Known:
     highest: that instrument, visits and sound joints may add up to; NaN where nothing tells.
     remaining: lower 95 % limit of the model's error but for what its own fit takes.
     visits: lower 97.5 % limit of the scatter of repeated poses, NaN without.  expected: what
-    instrument and sound joints would show there at most, NaN where the instrument is not known.
+    instrument and sound joints would show there, NaN where the instrument is not known.
     """
 
     highest: float
@@ -63,19 +63,21 @@ def known_noise(last: Joint, floor: Floor, data: Measurements, repeatability: fl
     data: without faults.  repeatability: of the arm by its data sheet, NaN unknown [m].
     """
     sound = usual_scatter(last)
-    arm = 1e3 * repeatability if math.isfinite(repeatability) else sound
-    between = noise_between(data)
-    instrument = of_coordinate(between[0]) * wider(between[1]) if between else math.nan
-    repeats = floor.source == REPEATS
-    joints = 0.0 if repeats or math.isfinite(repeatability) else sound
-    expected = math.hypot(instrument, max(arm, sound))
+    told = math.isfinite(repeatability)
+    arm = max(sound, 1e3 * repeatability) if told else sound
+    repeats, between = floor.source == REPEATS, noise_between(data)
+    instrument, most = math.nan, math.nan
+    if between:
+        instrument = of_coordinate(between[0])
+        most = instrument * wider(between[1])
+    highest = math.hypot(floor.high, 0.0 if repeats or told else sound)
+    if repeats:
+        highest = float(np.fmin(highest, math.hypot(most, arm)))
     return Known(
-        highest=float(np.fmin(math.hypot(floor.high, joints), expected if repeats else math.nan))
-        if floor.certain
-        else math.nan,
+        highest=highest if floor.certain else math.nan,
         remaining=remaining_mm(last),
         visits=least_visits(data, last.cell.error(data)) if repeats else math.nan,
-        expected=expected,
+        expected=math.hypot(instrument, arm),
     )
 
 

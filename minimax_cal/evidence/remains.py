@@ -96,7 +96,7 @@ class Rest:
         """(d, m, b) products at each visit of motions (N, d) with rows (N, b)."""
         shape = len(self.group), self.width, -1
         moved = scaled(self, motion).reshape(shape)
-        return np.einsum("mwd,mwb->dmb", moved, rows.reshape(shape), optimize=True)
+        return np.asarray(np.einsum("mwd,mwb->dmb", moved, rows.reshape(shape), optimize=True))
 
 
 def rest_of(rows: Problem, noise: Noise, known: Array, width: int) -> Rest:

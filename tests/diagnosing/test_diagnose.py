@@ -14,6 +14,7 @@ import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, Sealed, make
 from minimax_cal.diagnosing.gap import closed_share
 from minimax_cal.diagnosing.result import VERDICTS
+from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.fitting.checks import misplaced, put_right
 from minimax_cal.measuring.floor import REPEATS, Floor
 from minimax_cal.modelling.simulate import Simulation
@@ -128,7 +129,7 @@ def test_an_arm_that_does_not_come_back_is_called_so() -> None:
 def test_a_law_outside_the_library_is_unknown() -> None:
     found = diagnosed(Cause("outside_sum", "J2", 1000.0))
     assert found.verdict == "unknown"
-    assert found.structure < 1e-3
+    assert found.structure < STRUCTURE
     assert "cause is unknown" in found.headline() or "best guess" in found.headline()
 
 

@@ -7,6 +7,7 @@ import pytest
 
 import minimax_cal as mc
 from experiments.gap_cases import Case, Cause, make
+from minimax_cal.diagnosing.causes import with_untested
 from minimax_cal.diagnosing.established import loose_among, mostly_loose
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import Alternative, Finding
@@ -17,6 +18,7 @@ from minimax_cal.diagnosing.verdict import (
     why_loose,
 )
 from minimax_cal.evidence import limits
+from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.table import Term
 
 
@@ -104,3 +106,19 @@ def test_an_old_file_holds_established_effects(two_orders: mc.Diagnosis) -> None
 def test_a_name_that_is_not_found_again_is_tentative() -> None:
     assert finding("backlash", "J1", again=1.0).established
     assert not replace(finding("backlash", "J1"), again=0.8).established
+
+
+def test_what_could_not_be_tested_stands_among_the_alternatives_of_its_relatives() -> None:
+    """Without masses a joint that yields to its own load may yield to its neighbour's."""
+    robot = mc.load_robot("irb2600")
+    bare = Cell(robot, np.eye(4), ("smr1",), np.full((1, 3), 0.1))
+    scene = bare.scene(still(np.linspace(-1.0, 1.0, 60).reshape(10, 6), ("smr1",), robot))
+    assert not scene.known_masses
+    (rival,) = with_untested(finding("joint_compliance", "J2"), scene, ()).alternatives
+    assert (rival.effect, rival.place) == ("cross_compliance", "J2")
+    assert "mass_kg" in rival.separate_with
+    assert not with_untested(finding("joint_compliance", "J2"), scene, (rival.effect,)).alternatives
+    assert not with_untested(finding("gear_error", "J2"), scene, ()).alternatives
+    heavy = replace(robot, mass=np.full(6, 5.0), com=np.zeros((6, 3)))
+    told = replace(bare, robot=heavy).scene(scene.data)
+    assert not with_untested(finding("joint_compliance", "J2"), told, ()).alternatives
