@@ -268,9 +268,9 @@ def finding(study: Study, choice: Choice, number: int) -> Finding:
 def with_untested(found: Finding, scene: Scene, exclude: Sequence[str]) -> Finding:
     """A finding with its relatives that the data lack something for: they may be it as well.
 
-    Relatives turn a joint by what drives it; of how much alike they are nothing is known.
+    Relatives turn the same joint by what drives it; of how much alike they are nothing is known.
     """
-    if found.term.place.startswith("L"):  # a link that bends turns no joint
+    if not found.term.place.startswith("J"):
         return found
     own = EFFECTS[found.term.effect]
     lacking = [
