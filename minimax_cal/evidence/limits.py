@@ -51,5 +51,4 @@ MAX_JOINT_JITTER = 1.5e-5  # of a sound joint, where no data sheet says [rad]: 5
 CREDIBLE = 3.0  # sigmas by which masses may be off to explain what a name leaves: with the true law
 # they are by up to 2, without it by 3.3 to 9 (twelve and eighteen simulated UR10s)
 CERTAIN = 1e-6  # chance below which something is there, though no name of it holds
-HALF = 0.5  # of the predictable gap, which what is established must close; of an effect, below
-# which a part of the poses is no test of it
+HALF = 0.5  # of what is there, by its size: more under no name that holds, and nothing is named

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import minimax_cal as mc
@@ -25,8 +26,6 @@ from minimax_cal.modelling.effects.table import Term
 def finding(effect: str, place: str, size: float = 100.0, again: float = 1.0) -> Finding:
     none = (0.0,)
     return Finding((Term(effect, place),), ("a",), ("rad",), none, none, size, 1e-9, again=again)
-
-
 
 
 def test_a_name_that_helps_at_no_poses_left_out_holds_nothing() -> None:
