@@ -78,12 +78,13 @@ def as_large(series: Series, bounds: Bounds) -> Series:
     moved = series.at(series.grid(CHECKED_HZ))
     off = moved.q - series.centre
     room = bounds.room
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # a joint without a drive stays
         up = (room.upper - series.centre) / np.maximum(off.max(axis=0), 0.0)
         down = (series.centre - room.lower) / np.maximum(-off.min(axis=0), 0.0)
         quick = bounds.speed / np.abs(moved.qd).max(axis=0)
         hard = bounds.acceleration / np.abs(moved.qdd).max(axis=0)
-    return series.sized(MARGIN * np.min([up, down, quick, hard], axis=0))
+    factor = MARGIN * np.min([up, down, quick, hard], axis=0)
+    return series.sized(np.where(np.isfinite(factor), factor, 0.0))
 
 
 def free(q: Array, bounds: Bounds) -> Array:
@@ -100,7 +101,7 @@ def free(q: Array, bounds: Bounds) -> Array:
 def inside(room: Room, q: Array, box: Array) -> Array:
     """(m,) True where all moving origins of the arm's links are in a box.  box: (2, 3) [m]."""
     robot = room.robot
-    points = chain(robot.mdh, np.ascontiguousarray(q * robot.sign), robot.prismatic).after
+    points = chain(robot.mdh, np.ascontiguousarray(robot.turned(q)), robot.prismatic).after
     low, high = box[:, None, :, None]
     within = np.all((points >= low) & (points <= high), axis=1)
     return np.asarray(within[moving_links(room)].all(axis=0))
@@ -110,7 +111,7 @@ def moving_links(room: Room) -> Array:
     """(n,) True for the links whose origin moves as the joints do."""
     robot = room.robot
     q = np.random.default_rng(0).uniform(room.lower, room.upper, (20, robot.joints))
-    points = chain(robot.mdh, q * robot.sign, robot.prismatic).after
+    points = chain(robot.mdh, robot.turned(q), robot.prismatic).after
     return np.asarray(np.ptp(points, axis=-1).max(axis=-1) > STILL)
 
 

@@ -50,6 +50,7 @@ NOISE = 0.01  # of the range of a joint's torque; measured arms have 0.3 to 2 %
 LEAST_NOISE = 0.05  # of any joint [N m, N]
 REST = 0.02  # of the largest speed: below it friction has no sign
 NOT_APART = 1e4  # relative sigma above which a parameter is not separable
+VAGUE_GAIN = 1.0  # sigma of a drive gain, of itself, that says nothing of it
 WAYPOINTS_HZ = 10.0
 SCHEMA = 1
 SHORTEST, LONGEST = 5.0, 300.0  # of a part [s]
@@ -349,6 +350,7 @@ def bounds_of(
 ) -> tuple[Bounds, tuple[str, ...]]:
     """What the motion may do, and notices.  Raises OptionError."""
     lower, upper, notices = limits_of(robot, joints)
+    lower, upper = (np.where(robot.passive, 0.0, limit) for limit in (lower, upper))
     radius = THICK * robot.reach() if body is None else body
     up = np.array([[0.0, 0.0, 1.0]])
     room = Room(robot, np.zeros((1, 3)), up, lower, upper, radius, floor)
@@ -398,6 +400,7 @@ def information(model: Model, series: Series) -> float:
     motion = series.at(series.grid(ROWS_HZ))
     columns = np.concatenate([regressor(model.robot, motion) @ model.basis, friction(motion)], -1)
     white = (columns / model.noise[:, None]).reshape(-1, columns.shape[-1])
+    white = white[:, white.any(axis=0)]  # a joint without a drive has no friction
     sign, size = np.linalg.slogdet(white.T @ white)
     return float(size) if sign > 0.0 else -np.inf
 
@@ -435,6 +438,7 @@ def told_by(model: Model, parts: Sequence[Part]) -> list[Told]:
     for kind, values in zip(("Coulomb", "viscous", "armature", "drive gain"), sigma, strict=True):
         for j, value in enumerate(values):
             unit, scale = unit_of(kind, bool(robot.prismatic[j]))
+            value = np.inf if kind == "drive gain" and value > VAGUE_GAIN else value
             out.append(Told(kind, f"J{j + 1}", scale * float(value), unit))
     return out
 

@@ -295,6 +295,10 @@ def same_column(c: Columns) -> None:
     c["tau2_N"] = c["tau2_Nm"]
 
 
+def huge(c: Columns) -> None:
+    c["tau1_Nm"][10] = 1e300
+
+
 REFUSED: list[tuple[Change, str]] = [
     (times_back, r"x.csv:302: time runs back from 2.99 to 0 s; give each run a file or a label"),
     (degrees_with_speeds, r"q\d_rad changes by 57.\d times what qd\d_rad_s says; .* in degrees"),
@@ -318,6 +322,7 @@ REFUSED: list[tuple[Change, str]] = [
     (payload_changes, r"the payload changes from 0 to 2 kg within a run"),
     (joint_lacks, r"x.csv:1: joint 2 has no column, but q3_rad is there"),
     (torque_lacks, r"x.csv:1: joint column q2_rad has no torque or current beside tau1_Nm"),
+    (huge, r"x.csv:12: column tau1_Nm: 1e\+300 cannot be; check the number and its unit"),
     (same_column, r"x.csv:1: tau2_Nm and tau2_N are one column"),
 ]
 

@@ -16,6 +16,7 @@ from minimax_cal.dynamics.regressor import regressor
 from minimax_cal.planning import motion_plan as module
 from minimax_cal.planning.motion import Series, at_rest
 from minimax_cal.robots.kinematics import chain
+from minimax_cal.robots.robot import robot_from_dict
 
 ARM = "irb120"
 SPEED, ACCELERATION = np.radians(60.0), np.radians(120.0)
@@ -84,9 +85,22 @@ def test_a_payload_tells_drive_gains(loaded: module.MotionPlan, short: None) -> 
     assert any("without a known payload" in text for text in alone.notices)
     gains = [t.sigma for t in alone.told if t.parameter == "drive gain"]
     assert np.isinf(gains).all()
-    gains = [t.sigma for t in loaded.told if t.parameter == "drive gain" and t.place != "J6"]
-    assert max(gains) < 20.0  # percent
+    gains = [t.sigma for t in loaded.told if t.parameter == "drive gain"]
+    assert max(gains[:5]) < 20.0  # percent
+    assert np.isinf(gains[5])  # the payload hangs on the axis of the last joint
     assert "not separable" in {cell for row in alone.told_table().rows for cell in row}
+
+
+def test_couplings_and_joints_without_a_drive(short: None) -> None:
+    plain = mc.load_robot(ARM).to_dict()
+    plain["coupling"] = {"J3": {"J2": -1.0}, "J4": {"J2": 0.5, "J4": 0.0}}
+    robot = robot_from_dict(plain)
+    assert robot.passive.tolist() == [False, False, False, True, False, False]
+    found = mc.plan_motion(robot, duration=6.0)
+    moved = found.parts[0].series.at(found.parts[0].series.grid(20.0))
+    assert_allclose(moved.q[:, 3], 0.0, atol=1e-12)
+    assert {t.sigma for t in found.told if t.place == "J4"} == {np.inf}
+    assert np.isfinite([t.sigma for t in found.told if t.parameter == "Coulomb"]).sum() == 5
 
 
 def test_what_is_told_is_what_a_fit_finds(loaded: module.MotionPlan) -> None:

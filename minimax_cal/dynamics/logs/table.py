@@ -24,6 +24,8 @@ from minimax_cal.measuring.importers.sheet import Sheet, cut, open_text
 
 MOST_TORN = 0.01  # share of rows that a log may lose to torn lines
 MOST_JOINTS = 100  # of any machine; guards against a number that is none of a joint
+MOST = 1e6  # of a joint value, speed, acceleration, torque or current, in any unit
+MOST_TIME = 1e20  # nanoseconds since 1970 are 2e18
 SHORTEST_STEP, LONGEST_STEP = 5e-5, 0.5  # between rows of any log of a motion [s]
 FACTORS = {"rad": 1.0, "deg": np.pi / 180.0, "m": 1.0, "mm": 1e-3, "mA": 1e-3}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -142,6 +144,7 @@ def of_format(
         units_of = [unit_of(sheet, i, places[i], units) for i in at]
         wide = [block.shape[1] for block in blocks]
         own[kind] = tuple(np.repeat(units_of, wide).tolist())
+        check_sizes(sheet, kind, at, blocks)
         block = np.concatenate(blocks, axis=1) * [FACTORS.get(unit, 1.0) for unit in own[kind]]
         names = [sheet.header[i] for i in at]
         of_list = tuple(f"{names[0]}[{j}]" for j in range(wide[0]))
@@ -164,6 +167,19 @@ def of_format(
         notices=(*reading.notices(), *unused(sheet, form, places)),
         simulated=is_simulated(sheet.text),
     )
+
+
+def check_sizes(sheet: Sheet, kind: str, at: Sequence[int], blocks: Sequence[Array]) -> None:
+    """Raise DataError for a number that no arm has."""
+    most = MOST_TIME if kind in ("t", "sec", "nanosec") else MOST
+    for i, block in zip(at, blocks, strict=True):
+        odd = (np.abs(block) > most).any(axis=1)
+        if odd.any():
+            row = int(np.argmax(odd))
+            raise DataError(
+                f"{sheet.path}:{sheet.line[row]}: column {sheet.header[i]}: "
+                f"{sheet.cells[row][i][:40]} cannot be; check the number and its unit"
+            )
 
 
 def unit_of(sheet: Sheet, at: int, place: Place, units: Mapping[str, str]) -> str:
