@@ -478,6 +478,29 @@ def test_a_current_called_effort(robot: mc.Robot) -> None:
     assert against_robot(robot, [replace(run, notices=())])[0].notices == ()  # no masses given
 
 
+def test_torques_of_other_joints_or_signs(robot: mc.Robot) -> None:
+    n = robot.joints
+    heavy = replace(robot, mass=np.full(n, 8.0), com=np.full((n, 3), 0.05))
+    run = heavy_run(heavy, 1.0)
+    (told,) = against_robot(heavy, [replace(run, torque=run.torque[:, ::-1])])[0].notices
+    assert re.search(r"the torque of joint [45] follows gravity at joint [23] .* order", told)
+    (told,) = against_robot(heavy, [replace(run, torque=-run.torque)])[0].notices
+    assert re.search(r"joint [23] has the sign of gravity, not of what holds it", told)
+
+
+def test_real_torques_are_those_of_the_arm() -> None:
+    if not (urdf := SHARED / "ur10e_torque" / "ur10e.urdf").exists():
+        pytest.skip("no shared data")
+    (real,) = read_runs(next(urdf.parent.glob("*.csv")))
+    arm = mc.load_robot(urdf)
+    assert against_robot(arm, [real])[0].notices == ()
+    (told,) = against_robot(arm, [replace(real, unit="N m")])[0].notices
+    assert "a current?" in told
+    swapped = real.torque[:, [0, 2, 1, 3, 4, 5]]
+    (told,) = against_robot(arm, [replace(real, torque=swapped)])[0].notices
+    assert "the torque of joint 3 follows gravity at joint 2" in told
+
+
 def test_joints_outside_their_limits(robot: mc.Robot) -> None:
     run = heavy_run(replace(robot, mass=np.full(robot.joints, 8.0), com=np.zeros((6, 3))), 1.0)
     off = replace(run, q=run.q + np.array([0.0, 4.0, 0.0, 0.0, 0.0, 0.0]))

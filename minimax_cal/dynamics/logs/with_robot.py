@@ -17,6 +17,7 @@ from minimax_cal.robots.robot import Robot
 COMPARED = 400  # rows of a run that are compared with gravity
 HEAVY = 5.0  # range of gravity's torque at a joint that shows the size of a torque [N m]
 LEAST_SCALE, MOST_SCALE = 0.4, 2.5  # masses of data sheets are not wrong by more
+FOLLOWS = 0.9  # correlation of a torque with gravity; 0.93 to 0.96 at the shoulder of real arms
 SLACK = 0.01  # of the range of a joint: how far outside its limits it may be
 
 
@@ -28,7 +29,7 @@ def against_robot(robot: Robot, runs: Sequence[Run]) -> tuple[Run, ...]:
                 f"{run.source}: has {run.joints} joints, but {robot.name} has {robot.joints}"
             )
     return tuple(
-        replace(run, notices=(*run.notices, *outside(robot, run), *odd_size(robot, run)))
+        replace(run, notices=(*run.notices, *outside(robot, run), *odd_torque(robot, run)))
         for run in runs
     )
 
@@ -47,25 +48,45 @@ def outside(robot: Robot, run: Run) -> Iterator[str]:
         )
 
 
-def odd_size(robot: Robot, run: Run) -> Iterator[str]:
-    """A notice where torques are not those that hold the arm's masses."""
-    if run.unit != TORQUE or not weighed(robot).all():
+def odd_torque(robot: Robot, run: Run) -> Iterator[str]:
+    """A notice where torques are not those that hold the arm's masses: order, sign, size."""
+    if not weighed(robot).all():
         return
     rows = np.unique(np.linspace(0, len(run.time) - 1, COMPARED).astype(int))
     weight = gravity(robot, run.q[rows])
-    turning = np.where(robot.prismatic, 0.0, np.ptp(weight, axis=0))
-    j = int(np.argmax(turning))
-    if turning[j] < HEAVY:
+    span = np.where(robot.prismatic, 0.0, np.ptp(weight, axis=0))
+    j = int(np.argmax(span))
+    if span[j] < HEAVY:
         return
-    speed = np.gradient(run.q[:, j], run.time)[rows]
-    columns = np.column_stack([weight[:, j], np.sign(speed), speed, np.ones(len(rows))])
-    scale = float(np.linalg.lstsq(columns, run.torque[rows, j], rcond=None)[0][0])
-    if LEAST_SCALE < scale < MOST_SCALE:
-        return
-    yield (
-        f"{run.source}: the torque of joint {j + 1} is {scale:.3g} times what holds the masses of "
-        f"{robot.name}; a current? then name the columns i1_A, i2_A, ..."
-    )
+    alike = np.nan_to_num(np.corrcoef(weight[:, j], run.torque[rows].T)[0, 1:])
+    other = int(np.argmax(np.abs(alike)))
+    if abs(alike[other]) > FOLLOWS and other != j:
+        yield (
+            f"{run.source}: the torque of joint {other + 1} follows gravity at joint {j + 1} "
+            f"(correlation {alike[other]:.2f}, that of joint {j + 1} {alike[j]:.2f}); check the "
+            "order of the joints"
+        )
+    elif alike[j] < -FOLLOWS:
+        yield (
+            f"{run.source}: the torque of joint {j + 1} has the sign of gravity, not of what holds "
+            "it; check its sign"
+        )
+    elif run.unit == TORQUE:
+        speed = np.gradient(run.q[:, j], run.time)[rows]
+        yield from odd_size(robot, run, j, weight[:, j], run.torque[rows, j], speed)
+
+
+def odd_size(
+    robot: Robot, run: Run, j: int, weight: Array, torque: Array, speed: Array
+) -> Iterator[str]:
+    """A notice where a joint's torque is another multiple of gravity's.  Arrays: (m,)."""
+    columns = np.column_stack([weight, np.sign(speed), speed, np.ones(len(speed))])
+    scale = float(np.linalg.lstsq(columns, torque, rcond=None)[0][0])
+    if not LEAST_SCALE < scale < MOST_SCALE:
+        yield (
+            f"{run.source}: the torque of joint {j + 1} is {scale:.3g} times what holds the masses "
+            f"of {robot.name}; a current? then name the columns i1_A, i2_A, ..."
+        )
 
 
 def gravity(robot: Robot, q: Array) -> Array:
