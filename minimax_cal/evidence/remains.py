@@ -118,20 +118,21 @@ def remains(rest: Rest, components: Sequence[Component]) -> tuple[Remains, ...]:
     if not moving:
         return ()
     drawn = rng.normal(size=(len(rest.rows), DRAWS)) * (rest.root > 0.0)[:, None]
-    white = scores_of(rest, moving, rest.without(drawn) * np.sqrt(rest.total / max(rest.dof, 1)))
+    drawn = rest.without(drawn) * np.sqrt(rest.total / max(rest.dof, 1))
+    white = scores_of(rest, moving, drawn)
     score, chance = largest(white)
     order = np.argsort(-score).tolist()
     loud = sorted([i for i in order if chance[i] < AUDIBLE][:ASKED] or order[:1])
     signs = np.repeat(rng.choice((-1.0, 1.0), (len(rest.group), DRAWS)), rest.width, axis=0)
     flipped = rest.without(signs * rest.even()[:, None])
     _, by_signs = largest(scores_of(rest, [moving[i] for i in loud], flipped))
-    told = [
+    told = sorted(
         (1.0 if scatter > SCATTERS else float(chance[i]), -float(score[i]), i)
         for i, scatter in zip(loud, by_signs, strict=True)
-    ]
+    )[:SHOWN]
     return tuple(
-        Remains(moving[i].place, moving[i].driver, -minus, p, share_of(rest, moving[i], white[i]))
-        for p, minus, i in sorted(told)[:SHOWN]
+        Remains(moving[i].place, moving[i].driver, -minus, p, share_of(rest, moving[i], drawn))
+        for p, minus, i in told
     )
 
 
@@ -180,19 +181,17 @@ def scaled(rest: Rest, motion: Array) -> Array:
     return np.asarray(weighed[:, size > 0.0] / size[size > 0.0])
 
 
-def share_of(rest: Rest, one: Component, scores: Array) -> float:
+def share_of(rest: Rest, one: Component, drawn: Array) -> float:
     """Share of the rest's square that a component has, by its score beyond chance.
 
-    With z features of variance v, E|z'r|^2 is that by chance plus v |z'z|^2 (MINQUE).  scores:
-    (1 + DRAWS,) its own and those by chance.
+    With z features of variance v the score |z'r|^2 is that by chance plus v |z'z|^2 (MINQUE); by
+    chance, of rows of variance s, it has the mean s tr z'z and the variance 2 s^2 |z'z|^2.
+    drawn: (N, b) rows by chance.
     """
-    motion, feature = scaled(rest, one.motion), one.feature
+    felt = rest.felt(one.motion, np.concatenate([rest.rows[:, None], drawn], axis=1))
+    feature = one.feature
     if len(feature) > 1:
-        told = [float(score_of(way[None], rest.felt(one.motion, rest.rows[:, None]))[0])
-                for way in feature]  # fmt: skip
-        feature = feature[[int(np.argmax(told))]]
-    spread = np.repeat(feature[0].T, rest.width, axis=0)
-    columns = rest.without((spread[:, :, None] * motion[:, None]).reshape(len(motion), -1))
-    gram = columns.T @ columns if columns.shape[1] < len(columns) else columns @ columns.T
-    variance = float(scores[0] - scores[1:].mean()) / max(float((gram**2).sum()), 1e-300)
-    return max(variance, 0.0) * float(np.trace(gram)) / max(rest.total, 1e-300)
+        feature = feature[[int(np.argmax([score_of(w[None], felt[..., :1])[0] for w in feature]))]]
+    score, *chance = score_of(feature, felt).tolist()
+    mean, spread = float(np.mean(chance)), float(np.var(chance))
+    return max(2.0 * (score - mean) * mean / max(spread * rest.dof, 1e-300), 0.0)
