@@ -64,6 +64,10 @@ def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
     text = VERDICTS[found.verdict]
     if found.verdict != "unknown":
         return text
+    carrying = [f for f in causes if not f.share < SMALL]
+    if carrying:
+        names = ", ".join(f"{f.term.effect} {f.at}" for f in carrying)
+        text = f"Verdict: unknown beside {names}."
     if found.structure_in in (ABOVE_NOISE, ONLY_MINOR):
         said = found.structure_in[:1].upper() + found.structure_in[1:]
         joints = "" if found.floor.source == REPEATS else ", and what sound joints add"

@@ -182,6 +182,8 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
     assert "by chance 1e-07, below 0.005 is no accident" in told.headline()
+    assert told.headline().startswith("Verdict: unknown beside gear_error at joint 3, joint_")
+    assert replace(told, findings=()).headline().startswith("Verdict: unknown. What geometry")
     assert "0.005 is rare enough" in told.effects_table().title
     assert "less than the power 25 tells apart" in told.rival_table().title
     assert " p = " not in told.headline()
