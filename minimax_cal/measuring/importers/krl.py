@@ -15,7 +15,7 @@ from minimax_cal.measuring.importers.sheet import POINT, Sheet
 TITLE = "KRL joint targets"
 ASIDE = re.compile(r'"[^"\r\n]*"|;[^\r\n]*')  # strings and comments
 TARGET = re.compile(
-    r"(?:(\w+)\s*=\s*)?\{\s*(?:E6AXIS\s*:|AXIS\s*:)?\s*(A1\s+[^{}]*)\}", re.IGNORECASE
+    r"(?:\b(\w++)\s*+=\s*+)?\{\s*+(?:(?:E6AXIS|AXIS)\s*+:)?\s*+(A1\s[^{}]*+)\}", re.IGNORECASE
 )
 AXIS = re.compile(r"\b([AE])(\d)\s+([^\s,{}]+)", re.IGNORECASE)
 

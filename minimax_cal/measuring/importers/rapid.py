@@ -15,7 +15,7 @@ from minimax_cal.measuring.importers.sheet import POINT, Sheet
 TITLE = "RAPID jointtargets"
 ASIDE = re.compile(r'"[^"\r\n]*"|![^\r\n]*')  # strings and comments
 DECLARED = re.compile(r"\bjointtarget\s+(\w+)", re.IGNORECASE)
-VALUES = re.compile(r"[\[{]\s*([^\[\]{}]+?)\s*[\]}]")
+VALUES = re.compile(r"[\[{]\s*+([^\[\]{}]++)[\]}]")
 ROBOT_AXES = 6
 UNUSED = 9e9  # how RAPID writes an external axis that is not there
 
@@ -36,7 +36,7 @@ def read(sheet: Sheet, told: Told) -> Reading:
         line = bare.count("\n", 0, here.start()) + 1
         body = bare[here.end() : after.start() if after else len(bare)]
         values = VALUES.search(body.split(";")[0])
-        cells = [c.strip() for c in values[1].strip(" ,").split(",")] if values else []
+        cells = [c.strip() for c in values[1].strip().strip(" ,").split(",")] if values else []
         where = f"{sheet.path}:{line}: jointtarget {here[1]}"
         if len(cells) < 2:
             raise DataError(f"{where} has no joint values; write it as [[0,0,0,0,30,0],[9E9,...]]")
