@@ -194,4 +194,4 @@ def share_of(rest: Rest, one: Component, drawn: Array) -> float:
         feature = feature[[int(np.argmax([score_of(w[None], felt[..., :1])[0] for w in feature]))]]
     score, *chance = score_of(feature, felt).tolist()
     mean, spread = float(np.mean(chance)), float(np.var(chance))
-    return max(2.0 * (score - mean) * mean / max(spread * rest.dof, 1e-300), 0.0)
+    return float(max(2.0 * (score - mean) * mean / max(spread * rest.dof, 1e-300), 0.0))
