@@ -128,6 +128,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.simulator_gap",
         "A simulated arm in MuJoCo: published gains, then corrected step by step, against the fit",
     ),
+    "motion_real": (
+        "experiments.motion_real",
+        "Torques along trajectories, judged by runs that no fit saw: a real arm, a simulated one",
+    ),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

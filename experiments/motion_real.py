@@ -1,0 +1,195 @@
+"""What torques along trajectories tell of a real arm and a simulated one, on runs that no fit saw.
+
+    python -m experiments.motion_real [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
+
+Each run is left out in turn: the others are diagnosed, and the model is judged on that run at every
+step, beside what the diagnosis claims for runs that it left out itself.  The real arm is a UR10e
+whose motor currents were logged, where its logs are on this machine; the simulated one has friction
+in proportion to the load at joint 2 and a rotor inertia at joint 3 that its file does not know.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import sweep
+from experiments.real import SHARED, here
+from experiments.sweep import Study, study_options
+from minimax_cal.dynamics.given import runs_of
+from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
+from minimax_cal.dynamics.run import Run
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.robots.robot import Robot, load_robot, robot_from_dict
+
+REAL, SIMULATED = "ur10e_torque", "simulated"
+ARMS = {REAL: "UR10e, motor currents", SIMULATED: "simulated, three joints"}
+DRIVE_GAIN = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)  # of the UR10e, from the literature [N m/A]
+RATIO = 101.0  # of its gears
+RUNS, SECONDS, RATE = 5, 20.0, 100.0  # of the simulated arm: how many, how long [s], [Hz]
+NOISE = 0.1  # of its torques [N m]
+COULOMB, VISCOUS = np.array([4.0, 3.0, 1.5]), np.array([3.0, 4.0, 1.0])  # [N m], [N m s/rad]
+LOAD_FRICTION, ARMATURE = 0.07, 0.4  # at joint 2, share of the load; at joint 3 [kg m^2]
+ACROSS = 0.06  # side of the links of the simulated arm [m]
+
+
+@dataclass(frozen=True)
+class Left:
+    """An arm and the run of it that is left out."""
+
+    arm: str
+    run: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the others say, and what they reach on the run that was left out.
+
+    steps: names of the budget.  claimed, reached: RMS torque (s, n) of moving rows, whole: of all
+    rows that the run has.  confirmed: effects with their places.
+    """
+
+    name: str
+    unit: str
+    steps: tuple[str, ...]
+    claimed: Array
+    reached: Array
+    whole: Array
+    confirmed: tuple[str, ...]
+    unexplained: tuple[str, ...]
+
+
+def run(left: Left) -> Told:
+    """Diagnose all runs but one, and judge the model on that."""
+    robot, runs = logs_of(left.arm, left.seed)
+    rest = [one for i, one in enumerate(runs) if i != left.run]
+    gain, ratio = (DRIVE_GAIN, RATIO) if left.arm == REAL else (None, None)
+    found = mc.diagnose_motion(robot, rest, drive_gain=gain, ratio=ratio)
+    seen = mc.evaluate_motion(found, [runs[left.run]])
+    names = tuple(step.name for step in seen.steps)
+    budget = {step.name: step.holdout_rms_moving for step in found.budget}
+    return Told(
+        name=runs[left.run].name,
+        unit=found.unit,
+        steps=names,
+        claimed=np.array([budget[name] for name in names]),
+        reached=np.array([step.rms_moving for step in seen.steps]),
+        whole=np.array([step.rms for step in seen.steps]),
+        confirmed=tuple(sorted({f"{e.effect} {e.place}" for e in found.effects if e.established})),
+        unexplained=tuple(one.place for one in found.unexplained),
+    )
+
+
+def logs_of(arm: str, seed: int) -> tuple[Robot, Sequence[Run]]:
+    """The arm as its file has it, and its runs."""
+    if arm == REAL:
+        robot = load_robot(SHARED / REAL / "ur10e.urdf")
+        return robot, runs_of(robot, robot, sorted((SHARED / REAL).glob("*.csv")))
+    return simulated(seed)
+
+
+def simulated(seed: int) -> tuple[Robot, Sequence[Run]]:
+    """An arm of three joints with usual friction, and two effects that its file does not know."""
+    rng, robot = np.random.default_rng(seed), three_joints()
+    time, out = np.arange(0.0, SECONDS, 1.0 / RATE), list[Run]()
+    for number in range(RUNS):
+        motion = fourier(rng, time, robot.joints, 0.06 + 0.03 * number)
+        torque = inverse_dynamics(robot, motion, inertial_parameters(robot))
+        sense = np.sign(motion.qd)
+        more = sense * COULOMB + motion.qd * VISCOUS
+        more[:, 1] += LOAD_FRICTION * np.abs(torque[:, 1]) * sense[:, 1]
+        more[:, 2] += ARMATURE * motion.qdd[:, 2]
+        torque = torque + more + NOISE * rng.normal(size=torque.shape)
+        name = f"run{number + 1}"
+        out.append(Run(name, f"{name}.csv", time, motion.q, None, None, torque, "N m"))
+    return robot, out
+
+
+def fourier(rng: np.random.Generator, time: Array, joints: int, rate: float) -> Motion:
+    """A finite Fourier series of four harmonics.  rate: of the first [Hz]."""
+    k = np.arange(1.0, 5.0)
+    speed = 2.0 * np.pi * rate * k
+    size = 0.6 * rng.normal(size=(2, len(k), joints)) / k[:, None]
+    sin, cos = np.sin(np.outer(time, speed)), np.cos(np.outer(time, speed))
+    a, b = size
+    w = speed[:, None]
+    return Motion(sin @ a + cos @ b, cos @ (w * a) - sin @ (w * b),
+                  -(sin @ (w**2 * a) + cos @ (w**2 * b)))  # fmt: skip
+
+
+def three_joints() -> Robot:
+    """A vertical axis and two parallel ones, with links of steel bars."""
+    half, joints = np.pi / 2.0, []
+    for a, d, alpha, mass in ((0.0, 0.4, half, 8.0), (0.5, 0.0, 0.0, 6.0), (0.4, 0.1, half, 3.0)):
+        length = max(a, d)
+        about = mass * (length**2 + ACROSS**2) / 12.0
+        joints.append({
+            "a": a, "d": d, "theta": 0.0, "alpha": alpha, "mass_kg": mass,
+            "com_mm": [-500.0 * a, -500.0 * d if d > a else 0.0, 20.0],
+            "inertia": [mass * ACROSS**2 / 6.0, 0.0, 0.0, about, 0.0, about],
+        })  # fmt: skip
+    units = {"length": "m", "angle": "rad"}
+    return robot_from_dict({"name": "three joints", "units": units, "joints": joints})
+
+
+# ---- tables --------------------------------------------------------------------------------------
+
+
+def steps_table(arm: str, told: Sequence[Told]) -> Table:
+    """RMS torque on the runs left out, by the steps that every diagnosis has, and at the end."""
+    shared = [name for name in told[0].steps if all(name in one.steps for one in told)]
+    joints = [f"J{j + 1}" for j in range(told[0].reached.shape[1])]
+    rows: list[tuple[Cell, ...]] = []
+    for name in shared:
+        each = np.array([one.reached[one.steps.index(name)] for one in told])
+        rows.append((name, *np.sqrt(np.mean(each**2, axis=0)).tolist()))
+    last = np.array([one.reached[-1] for one in told])
+    whole = np.array([one.whole[-1] for one in told])
+    claimed = np.array([one.claimed[-1] for one in told])
+    rows += [
+        ("all effects", *np.sqrt(np.mean(last**2, axis=0)).tolist()),
+        ("all effects, with rows at rest", *np.sqrt(np.mean(whole**2, axis=0)).tolist()),
+        ("claimed over reached", *np.median(claimed / last, axis=0).tolist()),
+    ]
+    title = f"{ARMS[arm]}: RMS torque [{told[0].unit}] on each run left out, {len(told)} runs"
+    return Table(title, ("step", *joints), tuple(rows), ("", *[".3g"] * len(joints)))
+
+
+def names_table(arm: str, told: Sequence[Told]) -> Table:
+    """How often each effect is confirmed."""
+    counts = Counter(name for one in told for name in one.confirmed)
+    rows = tuple((name, count, len(told)) for name, count in counts.most_common())
+    return Table(f"{ARMS[arm]}: effects confirmed", ("effect", "runs left out", "of"), rows,
+                 ("", "d", "d"))  # fmt: skip
+
+
+@click.command()
+@study_options("motion_real")
+def main(study: Study) -> None:
+    """Torques along trajectories, judged by runs that no fit saw."""
+    arms = [arm for arm in ARMS if arm == SIMULATED or here(arm)]
+    if REAL not in arms:
+        click.echo(f"{REAL}: its logs are not on this machine; only the simulated arm", err=True)
+    tables, content = list[Table](), dict[str, object]()
+    for arm in arms[-1:] if study.quick else arms:
+        count = RUNS if arm == SIMULATED else len(logs_of(arm, study.seed)[1])
+        jobs = [Left(arm, i, study.seed) for i in range(2 if study.quick else count)]
+        told = study.sweep(run, jobs, "runs left out")
+        tables += [steps_table(arm, told), names_table(arm, told)]
+        content[arm] = [
+            {"run": one.name, "unit": one.unit, "rms_moving": one.reached[-1].tolist(),
+             "rms": one.whole[-1].tolist(), "claimed": one.claimed[-1].tolist(),
+             "confirmed": list(one.confirmed)} for one in told
+        ]  # fmt: skip
+    study.save(tables, content)
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)
