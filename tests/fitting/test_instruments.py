@@ -241,7 +241,7 @@ def test_an_arm_with_a_slide() -> None:
 # ---- the start -------------------------------------------------------------------------------
 
 
-SEEDS = (0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8)))
+SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8)))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -370,6 +370,7 @@ def test_points_that_stand_out_are_named() -> None:
     assert any("line 18 wire3" in notice for notice in fit.notices)
 
 
+@pytest.mark.slow  # its fit goes to the limit of its steps
 def test_another_robot_is_doubted() -> None:
     seen = SIMULATORS["wires_3"](Arm.of("irb2600", 0, 0.0), np.random.default_rng(5), 45, 0.0)
     fit = relative("irb120", seen.data)

@@ -91,6 +91,7 @@ def test_joints_that_cannot_be_are_refused(cell: str, tmp_path: Path) -> None:
             read(path)
 
 
+@pytest.mark.slow
 def test_positions_that_are_told_badly_are_told_in_numbers(tmp_path: Path) -> None:
     """A variance that rounding made negative was a warning, and "good to nan mm"."""
     robot = mc.load_robot("irb120")

@@ -197,7 +197,7 @@ def test_every_option_of_every_command_is_among_the_cases() -> None:
             if isinstance(part, click.Option) and "--pdf" not in part.opts:
                 assert (name, max(part.opts, key=len)) in given
     assert len(set(lines)) == len(lines)
-    some = range(0, len(lines), len(lines) // 20)
+    some = range(0, len(lines), len(lines) // 10)
     assert bad(list(outcomes(EACH, some))) == []
 
 

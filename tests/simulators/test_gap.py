@@ -1,7 +1,7 @@
 """The gap in a simulator: rung by rung what the fit says, and the corrected file keeps it."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,14 @@ KEYS = {"name", "holdout_rms_mm", "holdout_max_mm"}
 
 
 @pytest.fixture(scope="module")
+def few_moves() -> Iterator[None]:
+    """Two dozen training poses place base and targets: every pose is a move of seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "TRAINING", 24)
+        yield
+
+
+@pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A published-like model, poses that its real twin took, and a fit of them."""
     folder = tmp_path_factory.mktemp("arm")
@@ -48,7 +56,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def gap(arm: Path) -> SimulatorGap:
+def gap(arm: Path, few_moves: None) -> SimulatorGap:
     return mc.simulator_gap(
         arm / "arm.xml", arm / "poses.csv", fit=arm / "fit.json", write=arm / "corrected.xml"
     )
@@ -141,6 +149,7 @@ def test_models_that_do_not_fit_are_refused(
     assert "moves otherwise than the nominal robot" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # the quick studies run it besides
 def test_the_study_in_its_quick_form() -> None:
     result = study.run(study.Trial("ur10", 48, 0))
     for rung in result.gap.rungs[2:]:
@@ -172,8 +181,9 @@ def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_is_not_used(
-    stiffening: Path,
+    stiffening: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(ladder, "TRAINING", 100)  # what is left is much more than noise
     written = stiffening / "corrected.xml"
     ways = {"data": stiffening / "poses.csv", "fit": stiffening / "fit.json"}
     gap = mc.simulator_gap(stiffening / "arm.xml", **ways, write=written)
@@ -215,6 +225,7 @@ def driven(path: Path, fit: mc.Fit, asked: Callable[[np.ndarray], np.ndarray]) -
 def test_what_makes_the_simulator_worse_is_not_written(
     stiffening: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(ladder, "TRAINING", 24)
     monkeypatch.setattr(ladder, "WORSE", -0.9)  # no rung is so much better
     monkeypatch.setattr(ladder, "AGREES_MM", -1.0)
     gap = mc.simulator_gap(
