@@ -4,13 +4,14 @@
 
 A session is cut in halves, by time and by the range of a joint; each half is calibrated by itself.
 `compare` of both, and `check` of each half by the poses of the other, should name nothing: whatever
-they name is a false alarm.  Real arms where their measurements are on this machine, and simulated
-ones whose model lacks what real ones lack: joints that give way under gravity, gears that err once
-and twice a turn, lengths and zeros that drift.  Of the simulated ones the zero of a joint is also
-shifted in the second half, by so much that its noncentrality is `LAMBDA`: its square over the
-variance with which least squares tells it beside moves of base, reflectors and links.  That
-variance counts noise and lack of fit, the lack of fit as it is drawn, alike at poses that are
-alike; or, which is less, as if it were so much more noise.
+they name is a false alarm.  So should one fit, and one diagnosis, of both halves as two sessions of
+which the second was measured from elsewhere.  Real arms where their measurements are on this
+machine, and simulated ones whose model lacks what real ones lack: joints that give way under
+gravity, gears that err once and twice a turn, lengths and zeros that drift.  Of the simulated ones
+the zero of a joint is also shifted in the second half, by so much that its noncentrality is
+`LAMBDA`: its square over the variance with which least squares tells it beside moves of base,
+reflectors and links.  That variance counts noise and lack of fit, the lack of fit as it is drawn,
+alike at poses that are alike; or, which is less, as if it were so much more noise.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from dataclasses import dataclass, replace
 
 import click
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from experiments import sweep
 from experiments.real import here, real
 from experiments.sweep import Study, study_options
+from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
@@ -38,6 +41,7 @@ from minimax_cal.judging.watching.comparison import compare
 from minimax_cal.judging.watching.health import check
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.changes import ENCODER_ZERO
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
 from minimax_cal.robots.robot import load_robot
@@ -56,6 +60,9 @@ SMALL_STEP = 1e-4  # share of all lengths, over which growth is linear
 DRIFT = 3e-5  # usual drift of a joint's zero during a session [rad]
 
 
+COMMANDS = {  # and where what they name is kept
+    "compare": "compared", "check": "checked", "calibrate": "fitted", "diagnose": "diagnosed",
+}  # fmt: skip
 NOT_MOVED, DRAWN, AS_NOISE = "", "as drawn", "as noise"  # how lack of fit counts
 
 
@@ -78,13 +85,16 @@ class Job:
 
 @dataclass(frozen=True)
 class Found:
-    """What was named: by `compare`, and by `check`, which may not be possible.
+    """What was named: by `compare`, and by `check`, which may not be possible; by one fit, and one
+    diagnosis, of both halves as sessions.
 
     joint: that was moved, as J3; shift: by how much [mrad].
     """
 
     compared: tuple[str, ...] | None
     checked: tuple[str, ...] | None
+    fitted: tuple[str, ...] | None = None
+    diagnosed: tuple[str, ...] | None = None
     joint: str = ""
     shift: float = 0.0
 
@@ -217,23 +227,63 @@ def session(job: Job) -> tuple[object, Measurements, Array, str, float]:
     return load_robot(job.arm), *simulated(job)
 
 
+def as_sessions(data: Measurements, first: Array, seed: int) -> Measurements:
+    """The halves as two sessions, the second measured from elsewhere."""
+    rng = np.random.default_rng([seed, 11])
+    turn, away = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    y = np.where(first[:, None, None], data.y, data.y @ turn.T + away)
+    label = np.where(first, "first", "second")
+    return replace(data.with_y(y), columns={**data.columns, "session": label})
+
+
+def place(term: str) -> str:
+    """J3 of encoder_zero:J3; the whole name of what is no joint's."""
+    effect, _, at = term.partition(":")
+    return at if effect == ENCODER_ZERO.name else term
+
+
+def in_one_fit(robot: object, both: Measurements) -> tuple[str, ...] | None:
+    """What one fit of two sessions says has moved of arm and reflectors."""
+    try:
+        fit = calibrate(robot, both, "sum")  # type: ignore[arg-type]
+    except CalibrationError:
+        return None
+    labels = [f"{one.effect}:{one.place}" for one in fit.moved if one.text]
+    return tuple(dict.fromkeys(map(place, labels)))
+
+
+def in_one_diagnosis(robot: object, both: Measurements) -> tuple[str, ...] | None:
+    """What a diagnosis of two sessions has confirmed of what moved."""
+    try:
+        found = diagnose(robot, both, quick=True)  # type: ignore[arg-type]
+    except CalibrationError:
+        return None
+    named = [
+        place(one.term.label)
+        for one in found.findings
+        if one.established
+        and (one.term.effect == ENCODER_ZERO.name or "session" in one.term.choice)
+    ]
+    return tuple(dict.fromkeys(named))
+
+
 def run(job: Job) -> Found:
-    """Both halves calibrated, compared, and the first checked by the second."""
+    """Both halves calibrated, compared, the first checked by the second, and both in one fit."""
     warnings.simplefilter("ignore", CalibrationWarning)
     robot, data, first, joint, shift = session(job)
     if job.flip:
         first = ~first
     early, late = data.take(first), data.take(~first)
+    compared = checked = None
     try:
         a, b = (calibrate(robot, half, "sum") for half in (early, late))  # type: ignore[arg-type]
         compared = tuple(dict.fromkeys(m.joint for m in compare(a, b).changed))
-    except CalibrationError:
-        return Found(None, None)  # half a session does not calibrate the arm
-    try:
         checked = tuple(dict.fromkeys(m.joint for m in check(a, late, "rms 0.5").moved))
     except CalibrationError:
-        checked = None
-    return Found(compared, checked, joint, 1e3 * shift)
+        pass  # half a session does not calibrate the arm, or cannot be checked
+    both = as_sessions(data, first, job.seed)
+    fitted, diagnosed = in_one_fit(robot, both), in_one_diagnosis(robot, both)
+    return Found(compared, checked, fitted, diagnosed, joint, 1e3 * shift)
 
 
 def real_jobs(seed: int) -> Iterator[Job]:
@@ -280,7 +330,7 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
     )
     for kind, belongs in kinds:
         for cut in ("time", "range"):
-            for command, name in (("compare", "compared"), ("check", "checked")):
+            for command, name in COMMANDS.items():
                 some = [
                     (found.joint, getattr(found, name))
                     for job, found in pairs

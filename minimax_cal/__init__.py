@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.judging.watching.comparison import compare
     from minimax_cal.judging.watching.health import check
     from minimax_cal.measuring import datasets
+    from minimax_cal.measuring.campaigns import read_campaigns
     from minimax_cal.measuring.importers import import_files
     from minimax_cal.measuring.measurements import (
         Measurements,
@@ -106,6 +107,7 @@ __all__ = [
     "minimize_max",
     "plan",
     "plan_motion",
+    "read_campaigns",
     "read_measurements",
     "read_runs",
     "register",
@@ -130,6 +132,7 @@ MODULES = {  # name: where it is defined
     "Measurements": "measuring.measurements",
     "measurements": "measuring.measurements",
     "read_measurements": "measuring.measurements",
+    "read_campaigns": "measuring.campaigns",
     "write_measurements": "measuring.measurements",
     "import_files": "measuring.importers",
     "datasets": "measuring.datasets",  # the module itself

@@ -9,7 +9,7 @@ import click
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
-    DATA,
+    CAMPAIGNS,
     ROBOT,
     ROWS,
     InGroups,
@@ -33,7 +33,7 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 @click.command(name="calibrate", cls=InGroups)
 @ROBOT
-@DATA
+@CAMPAIGNS
 @options_from(Options)
 @ROWS
 @plain_option(
@@ -53,7 +53,7 @@ BRIEF = 1000  # poses that one fit needs no compiled kernels for
 @result_options("the result (JSON)", figure="the errors before and after")
 def calibrate_command(
     robot: str,
-    data: Path,
+    data: tuple[Path, ...],
     replicates: int | None,
     in_rows: bool,
     without: bool,

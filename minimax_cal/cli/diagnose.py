@@ -9,7 +9,7 @@ import click
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
-    DATA,
+    CAMPAIGNS,
     JSON,
     ROBOT,
     ROWS,
@@ -33,7 +33,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
 
 @click.command(name="diagnose", cls=InGroups)
 @ROBOT
-@DATA
+@CAMPAIGNS
 @options_from(Options, "holdout", "seed", "holdout_by", "instrument")
 @options_of(
     diagnose,
@@ -51,7 +51,9 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
 )
 @ROWS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")
-def diagnose_command(robot: str, data: Path, in_rows: bool, to: Output, **chosen: Any) -> int:
+def diagnose_command(
+    robot: str, data: tuple[Path, ...], in_rows: bool, to: Output, **chosen: Any
+) -> int:
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
     with to.stages() as progress:
         found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
@@ -75,7 +77,7 @@ def effects_command(robot: str | None, data: Path | None, in_rows: bool, as_json
     if robot is not None:
         if data is None:
             raise OptionError("effects needs both ROBOT and DATA, or neither")
-        measured = with_history(options.measured(data, in_rows))
+        measured = with_history(options.measured([data], in_rows))
         fit = calibrate(robot, measured, objective="sum", holdout=0.0)
         scene = fit.cell.scene(measured)
     entries = effects_list(scene)

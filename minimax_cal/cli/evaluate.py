@@ -47,9 +47,14 @@ def evaluate_logs(motion: Path, logs: tuple[Path, ...], to: Output) -> int:
 @DATA
 @click.argument("more", type=PATH, nargs=-1)
 @RUNG
+@click.option(
+    "--new-frame",
+    is_flag=True,
+    help="The instrument or the base stands elsewhere than in FIT: fit its frame, six numbers.",
+)
 @result_options("the accuracy (JSON)")
 def evaluate_command(
-    fit: Path, data: Path, more: tuple[Path, ...], rung: int | None, to: Output
+    fit: Path, data: Path, more: tuple[Path, ...], rung: int | None, new_frame: bool, to: Output
 ) -> int:
     """Accuracy of a saved calibration FIT on the measurements in DATA; nothing is fitted.
 
@@ -62,7 +67,7 @@ def evaluate_command(
         raise OptionError(f"{more[0]}: evaluate takes one file of measurements; join them first")
     measured = read_measurements(data)
     opened = open_result(fit, rung)
-    cell, _, said = opened.placed_by(measured)
+    cell, _, said = opened.placed_by(measured, new_frame)
     error = cell.error(measured)
     found = accuracy(error)
     count, mixed = training_poses(measured, opened, error)
@@ -70,7 +75,8 @@ def evaluate_command(
     if found.rms_mm > 1e3 * POOR_FIT * cell.robot.reach():
         doubts.append(
             f"{data}: the fit misses by {found.rms_mm:.3g} mm: check that data and fit belong to "
-            "the same robot, measurement frame, units and order of targets"
+            "the same robot, measurement frame, units and order of targets; if it was measured "
+            "from elsewhere, --new-frame fits where"
         )
     away = outside(opened.spans, measured.q)
     if away.any():

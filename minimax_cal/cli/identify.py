@@ -33,7 +33,7 @@ def identify_command(data: Path, joints: str, name: str, to: Output) -> int:
     Best with sweeps: rows in which one joint alone moves, five or more over 20 degrees, of each.
     """
     with work(brief=True), to.stages() as progress:
-        found = identify_arm(options.measured(data, False), joints, name, progress)
+        found = identify_arm(options.measured([data], False), joints, name, progress)
     to.notice(*(notice for notice in found.fit.notices if notice != found.fit.reason))
     if to.deliver(lambda: json_text(found.robot.to_dict()), found.status):
         options.show(links_table(found.robot), headline=found.headline())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
@@ -41,6 +41,7 @@ Decorator = Callable[[Command], Command]
 PATH = click.Path(path_type=Path)
 ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
+CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, required=True, metavar="DATA...")
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
 ROWS = click.option(
@@ -277,12 +278,15 @@ def with_output(command: Command) -> Command:
     return handed
 
 
-def measured(path: Path, in_rows: bool) -> Measurements:
-    """The measurements of a file; in_rows: visited row by row, where it tells no order."""
-    from minimax_cal.measuring.history import ordered
-    from minimax_cal.measuring.measurements import read_measurements
+def measured(paths: Sequence[Path], in_rows: bool) -> Measurements:
+    """The measurements of a file, or of several as sessions.
 
-    data = read_measurements(path)
+    in_rows: visited row by row, where they tell no order.
+    """
+    from minimax_cal.measuring.campaigns import read_campaigns
+    from minimax_cal.measuring.history import ordered
+
+    data = read_campaigns(paths)
     return data.in_visit_order() if in_rows and not ordered(data) else data
 
 

@@ -21,7 +21,7 @@ from minimax_cal.ground.files import finite
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell
-from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.reach import flange_terms
 from minimax_cal.solvers.status import Status
 
@@ -238,13 +238,19 @@ def delivered(
     return replace(made, cell=placed, nominal=fit.nominal, figures=figures, fit=fit)
 
 
+def held_by(to: str, cell: Cell) -> tuple[Term, ...]:
+    """The effects of a cell that a deliverable holds, with those that are past: it is as of now."""
+    own = DELIVERABLES[to](cell)
+    return tuple(t for t in cell.effects.causes if t in own or EFFECTS[t.effect].of_past)
+
+
 def carried(known: Opened, to: str, clock: float | None) -> tuple[Term, ...]:
     """The effects of a result that a deliverable holds.
 
     Those of one session end with it: its time, where its nests, its instrument and its frame were.
     """
     cell = known.cell
-    held = DELIVERABLES[to](cell)
+    held = held_by(to, cell)
     timed = clock is not None and to == COMPENSATED
     return tuple(
         term
@@ -257,7 +263,7 @@ def carried(known: Opened, to: str, clock: float | None) -> tuple[Term, ...]:
 
 def as_it_is(made: Delivered, known: Opened) -> Delivered:
     """What a result holds that cannot be fitted again: its own geometry, or its arm whole."""
-    held = DELIVERABLES[made.format](made.cell)
+    held = held_by(made.format, made.cell)
     lost = tuple(term for term in made.cell.effects.causes if term not in held)
     why = f"{known.source} holds no measurements"
     if known.data.poses:

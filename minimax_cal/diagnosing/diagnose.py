@@ -36,6 +36,7 @@ from minimax_cal.diagnosing.gap import (
 )
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.last_question import answered, known_noise
+from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
 from minimax_cal.diagnosing.result import Diagnosis, Step
@@ -59,6 +60,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.stages import name_rung
 from minimax_cal.measuring import checks
+from minimax_cal.measuring.campaigns import measured
 from minimax_cal.measuring.faults import (
     Fault,
     find_faults,
@@ -88,7 +90,7 @@ EARLIEST = 5  # visits before a jump that a study takes for possible, and after 
 
 def diagnose(
     robot: Robot | str | Path,
-    data: Measurements | str | Path,
+    data: Measurements | str | Path | Sequence[str | Path],
     *,
     seed: int = 0,
     holdout: float = 0.2,
@@ -100,19 +102,19 @@ def diagnose(
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
-    robot, data: loaded, or a name or path.  seed, holdout: of the poses kept out of the fit, and
-    their share; holdout_by: a column (session, group ...) or region, whose poses are held out
-    together.  instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say.
-    exclude: effects that are not to be considered.  quick: leave no parts of the poses
-    out in turn, so that there is no claim outside the measured poses.  progress: called with a
-    word on each stage.  Lengths of the result are in m, in mm where a name says so.  Raises
-    CalibrationError for wrong input.
+    robot, data: loaded, or a name or path; data also as a list of paths, the campaigns of one arm,
+    each a session. seed, holdout: of the poses kept out of the fit, and their share;
+    holdout_by: a column (session, group ...) or region, whose poses are held out together.
+    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say. exclude: effects
+    that are not to be considered. quick: leave no parts of the poses out in turn, so that there
+    is no claim outside the measured poses. progress: called with a word on each stage. Lengths
+    of the result are in m, in mm where a name says so. Raises CalibrationError for wrong input.
 
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
     """
     began = time.perf_counter()
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    given = data if isinstance(data, Measurements) else read_measurements(data)
+    given = measured(data)
     for name in exclude:
         if name not in EFFECTS:
             raise OptionError(f"no effect {name!r} to leave out; choose {', '.join(EFFECTS)}")
@@ -205,6 +207,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
     every = ladder.last.cell.placed(clean.given)
     told = (*told, *contradictions(every, ladder.last.cell.error(every)))
+    told = (*told, *session_notices(study, effects))
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,

@@ -131,7 +131,8 @@ class Site:
             weight=self.plan.weight,
         )
         if free := of_sessions(self.plan.data.frames):
-            model = replace(model, fields=fields_of(free, self.whole))
+            fields = fields_of(free, self.whole)
+            model = replace(model, fields=fields, moved=np.zeros((0, 0, 0)))
         return self.turned.of(np.moveaxis(model.jacobian(self.state), (3, 1), (0, 3)))
 
     def lines(self, poses: slice) -> slice:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from minimax_cal.fitting import identify
+from minimax_cal.fitting.between_sessions import between_sessions
 from minimax_cal.fitting.checks import (
     LEAST_SCALE,
     POOR_FIT,
@@ -68,14 +69,14 @@ from minimax_cal.fitting.start import EVERYWHERE
 from minimax_cal.fitting.stations import jumps, stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationWarning
-from minimax_cal.measuring import checks, faults
+from minimax_cal.measuring import campaigns, checks, faults
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL
 from minimax_cal.measuring.faults.declared import noise
 from minimax_cal.measuring.grouping import groups, mislabelled, split, with_groups
 from minimax_cal.measuring.history import time_notices, with_history
 from minimax_cal.measuring.instrument import with_instrument
-from minimax_cal.measuring.measurements import Measurements, measurements, read_measurements
+from minimax_cal.measuring.measurements import Measurements, measurements
 from minimax_cal.measuring.set_aside import set_aside
 from minimax_cal.measuring.stations import Frames, seen_from
 from minimax_cal.modelling.effects.table import Term
@@ -109,7 +110,7 @@ class Parts:
 
 def calibrate(
     robot: Robot | str | Path,
-    data: Measurements | str | Path | tuple[ArrayLike, ArrayLike],
+    data: Measurements | str | Path | Sequence[str | Path] | tuple[ArrayLike, ArrayLike],
     objective: str = "minimax",
     qp: str | QpFunction = "daqp",
     *,
@@ -138,22 +139,23 @@ def calibrate(
     """Calibrate a robot from measurements.
 
     robot, data: loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
-    3).  objective: sum, minimax (the worst target), point (the worst point), pose, or smr:K.  qp:
-    backend of the minimax QPs, or a function from Problem to a verified Solution.  holdout: share
-    of the poses kept out of the fit; seed: of that choice; holdout_by: a column (session, group
-    ...) or region, whose poses are held out together.  instrument: u95 of a coordinate, as
-    10um+2.5um/m, where the data do not say.  cv: judge every pose by a fit without it, which is
-    done anyway where fewer than 20 poses are held out.  fix, free: parameters as ``beta*``, a list
-    or a text with commas.  only: offsets, for the joints' zero positions alone.
-    priors: sigma of a parameter's deviation from nominal, by name [m, rad],
-    or a text as 0.5mm.  method: of the least squares.  lever: what a radian counts as in the pose
-    objective [m], the targets' own unless given.  hessian: gauss-newton or bfgs.  distance: form of
-    the distance constraints, two-sided, squared or off; distance_tolerance: theirs [m], as measured
-    unless given. resolution: relative singular value that counts as not measured.  effects: beyond
-    geometry, as joint_compliance:J2, or a diagnosis (or its file), whose established effects are
-    taken.  loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
-    allow_large_changes: accept links that differ from the drawing by more than 5 % of the reach, 5
-    degrees (alpha, beta) or 30 degrees (theta).  simulated: the points may be exact.
+    3), or a list of paths: the campaigns of one arm, each a session. objective: sum, minimax
+    (the worst target), point (the worst point), pose, or smr:K. qp: backend of the minimax QPs,
+    or a function from Problem to a verified Solution. holdout: share of the poses kept out of
+    the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
+    poses are held out together. instrument: u95 of a coordinate, as 10um+2.5um/m, where the
+    data do not say. cv: judge every pose by a fit without it, which is done anyway where fewer
+    than 20 poses are held out. fix, free: parameters as ``beta*``, a list or a text with
+    commas. only: offsets, for the joints' zero positions alone. priors: sigma of a parameter's
+    deviation from nominal, by name [m, rad], or a text as 0.5mm. method: of the least squares.
+    lever: what a radian counts as in the pose objective [m], the targets' own unless given.
+    hessian: gauss-newton or bfgs. distance: form of the distance constraints, two-sided,
+    squared or off; distance_tolerance: theirs [m], as measured unless given. resolution:
+    relative singular value that counts as not measured. effects: beyond geometry, as
+    joint_compliance:J2, or a diagnosis (or its file), whose established effects are taken.
+    loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
+    allow_large_changes: accept links that differ from the drawing by more than 5 % of the
+    reach, 5 degrees (alpha, beta) or 30 degrees (theta). simulated: the points may be exact.
     progress: called with a word on each stage. Raises CalibrationError for wrong input; how the
     numbers ended is in the result's `status`.
 
@@ -197,11 +199,13 @@ def calibrate(
     return fit
 
 
-def measured(data: Measurements | str | Path | tuple[ArrayLike, ArrayLike]) -> Measurements:
-    """Measurements as they are, of a file, or of joints (m, n) and points.  Raises DataError."""
-    if isinstance(data, tuple):
+def measured(
+    data: Measurements | str | Path | Sequence[str | Path] | tuple[ArrayLike, ArrayLike],
+) -> Measurements:
+    """Measurements as they are, of files, or of joints (m, n) and points.  Raises DataError."""
+    if isinstance(data, tuple) and not all(isinstance(part, str | Path) for part in data):
         return measurements(*(np.asarray(part, dtype=float) for part in data))
-    return data if isinstance(data, Measurements) else read_measurements(data)
+    return campaigns.measured(data)  # type: ignore[arg-type]
 
 
 def again(fit: Fit, progress: Progress = silent, **changes: object) -> Fit:
@@ -311,6 +315,7 @@ def judged(
         status = Status.FAILED
     elif better and not better.is_better and status in ENDED:
         status, reason = Status.NO_BETTER, no_better(better, suspects)
+    moved = () if wrong else between_sessions(robot, poses.train, solved, cell)
     gone, counted = judged_with(data, held, cell, after, crossed, solved, options)
     alarming = tuple(alarms(robot, poses, solved, before[:, ~held]))
     notices = (
@@ -320,6 +325,7 @@ def judged(
         *checks.outliers(data, np.linalg.norm(after, axis=-1)),
         *contradictions(data, after),
         *(fault.text for fault in faults.session_jumps(data, after)),
+        *(change.sentence for change in moved),
         *alarming,
         *bad_rows(suspects, data.source),
         *unjudged(data, crossed),
@@ -368,6 +374,7 @@ def judged(
         work=work_of(solved),
         error_drawn_crossed=drawn_crossed,
         reason=reason,
+        moved=moved,
     )
     return fit, alarming
 

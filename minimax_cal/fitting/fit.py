@@ -18,6 +18,7 @@ import scipy
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
@@ -348,6 +349,7 @@ class Fit:
     reason: why it failed or is no better than the drawn arm, and what to do; empty where neither.
     set_aside: points that take no part; with_them: how it does where they count, None without any.
     answered: quadratic programs by the backend that answered.  work: what the solvers did.
+    moved: what changed between sessions.
     stated_geometric: `geometric` as the file of the fit holds it.
     """
 
@@ -387,6 +389,7 @@ class Fit:
     stated_geometric: Cell | None = None
     error_drawn_crossed: Array = field(default_factory=NOT_CROSSED.copy)
     reason: str = ""
+    moved: tuple[Change, ...] = ()
 
     def __repr__(self) -> str:
         after, known = self.within.after, sum(p.identifiable for p in self.parameters)

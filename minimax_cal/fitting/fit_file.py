@@ -18,6 +18,7 @@ from pydantic import Field
 
 from minimax_cal.fitting.beyond import Beyond, Fold, Trusted
 from minimax_cal.fitting.certificate import Certificate
+from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED
 from minimax_cal.fitting.fit import (
     Fit,
@@ -207,6 +208,7 @@ class FitPart(Part):
     qp: str = ""
     answered: dict[str, int] = Field(default_factory=dict)
     work: Work = Work()
+    between_sessions: tuple[Change, ...] = ()
     status: Status
     iterations: int = 0
     seconds: Number = math.nan
@@ -249,6 +251,7 @@ def written(fit: Fit, *, poses: bool = True) -> dict[str, Any]:
         "qp": fit.qp,
         "answered": dict(fit.answered),
         "work": vars(fit.work),
+        "between_sessions": [change.to_dict() for change in fit.moved],
         "status": str(fit.status),
         "advice": fit.reason or fit.status.advice,
         "reason": fit.reason,
@@ -453,6 +456,7 @@ def assembled(
         with_them=with_them_of(part.accuracy.holdout_with_them),
         answered=part.answered,
         work=part.work,
+        moved=part.between_sessions,
         error_drawn_crossed=arrays.get("drawn crossed", NOT_CROSSED) if data.poses else NOT_CROSSED,
         reason=part.reason,
     )

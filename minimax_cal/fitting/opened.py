@@ -17,13 +17,15 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.start import fit_base
+from minimax_cal.fitting.stations import LEAST, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
-from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.records import checked, reading
 from minimax_cal.measuring.checks import check_joints
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, spans_of
+from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.cell import Cell, cell_from_dict, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.model import model_of
@@ -108,16 +110,42 @@ class Opened:
         """The training poses."""
         return self.data.take(~self.held)
 
-    def placed_by(self, data: Measurements) -> tuple[Cell, Cell | None, tuple[str, ...]]:
+    def placed_by(
+        self, data: Measurements, new_frame: bool = False
+    ) -> tuple[Cell, Cell | None, tuple[str, ...]]:
         """The arm and the nominal one with base and targets that fit data best; a notice.
 
-        As they are where the result knows its place.  Raises CalibrationError.
+        As they are where the result knows its place.  new_frame: measured from elsewhere, so that
+        base and instrument are placed by the data.  Raises CalibrationError.
         """
+        if self.placed and new_frame:
+            return (
+                in_new_frame(self.cell, data),
+                in_new_frame(self.nominal, data) if self.nominal else None,
+                (f"{data.source}: the frame is placed by these points: six numbers are fitted",),
+            )
         if self.placed:
             return self.cell, self.nominal, ()
         before = place(self.nominal.robot, data) if self.nominal else None
         said = f"{self.source}: knows no base and no targets: both are fitted to {data.source}"
         return place(self.cell.robot, data), before, (said,)
+
+
+def in_new_frame(cell: Cell, data: Measurements) -> Cell:
+    """A cell as an instrument sees it that stands elsewhere; base and targets stay together.
+
+    Raises DataError for several sessions, and for fewer than three points.
+    """
+    data = check_joints(cell.robot, data)
+    if len(np.unique(labels(data))) > 1:
+        raise DataError(f"{data.source}: holds several sessions; evaluate them one by one")
+    alone = replace(cell, sessions=replace(cell.sessions, frames={}))
+    error = np.moveaxis(alone.error(data), 0, 1)
+    here = data.y[data.seen]
+    if len(here) < LEAST:
+        raise DataError(f"{data.source}: {len(here)} points do not place a frame; measure more")
+    there = here - error[data.seen]  # where the calibration's instrument would see them
+    return replace(alone, base=moving(there, here) @ cell.base)
 
 
 def place(robot: Robot, data: Measurements) -> Cell:

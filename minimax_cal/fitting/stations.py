@@ -93,9 +93,13 @@ def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Arra
 
 
 def fitting(data: Measurements, robot: Robot, state: State) -> Array:
-    """(4, 4) what takes points as they are given to where a state has them [Kabsch 1976]."""
+    """(4, 4) what takes points as they are given to where a state has them."""
     there = Cell.of(robot, state, data.target_names).predict(data.q)[data.seen]
-    here = data.y[data.seen]
+    return moving(data.y[data.seen], there)
+
+
+def moving(here: Array, there: Array) -> Array:
+    """(4, 4) what takes points (n, 3) nearest to where others are [Kabsch 1976]."""
     centre, goal = here.mean(axis=0), there.mean(axis=0)
     turn = nearest_rotation((there - goal).T @ (here - centre))
     return transform(turn, goal - turn @ centre)

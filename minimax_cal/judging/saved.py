@@ -44,19 +44,25 @@ class Saved:
     spans: tuple[Span, ...] = ()
 
 
-def evaluate(source: Result, data: Measurements | Path | str, rung: int | None = None) -> Accuracy:
+def evaluate(
+    source: Result,
+    data: Measurements | Path | str,
+    rung: int | None = None,
+    new_frame: bool = False,
+) -> Accuracy:
     """Accuracy of a calibrated arm on new measurements in the same measurement frame.
 
     source: a calibration, its cell, a diagnosis, a relative calibration, or the file of one.  data:
     points, and the columns that effects look at; nothing is fitted to them, but for base and
     targets of a relative calibration, which knows none.  rung: of a diagnosis (0 nominal, 1
-    geometric ...), the last unless given.  Errors of the result are in mm.  Raises
+    geometric ...), the last unless given.  new_frame: the instrument or the base stands elsewhere
+    than in the calibration, so that its frame is fitted.  Errors of the result are in mm.  Raises
     CalibrationError.
 
     >>> print(mc.evaluate(fit, "new_poses.csv").rms_mm)
     """
     data = data if isinstance(data, Measurements) else read_measurements(data)
-    cell, _, _ = open_result(source, rung).placed_by(data)
+    cell, _, _ = open_result(source, rung).placed_by(data, new_frame)
     return accuracy(cell.error(data))
 
 

@@ -80,10 +80,12 @@ def groups(data: Measurements) -> Array:
 
 
 def visits(data: Measurements) -> Array:
-    """(m,) a number for each pose and load: rows that share it are visits that should agree."""
+    """(m,) a number for each pose, load and session: rows that share it are visits that should
+    agree; between sessions something may have moved.
+    """
     group = groups(data)
     load = np.nan_to_num(data.columns.get("payload", np.zeros(data.poses)).astype(float))
-    both = np.stack([group.astype(float), load])
+    both = np.stack([group.astype(float), load, sessions(data).astype(float)])
     return np.asarray(np.unique(both, axis=1, return_inverse=True)[1]).reshape(-1)
 
 

@@ -619,6 +619,23 @@ def test_a_jump_is_the_base_elsewhere_in_each_further_session() -> None:
     assert_allclose(after.shift[0, :, 0], np.broadcast_to(SCENE.column("clock") >= 0.4, (3, 40)))
 
 
+def test_a_zero_is_otherwise_before_the_last_rows() -> None:
+    """The geometry is that of the last session; rows of no known session are as the last ones."""
+    session = np.array(["a", "b", "c", "x"])[np.arange(40) % 4]
+    frames = {name: np.eye(4) for name in "abc"}
+    scene = scene_of(ROBOT, replace(DATA, frames=frames, columns={**DATA.columns,
+                                                                  "session": session}))  # fmt: skip
+    since = columns("encoder_zero", "J3", scene, session=2.0).turn[0]
+    assert_allclose(since[2], np.where(session == "a", -1.0, 0.0), rtol=0, atol=0)
+    assert not np.delete(since, 2, axis=0).any()
+    alone = columns("encoder_zero", "J3", scene, session=2.0, alone=1.0).turn[0, 2]
+    assert_allclose(alone, session == "b", rtol=0, atol=0)
+    moment = columns("encoder_zero", "J3", since=0.4).turn[0, 2]
+    assert_allclose(moment, np.where(SCENE.column("clock") >= 0.4, 0.0, -1.0), rtol=0, atol=0)
+    later = replace(scene, data=replace(scene.data, frames={}))
+    assert not columns("encoder_zero", "J3", later, session=2.0).turn.any()
+
+
 def test_a_nest_moves_in_the_flange_after_its_moment() -> None:
     since = float(SCENE.column("clock")[15])
     move = np.array([1e-3, -2e-3, 5e-4])

@@ -118,6 +118,7 @@ CASES: dict[str, list[float]] = {
     "axis_wobble:J4:turns=2": [2e-4, -3e-4, 4e-4, 1e-4],
     "backlash:all": [2e-4, -1e-4, 3e-4, 2e-4, 4e-4, 5e-4],
     "settling:J3": [1e-3],
+    "encoder_zero:J3:since=0.4": [4e-4],
     "thermal_growth:all:constant=0.5:apart=0": [4e-4],
     "thermal_growth:all:temperature=1:apart=0": [1.2e-5],
     "thermal_growth:all:fast=0.15:slow=inf:apart=0": [4e-4, 2e-4],

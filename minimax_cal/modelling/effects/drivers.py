@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.changes import session_number
 from minimax_cal.modelling.effects.scene import Choice, Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 
@@ -62,6 +63,13 @@ def time_or_warmth(scene: Scene, joint: int, choice: Choice) -> Axis:
     return "time in the session (0 first, 1 last)", scene.column("clock")
 
 
+def session_or_moment(scene: Scene, joint: int, choice: Choice) -> Axis:
+    """The number of the session, or the time where the law looks at a moment of it."""
+    if "session" in choice:
+        return "session", np.minimum(session_number(scene), len(scene.data.frames) + 1.0)
+    return time_or_warmth(scene, joint, choice)
+
+
 def attitude(scene: Scene, joint: int, choice: Choice) -> Axis:
     """How the flange stands to gravity."""
     tilt = np.clip((scene.links.axes[2] * scene.robot.up[:, None]).sum(axis=0), -1.0, 1.0)
@@ -75,5 +83,6 @@ AXES = {
     "approach": last_move,
     "move": last_move,
     "time": time_or_warmth,
+    "session": session_or_moment,
     "attitude": attitude,
 }

@@ -319,7 +319,8 @@ PLAIN: tuple[Choice, ...] = ({},)
 
 MOVED = ("arm", "foot", "frame", "tool", "target", "instrument")
 DRIVERS = (  # "" stands for a joint's own value, whatever else there is
-    "", "angle", "wave", "source", "load", "approach", "move", "time", "attitude", "sight",
+    "", "angle", "wave", "source", "load", "approach", "move", "time", "session", "attitude",
+    "sight",
 )  # fmt: skip
 
 
@@ -344,6 +345,8 @@ class Effect:
     instrument sees it, the tool or reflectors beyond the flange, or only what is read.
     follows: what drives it, one of DRIVERS, by which its curve is drawn; `angle` and `wave` mean
     the joint's own angle and nothing else.
+    of_past: whether it says what was before the last rows alone, so that any file of the geometry
+    holds it.
     linear: whether a constant turn belongs to what drives it, and is geometry.
     against: label and (m,) values of the curve's axis, for a joint and a choice, where DRIVERS has
     none that fits.
@@ -366,6 +369,7 @@ class Effect:
     is_map: bool = False
     moves: str = "arm"
     follows: str = ""
+    of_past: bool = False
     linear: bool = False
     against: Callable[[Scene, int, Choice], tuple[str, Array]] | None = None
 

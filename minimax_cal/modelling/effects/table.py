@@ -13,6 +13,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import plain
 from minimax_cal.measuring.stations import Frames
 from minimax_cal.modelling.effects.bending import BASE_FLEX, LINK_BENDING, TOOL_FLEX
+from minimax_cal.modelling.effects.changes import ENCODER_ZERO
 from minimax_cal.modelling.effects.compliance import (
     CROSS_COMPLIANCE,
     GRAVITY_COMPENSATOR,
@@ -56,6 +57,7 @@ EFFECTS: dict[str, Effect] = {
         AXIS_WOBBLE,
         BACKLASH,
         SETTLING,
+        ENCODER_ZERO,
         THERMAL_GROWTH,
         FRAME_DRIFT,
         SESSION_JUMP,
@@ -115,7 +117,7 @@ class Term:
     @property
     def by_clock(self) -> bool:
         """Whether it follows the time, and not the temperature or the sessions."""
-        told = "temperature" in self.choice or self.frees_frames
+        told = "temperature" in self.choice or "session" in self.choice or self.frees_frames
         return EFFECTS[self.effect].follows == "time" and not told
 
     @property

@@ -8,6 +8,14 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.stations import station
+from minimax_cal.modelling.effects.changes import (
+    can_change,
+    finer_moments,
+    is_after,
+    lacking,
+    later_sessions,
+    moments,
+)
 from minimax_cal.modelling.effects.scene import Choice, Columns, Effect, Scene
 from minimax_cal.robots.kinematics import cross
 
@@ -15,8 +23,6 @@ CONSTANTS = (0.15, 0.5, np.inf)  # of the session; infinite is a straight line
 FINER = np.array([0.5, 0.65, 0.8, 0.9, 1.1, 1.25, 1.5, 2.0])
 TWO = {"fast": 0.15, "slow": np.inf}  # two constants: one settles fast, the other slowly
 ROOM = 20.0  # temperature at which lengths are what they are called [C]
-NEARBY = 24  # moments before one that was chosen, and after it
-STEPS = 12  # moments at which a nest may have moved
 
 
 def course(scene: Scene, choice: Choice) -> Array:
@@ -49,18 +55,10 @@ def courses(scene: Scene, place: str) -> Sequence[Choice]:
 
 def finer(scene: Scene, choice: Choice) -> Sequence[Choice]:
     """Time constants, or moments, near one that was chosen."""
-    if "since" in choice:
-        clock = np.sort(scene.column("clock"))
-        at = int(np.searchsorted(clock, choice["since"]))
-        step = max(1, len(clock) // STEPS)
-        away = np.unique(np.geomspace(1, step, NEARBY).astype(int))  # fine nearby, coarse afar
-        near = at + np.concatenate([-away[::-1], [0], away])
-        near = near[(near >= 3) & (near < len(clock) - 3)]
-        return tuple({**choice, "since": float(t)} for t in clock[near])
+    if "constant" not in choice and "fast" not in choice:
+        return finer_moments(scene, choice)
     if "fast" in choice:
         return tuple({**choice, "fast": float(fast)} for fast in choice["fast"] * FINER)
-    if "constant" not in choice:
-        return ()
     constant = choice["constant"]
     values = (1.0, 1.5, 2.5, 5.0) if np.isinf(constant) else constant * FINER
     return tuple({**choice, "constant": float(value)} for value in values)
@@ -144,38 +142,22 @@ FRAME_DRIFT = Effect(
 
 
 def nest(scene: Scene, place: str, choice: Choice) -> Columns:
-    """One target sits elsewhere on the flange from a moment on."""
+    """One target sits elsewhere on the flange from a session, or a moment, on."""
     target = scene.data.target_names.index(place)
-    after = (scene.column("clock") >= choice["since"]).astype(float)
     shift = np.zeros((3, *scene.points.shape))
-    shift[:, target] = after * scene.links.axes
-    return Columns(("x", "y", "z"), ("m",) * 3, shift=shift, fixed={"since": choice["since"]})
-
-
-def moments(scene: Scene, place: str) -> Sequence[Choice]:
-    """Moments spread over the session, with poses enough on both sides."""
-    clock = np.sort(scene.column("clock"))
-    if len(clock) < 12:
-        return ()
-    at = np.unique(np.linspace(5, len(clock) - 5, STEPS).astype(int))
-    return tuple({"since": float(clock[i])} for i in at)
+    shift[:, target] = is_after(scene, choice) * scene.links.axes
+    return Columns(("x", "y", "z"), ("m",) * 3, shift=shift, fixed=dict(choice))
 
 
 TARGET_SHIFT = Effect(
     "target_shift",
-    "a reflector's nest moved during the session",
-    "the target sits elsewhere after row k",
-    lambda scene: scene.data.target_names if scene.targets > 1 and scene.has("clock") else (),
+    "a reflector's nest moved during the session, or between sessions",
+    "the target sits elsewhere after row k, or from a session on",
+    lambda scene: scene.data.target_names if scene.targets > 1 and can_change(scene) else (),
     nest,
     finer=finer,
-    needs=lambda scene: (
-        "a second target"
-        if scene.targets < 2
-        else ""
-        if scene.has("clock")
-        else "column order or time_s" + scene.untold
-    ),
-    choices=moments,
+    needs=lambda scene: "a second target" if scene.targets < 2 else lacking(scene),
+    choices=lambda scene, place: (*later_sessions(scene), *moments(scene)),
     typical=5e-3,
     moves="target",
     follows="time",
@@ -183,9 +165,10 @@ TARGET_SHIFT = Effect(
 
 
 def plate(scene: Scene, place: str, choice: Choice) -> Columns:
-    """All targets sit elsewhere from a moment on: the plate as a body, or (`apart`) each nest."""
-    after = (scene.column("clock") >= choice["since"]).astype(float)
-    axes, fixed = scene.links.axes, {"since": choice["since"]}
+    """All targets sit elsewhere from then on: the plate as a body, or (`apart`) each nest."""
+    after = is_after(scene, choice)
+    axes = scene.links.axes
+    fixed = {name: value for name, value in choice.items() if name != "apart"}
     if choice["apart"]:
         shift = np.zeros((scene.targets, 3, *scene.points.shape))
         for target in range(scene.targets):
@@ -200,19 +183,20 @@ def plate(scene: Scene, place: str, choice: Choice) -> Columns:
 
 
 def reseats(scene: Scene, place: str) -> Sequence[Choice]:
-    """Moments, the plate as a body where the targets show its turn."""
+    """Sessions and moments, the plate as a body where the targets show its turn."""
     apart = (0.0,) if scene.targets > 2 else (1.0,)
-    return tuple({**choice, "apart": a} for choice in moments(scene, place) for a in apart)
+    found = (*later_sessions(scene), *moments(scene))
+    return tuple({**choice, "apart": a} for choice in found for a in apart)
 
 
 TARGET_RESEAT = Effect(
     "target_reseat",
-    "the plate of the reflectors, or all of them, seated anew during the session",
-    "all targets sit elsewhere on the flange after row k",
-    lambda scene: ("all",) if scene.has("clock") else (),
+    "the plate of the reflectors, or all of them, seated anew",
+    "all targets sit elsewhere on the flange after row k, or from a session on",
+    lambda scene: ("all",) if can_change(scene) else (),
     plate,
     finer=finer,
-    needs=lambda scene: "" if scene.has("clock") else "column order or time_s" + scene.untold,
+    needs=lacking,
     choices=reseats,
     typical=5e-3,
     moves="target",

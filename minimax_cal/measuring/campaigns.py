@@ -1,0 +1,212 @@
+"""Several files of one arm, measured one after the other: campaigns, each a session of its own."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.columns import TEXT
+from minimax_cal.measuring.measurements import Measurements, read_measurements
+
+MOST_FILES = 100
+LABELS = ("pose", "group")  # which mean something in their own file only
+
+
+def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
+    """The measurements of one file, or of several as sessions.
+
+    paths: in the order in which they were measured.  Raises DataError.
+
+    >>> data = mc.read_campaigns(["march.csv", "june.csv"])
+    """
+    if not paths:
+        raise DataError("no file of measurements is given")
+    if len(paths) > MOST_FILES:
+        raise DataError(f"{len(paths)} files of measurements; give at most {MOST_FILES}")
+    parts = [read_measurements(path) for path in paths]
+    return parts[0] if len(parts) == 1 else campaigns(parts, session_names(paths))
+
+
+def measured(data: Measurements | Path | str | Sequence[Path | str]) -> Measurements:
+    """Measurements as they are, of a file, or of several as sessions.  Raises DataError."""
+    if isinstance(data, Measurements):
+        return data
+    return read_campaigns([data] if isinstance(data, str | Path) else data)
+
+
+def session_names(paths: Sequence[Path | str]) -> list[str]:
+    """What the sessions of files are called: by the stem, or as much of the path as differs.
+
+    Raises DataError for a file that is given twice.
+    """
+    whole = [Path(path).resolve() for path in paths]
+    if len(set(whole)) < len(whole):
+        twice = next(path for path in whole if whole.count(path) > 1)
+        raise DataError(f"{twice}: is given twice; a campaign counts once")
+    for depth in range(1, max(len(path.parts) for path in whole) + 1):
+        names = ["/".join((*path.parts[-depth:-1], path.stem)) for path in whole]
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in whole]  # stems alike, endings not
+
+
+def campaigns(parts: Sequence[Measurements], names: Sequence[str]) -> Measurements:
+    """Measurements of one arm as sessions of one set.
+
+    names: of the sessions; where a part has sessions itself these come after it, as june/2.  Lines
+    of the second part are those of its file and a round number more, and so on.  Targets go by
+    their names.  Raises DataError for parts of different joints.
+    """
+    check_alike(parts)
+    step = numbered_apart(parts)
+    named = [
+        renumbered(in_session(part, name), number * step, name)
+        for number, (part, name) in enumerate(zip(parts, names, strict=True))
+    ]
+    named = in_turn(named)
+    targets = tuple(dict.fromkeys(name for part in named for name in part.target_names))
+    said = ", ".join(
+        f"{part.source} from line {number * step + 1}"
+        for number, part in enumerate(parts)
+        if number
+    )
+    whole = stacked([with_targets(part, targets) for part in named])
+    return replace(
+        whole,
+        notices=(
+            *(notice for part in parts for notice in part.notices),
+            f"{len(parts)} files are sessions {', '.join(names)}; lines are numbered on: {said}",
+        ),
+        source=" + ".join(part.source for part in parts),
+        digest=hashlib.sha256("".join(part.digest for part in parts).encode()).hexdigest(),
+    )
+
+
+def check_alike(parts: Sequence[Measurements]) -> None:
+    """Raise DataError for parts whose joints are not those of the first."""
+    first = parts[0]
+    for part in parts[1:]:
+        if part.q.shape[1] != first.q.shape[1]:
+            raise DataError(
+                f"{part.source}: has {part.q.shape[1]} joints, {first.source} has "
+                f"{first.q.shape[1]}; files of one calibration are of one arm"
+            )
+        if (part.sliding != first.sliding).any():
+            joint = int(np.argmax(part.sliding != first.sliding)) + 1
+            raise DataError(
+                f"{part.source}: joint {joint} is a length there and an angle in {first.source}, "
+                "or the other way round; name the column by its unit"
+            )
+
+
+def numbered_apart(parts: Sequence[Measurements]) -> int:
+    """A round number above all lines of the parts."""
+    last = max(int(part.line.max(initial=1)) for part in parts)
+    return int(10 ** max(3, len(str(last))))
+
+
+def in_session(part: Measurements, name: str) -> Measurements:
+    """A part whose session is its name, before that of the file where it has several."""
+    own = part.columns.get("session", np.full(part.poses, "")).astype(str)
+    several = len(np.unique(own)) > 1
+    label = np.array([f"{name}/{cell}" if several and cell else name for cell in own], dtype=str)
+    aside = in_session(part.aside, name) if part.aside else None
+    return replace(part, columns={**part.columns, "session": label}, aside=aside)
+
+
+def renumbered(part: Measurements, more: int, name: str) -> Measurements:
+    """A part with its lines counted on, and labels that mean something in their own file only."""
+    columns = dict(part.columns)
+    for column in LABELS:
+        if column in columns:
+            own = columns[column].astype(str)
+            columns[column] = np.array(
+                [f"{name}/{cell}" if cell else "" for cell in own], dtype=str
+            )
+    return replace(
+        part,
+        line=part.line + more,
+        columns=columns,
+        set_aside=tuple(replace(point, row=point.row + more) for point in part.set_aside),
+        aside=renumbered(part.aside, more, name) if part.aside else None,
+    )
+
+
+def in_turn(parts: Sequence[Measurements]) -> list[Measurements]:
+    """The parts, the time of each after that of the one before where their clocks overlap."""
+    out: list[Measurements] = []
+    last = -np.inf
+    for part in parts:
+        time = part.columns.get("time", np.zeros(0)).astype(float)
+        known = time[np.isfinite(time)]
+        if len(known):
+            late = float(last - known.min()) if known.min() <= last else 0.0
+            last = float(known.max()) + late
+            part = later(part, late + 1.0) if late else part
+        out.append(part)
+    return out
+
+
+def later(part: Measurements, seconds: float) -> Measurements:
+    """A part measured so much later [s]."""
+    aside = later(part.aside, seconds) if part.aside else None
+    columns = {**part.columns, "time": part.columns["time"].astype(float) + seconds}
+    return replace(part, columns=columns, aside=aside)
+
+
+def with_targets(part: Measurements, names: tuple[str, ...]) -> Measurements:
+    """A part with all targets of some names, those that it lacks measured nowhere."""
+    y = np.full((part.poses, len(names), 3), np.nan)
+    y[:, [names.index(name) for name in part.target_names]] = part.y
+    aside = with_targets(part.aside, names) if part.aside else None
+    return replace(part, y=y, target_names=names, aside=aside)
+
+
+def stacked(parts: Sequence[Measurements]) -> Measurements:
+    """Parts of the same joints and targets one after the other."""
+    aside = [part.aside for part in parts if part.aside]
+    return replace(
+        parts[0],
+        q=np.concatenate([part.q for part in parts]),
+        y=np.concatenate([part.y for part in parts]),
+        line=np.concatenate([part.line for part in parts]),
+        columns=together(parts, lambda part: dict(part.columns)),
+        unknown=together(parts, lambda part: dict(part.unknown)),
+        simulated=all(part.simulated for part in parts),
+        set_aside=tuple(point for part in parts for point in part.set_aside),
+        aside=stacked(aside) if aside else None,
+    )
+
+
+def together(
+    parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
+) -> dict[str, Array]:
+    """Columns of all parts, empty where a part lacks one.  held: those of a part."""
+    names = dict.fromkeys(name for part in parts for name in held(part))
+    return {
+        name: np.concatenate([
+            held(part).get(name, empty(name, part, is_text(name, parts, held))) for part in parts
+        ])
+        for name in names
+    }  # fmt: skip
+
+
+def is_text(
+    name: str, parts: Sequence[Measurements], held: Callable[[Measurements], dict[str, Array]]
+) -> bool:
+    """Whether the cells of a column are text."""
+    found = next(held(part)[name] for part in parts if name in held(part))
+    return name in TEXT or found.dtype.kind in "US"
+
+
+def empty(name: str, part: Measurements, text: bool) -> Array:
+    """(m,) cells of a column that a part lacks; without a `split` all poses are for training."""
+    if name == "split":
+        return np.full(part.poses, "train")
+    return np.full(part.poses, "" if text else np.nan)
