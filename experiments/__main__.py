@@ -132,6 +132,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.motion_real",
         "Torques along trajectories, judged by runs that no fit saw: a real arm, a simulated one",
     ),
+    "motion_blind": (
+        "experiments.motion_blind",
+        "Are causes of torque named rightly: sound arms, causes withheld, laws outside the library",
+    ),
     "speed": ("experiments.speed", "How fast the fits are, as ratios to peers in the same run"),
 }
 

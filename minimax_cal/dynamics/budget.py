@@ -66,12 +66,12 @@ class LeftOut:
         delayed: whether a delay was taken out.  without: columns that are left out besides.
         """
         index = np.setdiff1d(self.normal.index(parts), np.array(without, dtype=int))
-        out = np.zeros(self.error.shape)
         seen = self.error if delayed else self.early
-        for f in range(len(self.gram)):
-            rows = (self.fold == f) | (self.fold == NEVER_OUT)
-            value = solve_scaled(self.gram[f][np.ix_(index, index)], self.pull[f][index])
-            out[:, rows] = seen[:, rows] - self.raw[:, rows][..., index] @ value
+        value = np.zeros((self.raw.shape[2], len(self.gram)))
+        for f, (gram, pull) in enumerate(zip(self.gram, self.pull, strict=True)):
+            value[index, f] = solve_scaled(gram[np.ix_(index, index)], pull[index])
+        fitted, own = self.raw @ value, np.where(self.fold == NEVER_OUT, 0, self.fold)
+        out = seen - np.take_along_axis(fitted, own[None, :, None], axis=2)[..., 0]
         missed = np.asarray(out.T)
         return missed if self.normal.place[FRICTION].start not in index else self.less_held(missed)
 

@@ -37,8 +37,9 @@ from minimax_cal.dynamics.result import (
 )
 from minimax_cal.dynamics.rows import ROW_HZ, Logs, prepare, whitening
 from minimax_cal.dynamics.run import CURRENT, Run
-from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.scene import Arm, Scene, sense_of
 from minimax_cal.dynamics.search import Columns, dictionary_of, generous
+from minimax_cal.dynamics.softness import softened
 from minimax_cal.evidence.alternatives import alternatives
 from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import LEVEL
@@ -51,7 +52,7 @@ from minimax_cal.robots.robot import Robot, load_robot
 LEAST_SECONDS = 25.0  # of trajectories: in less, laws stand in for each other
 LEAST_PEAK = 0.25  # speed that some joint must reach [rad/s, m/s]: slower, most laws are invisible
 MINOR = 0.05  # of the squared error that the step before leaves at a joint: worth less, it is minor
-MATTERS = 0.15  # of the remaining error's square at a joint: structure beyond it is an error
+MATTERS = 0.28  # of the remaining error's square at a joint, 15 % of its RMS: more has no name
 SPLITS = 2  # of the groups in complementary halves, in which names are sought again
 FOUND_AGAIN = 0.75  # share of the halves in which a confirmed name is found
 SEED = 0  # of the halves
@@ -221,6 +222,11 @@ def examined(
     too_little = tuple(motion_lacking(logs.only(learning)))
     progress("searching for causes")
     found = search(arm, logs.only(learning), exclude)
+    soft = softened(found.columns, found.terms)
+    if np.any(soft > arm.soft):
+        progress("searching again with softer friction")
+        arm = replace(arm, soft=soft)
+        found = search(arm, logs.only(learning), exclude)
     early, late, unsure = logs, 0.0, 0.0
     for one, (value, sigma) in zip(found.choice.found, found.choice.estimates, strict=True):
         if one.candidate.family == "delay" and abs(value[0]) > LATE:
@@ -545,7 +551,7 @@ def curves(found: Found, normal: Normal, judge: LeftOut) -> tuple[FrictionCurve,
     out = []
     for j in range(arm.robot.joints):
         v = np.linspace(-1.0, 1.0, CURVE_POINTS) * arm.fastest[j]
-        sense, share = np.tanh(v / arm.soft[j]), np.abs(v) / arm.fastest[j]
+        sense, share = sense_of(v, arm.soft[j]), np.abs(v) / arm.fastest[j]
         at = normal.place[FRICTION].start + 2 * j
         drawn = np.outer(values[:, at], sense) + np.outer(values[:, at + 1], v)
         for term in (t for t in found.terms if t.place == f"J{j + 1}"):

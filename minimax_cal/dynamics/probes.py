@@ -1,31 +1,45 @@
 """What is left of the torques when all that has a name is taken out, and what it follows.
 
-A probe is a set of smooth functions of one driver.  Its fit beside the model is tested against the
-noise, by rows and by groups of them, and its size is the RMS torque that it would explain.
+A probe is a set of functions of one driver, at the rows that are fitted.  Its size is what it
+foretells of rows that its fit does not see: no number of functions makes it large, and noise that
+remembers, or that was taken for more than it is, does not make it small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.signal import lfilter
+from scipy.special import stdtr
 
 from minimax_cal.dynamics.model import Normal
+from minimax_cal.dynamics.rows import CUTOFF_HZ, FILTER_ORDER, SAMPLE_HZ
 from minimax_cal.dynamics.scene import Scene
-from minimax_cal.evidence.noise import inflation
+from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 
-LEVEL = 0.001  # chance that noise alone is called structure, of all probes at all joints
+LEVEL = 0.02  # chance that noise alone is called structure, of all probes at all joints, at most:
+# what noise foretells of rows left out is below 0 on average
 RANK = 1e-4  # of a probe's largest direction beside the model: smaller ones are no test
 BUMPS = 5  # smooth steps over the range of a driver
+WAVES = 4  # a turn of a joint that angle alone is tried by; more are those of gears
+FINEST, STEPS = 60.0, 28  # waves a turn of a gear that are tried at most, and how many of them
+PARTS = (1.0, 0.1, 0.01)  # of the remaining error's square, that a probe may explain
+BLOCK_S, TIME_FOLDS = 1.0, 8  # length of stretches that are left out together, every eighth [s]
+TIME = "time"
+RECENT_S = (0.5, 2.0, 8.0)  # over which motion that went before is averaged [s]
+BEFORE_S = (0.1, 0.2, 0.3, 0.45, 0.6, 0.8)  # by which accelerations went before [s]
+PLAYS = (0.03, 0.1, 0.3)  # of a joint's range: ways over which a spring lags the angle
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Torque without a name.  size: RMS, and noise: that of the whole remaining error, both of the
-    rows that are fitted [unit of the log].  share: of the remaining error's square.
+    """Torque without a name.  size: RMS that its driver foretells of rows left out, and noise: that
+    of the whole remaining error, both of the rows that are fitted [unit of the log].  share: of its
+    square.
     """
 
     place: str
@@ -36,90 +50,215 @@ class Unexplained:
     p: float
 
 
-def waves(q: Array, most: int) -> list[Array]:
-    """Cosines and sines of an angle (M,)."""
-    return [f(k * q) for k in range(1, most + 1) for f in (np.cos, np.sin)]
+# ---- what drivers are functions of ---------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What a scene knows of some rows, for one joint.
+
+    scene: of all samples.  joint: from 0.  at: (k,) samples.  past: what all joints did before.
+    """
+
+    scene: Scene
+    joint: int
+    at: Array
+    past: Past
+
+    @cached_property
+    def q(self) -> Array:
+        """(k, n) joint values."""
+        return np.asarray(self.scene.logs.motion.q[self.at])
+
+    @cached_property
+    def qd(self) -> Array:
+        """(k, n) speeds."""
+        return np.asarray(self.scene.logs.motion.qd[self.at])
+
+    @cached_property
+    def qdd(self) -> Array:
+        """(k, n) accelerations."""
+        return np.asarray(self.scene.logs.motion.qdd[self.at])
+
+    @cached_property
+    def sense(self) -> Array:
+        """(k, n) directions."""
+        return np.asarray(self.scene.sense[self.at])
+
+    @cached_property
+    def load(self) -> Array:
+        """(k, n) torques that the body puts on the joints, over the largest."""
+        size = np.maximum(np.abs(self.scene.load).max(axis=0), 1e-12)
+        return np.asarray(self.scene.load[self.at] / size)
+
+    def both_ways(self, columns: list[Array]) -> list[Array]:
+        """Columns alone and with the direction."""
+        return [f for one in columns for f in (one, one * self.sense[:, self.joint])]
+
+    @property
+    def others(self) -> Iterator[int]:
+        """The other joints."""
+        return (k for k in range(self.q.shape[1]) if k != self.joint)
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """What joints did before: (M, n, d) at every sample.
+
+    recent: averages of the speed's size and of the angle.  lagged: where a spring with play is.
+    """
+
+    recent: Array
+    lagged: Array
+
+    @staticmethod
+    def of(scene: Scene) -> Past:
+        """Of every run for itself."""
+        q, qd = scene.logs.motion.q, scene.logs.motion.qd
+        recent = np.empty((*q.shape, len(RECENT_S)))
+        lagged = np.empty((*q.shape, len(PLAYS)))
+        way = np.maximum(np.ptp(q, axis=0), 1e-12)[:, None] * np.array(PLAYS)
+        for a, b in zip(scene.logs.start[:-1], scene.logs.start[1:], strict=True):
+            for number, seconds in enumerate(RECENT_S):
+                stays = np.exp(-1.0 / SAMPLE_HZ / seconds)
+                recent[a:b, :, number] = lfilter([1.0 - stays], [1.0, -stays],
+                                                 np.abs(qd[a:b]), axis=0)  # fmt: skip
+            now = np.zeros_like(way)
+            step = np.diff(q[a:b], axis=0, prepend=q[a : a + 1])[:, :, None]
+            for i in range(b - a):
+                now = np.clip(now + step[i], -way, way)
+                lagged[a + i] = now
+        return Past(recent, lagged / way)
+
+
+# ---- drivers -------------------------------------------------------------------------------------
+
+
+def waves(q: Array, counts: Array) -> list[Array]:
+    """Cosines and sines of an angle (k,), so many a turn."""
+    return [f(k * q) for k in counts for f in (np.cos, np.sin)]
 
 
 def bumps(x: Array) -> list[Array]:
-    """Smooth bumps over the range of a driver (M,)."""
+    """Smooth bumps over the range of a driver (k,)."""
     low, high = np.quantile(x, [0.02, 0.98])
     width = max(float(high - low), 1e-12) / BUMPS
     return [np.exp(-(((x - low) / width - k) ** 2)) for k in range(BUMPS + 1)]
 
 
-def by_angle(s: Scene, j: int) -> list[Array]:
+def by_angle(m: Moments) -> list[Array]:
     """The joint's own angle, alone and with the direction."""
-    q = s.logs.motion.q[:, j]
-    if s.arm.robot.prismatic[j]:
-        return [f for b in bumps(q) for f in (b, b * s.sense[:, j])]
-    return [*waves(q, 4), *(f * s.sense[:, j] for f in waves(q, 2))]
+    q = m.q[:, m.joint]
+    if m.scene.arm.robot.prismatic[m.joint]:
+        return m.both_ways(bumps(q))
+    slow = np.arange(1.0, WAVES + 1.0)
+    return [*waves(q, slow), *(f * m.sense[:, m.joint] for f in waves(q, slow[:2]))]
 
 
-def by_speed(s: Scene, j: int) -> list[Array]:
+def by_fine_angle(m: Moments) -> list[Array]:
+    """Waves of the angle as gears and motors have them, less what the filter takes."""
+    q, qd = m.q[:, m.joint], m.qd[:, m.joint]
+    far = max(float(np.ptp(q)), 1e-12)
+    first = WAVES + 1.0 if not m.scene.arm.robot.prismatic[m.joint] else np.pi / far
+    counts = first + np.arange(STEPS) * max(np.pi / far, (FINEST - first) / STEPS)
+    out = []
+    for k in counts:
+        rate = k * np.abs(qd) / (2.0 * np.pi * CUTOFF_HZ)
+        out += [f / (1.0 + rate ** (2 * FILTER_ORDER)) for f in waves(q, np.array([k]))]
+    return out
+
+
+def by_speed(m: Moments) -> list[Array]:
     """The joint's speed, the same both ways."""
-    return [b * s.sense[:, j] for b in bumps(np.abs(s.logs.motion.qd[:, j]))]
+    return [b * m.sense[:, m.joint] for b in bumps(np.abs(m.qd[:, m.joint]))]
 
 
-def by_direction(s: Scene, j: int) -> list[Array]:
+def by_direction(m: Moments) -> list[Array]:
     """The joint's speed, otherwise one way than the other."""
-    return bumps(np.abs(s.logs.motion.qd[:, j]))
+    return bumps(np.abs(m.qd[:, m.joint]))
 
 
-def by_load(s: Scene, j: int) -> list[Array]:
+def by_load(m: Moments) -> list[Array]:
     """The torque that the joint transmits, alone, with the direction and with the speed."""
-    load = s.load[:, j]
-    size = load / max(float(np.abs(load).max()), 1e-12)
-    sense, v = s.sense[:, j], s.logs.motion.qd[:, j]
+    size, sense, v = m.load[:, m.joint], m.sense[:, m.joint], m.qd[:, m.joint]
     return [size, np.abs(size), size**2, size**3, np.abs(size) * sense, size**2 * sense,
-            np.abs(size) * v, size**2 * v]  # fmt: skip
+            np.abs(size) * v, size**2 * v, size * sense]  # fmt: skip
 
 
-def by_acceleration(s: Scene, j: int) -> list[Array]:
-    """The joint's acceleration and its derivative."""
-    qdd = s.logs.motion.qdd[:, j]
-    return [qdd, np.abs(qdd), np.abs(qdd) * s.sense[:, j], s.logs.slope(qdd)]
+def by_acceleration(m: Moments) -> list[Array]:
+    """The joint's acceleration, its derivative, and accelerations that went before."""
+    logs, j = m.scene.logs, m.joint
+    qdd = m.qdd[:, j]
+    first = logs.start[np.searchsorted(logs.start, m.at, side="right") - 1]
+    earlier = [logs.motion.qdd[np.maximum(m.at - int(s * SAMPLE_HZ), first), j] for s in BEFORE_S]
+    return [qdd, np.abs(qdd), np.abs(qdd) * m.sense[:, j],
+            logs.slope(logs.motion.qdd[:, j])[m.at], *earlier]  # fmt: skip
 
 
-def by_others(s: Scene, j: int) -> list[Array]:
-    """Where the other joints are, how they move and what they transmit."""
-    motion, out = s.logs.motion, []
-    for k in range(s.logs.joints):
-        if k != j:
-            out += [np.cos(motion.q[:, k]), np.sin(motion.q[:, k]), motion.qd[:, k],
-                    motion.qdd[:, k], s.sense[:, k], s.load[:, k],
-                    motion.qd[:, k] * motion.qd[:, j]]  # fmt: skip
+def by_others(m: Moments) -> list[Array]:
+    """Where the other joints are, alone and two together, how they move and what they transmit."""
+    others = list(m.others)
+    alone = [
+        f
+        for k in others
+        for f in (np.cos(m.q[:, k]), np.sin(m.q[:, k]), m.qd[:, k], m.qdd[:, k], m.sense[:, k],
+                  m.load[:, k], np.abs(m.qd[:, k]))
+    ]  # fmt: skip
+    sums = [m.q[:, a] + m.q[:, b] for a in others for b in others if a <= b]
+    differences = [m.q[:, a] - m.q[:, b] for a in others for b in others if a < b]
+    return [*alone, *(f(q) for q in (*sums, *differences) for f in (np.cos, np.sin))]
+
+
+def by_friction_of_others(m: Moments) -> list[Array]:
+    """Friction and damping of this joint by what the other joints do."""
+    sense, v = m.sense[:, m.joint], m.qd[:, m.joint]
+    out = []
+    for k in m.others:
+        cos, sin = np.cos(m.q[:, k]), np.sin(m.q[:, k])
+        out += [sense * cos, sense * sin, v * cos, v * sin, sense * m.load[:, k],
+                sense * np.abs(m.load[:, k]), sense * m.sense[:, k], v * m.qd[:, k],
+                sense * np.abs(m.qd[:, k])]  # fmt: skip
     return out
 
 
-def by_time(s: Scene, j: int) -> list[Array]:
-    """The time since the run began, and the run itself."""
-    since = s.logs.since / max(float(s.logs.since.max()), 1e-9)
-    out = [f * g for f in (since, since**2) for g in (np.ones_like(since), s.sense[:, j])]
-    for a, b in zip(s.logs.start[:-2], s.logs.start[1:-1], strict=True):
-        within = np.zeros_like(since)
-        within[a:b] = 1.0
-        out += [within, within * s.sense[:, j]]
-    return out
+def by_time(m: Moments) -> list[Array]:
+    """The time since the run began, of every run for itself."""
+    logs = m.scene.logs
+    run = np.searchsorted(logs.start, m.at, side="right") - 1
+    out = []
+    for r in range(len(logs.names)):
+        mine = run == r
+        if mine.any():
+            since = logs.since[m.at] / max(float(logs.since[m.at][mine].max()), 1e-9)
+            out += [mine * np.exp(-((BUMPS * since - k) ** 2)) for k in range(BUMPS + 1)]
+    return m.both_ways(out)
 
 
-def by_memory(s: Scene, j: int) -> list[Array]:
-    """How far the joint is from where it last turned round."""
-    way = s.since_reversal[:, j] / max(float(s.since_reversal[:, j].max()), 1e-12)
+def by_memory(m: Moments) -> list[Array]:
+    """How far the joint is from where it last turned round, and how it moved before."""
+    j, whole = m.joint, m.scene.since_reversal[:, m.joint]
+    way = whole[m.at] / max(float(whole.max()), 1e-12)
     faded = [np.exp(-way / length) for length in (0.02, 0.06, 0.2, 0.6)]
-    return [f for b in faded for f in (b * s.sense[:, j], b * s.logs.motion.qd[:, j])]
+    recent = [*m.past.recent[m.at, j].T]
+    by_way = [f for b in faded for f in (b * m.sense[:, j], b * m.qd[:, j])]
+    return [*by_way, *m.both_ways(recent), *m.past.lagged[m.at, j].T]
 
 
-DRIVERS: dict[str, Callable[[Scene, int], list[Array]]] = {
+DRIVERS: dict[str, Callable[[Moments], list[Array]]] = {
     "angle": by_angle,
+    "fine waves of the angle": by_fine_angle,
     "speed": by_speed,
     "direction": by_direction,
     "load": by_load,
     "acceleration": by_acceleration,
     "other joints": by_others,
-    "time": by_time,
-    "way since the last reversal": by_memory,
+    "other joints and the direction": by_friction_of_others,
+    TIME: by_time,
+    "motion before": by_memory,
 }
+
+
+# ---- the test ------------------------------------------------------------------------------------
 
 
 def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
@@ -128,47 +267,73 @@ def unexplained(normal: Normal, value: Array) -> list[Unexplained]:
     value: (p,) of the fit, 0 where a column is not part of it.
     """
     scene, white = normal.columns.scene, normal.white
-    rest, plain = normal.error - normal.matrix @ value, normal.rest(value)
-    out = []
+    plain, out, past = normal.rest(value), list[Unexplained](), Past.of(scene)
     for j in range(scene.logs.joints):
-        mine = white.joint == j
+        mine, kept = white.joint == j, white.kept[j]
         if np.count_nonzero(mine) < 10 * BUMPS:
             continue
-        matrix = normal.matrix[mine][:, value != 0.0]
-        matrix = matrix[:, np.linalg.norm(matrix, axis=0) > 0.0]
-        basis = np.linalg.svd(matrix / np.linalg.norm(matrix, axis=0), full_matrices=False)
-        span = basis[0][:, basis[1] > RANK * basis[1][0]]
-        left = rest[mine] - span @ (span.T @ rest[mine])
+        basis = orthonormal(normal.raw[j, kept][:, value != 0.0])
+        left = less(basis, plain[mine])
         noise = float(np.sqrt(np.mean(plain[mine] ** 2)))
-        probes = {name: np.stack(f(scene, j), axis=1) for name, f in DRIVERS.items()}
-        rows = scene.logs.filtered(np.concatenate(list(probes.values()), axis=1))
-        field = white.white_joint(j, rows[white.kept[j]])
-        field = field - span @ (span.T @ field)
-        at = 0
-        for name, columns in probes.items():
-            part = field[:, at : at + columns.shape[1]]
-            at += columns.shape[1]
-            found = tested(part, left, normal.group[mine], len(left) - span.shape[1])
-            p = min(1.0, found[0] * len(DRIVERS) * scene.logs.joints)
+        moments = Moments(scene, j, scene.logs.picked[kept], past)
+        group = np.unique(normal.group[mine], return_inverse=True)[1]
+        for name, columns in DRIVERS.items():
+            fold = blocks(moments) if name == TIME else group
+            raw = np.stack(columns(moments), axis=1)
+            share, p = foretold(beside(basis, raw), left, fold, group)
+            p = min(1.0, p * len(DRIVERS) * scene.logs.joints)
             if p < LEVEL:
-                size = noise * float(np.sqrt(found[1]))
-                out.append(Unexplained(f"J{j + 1}", name, size, noise, found[1], p))
+                size = noise * float(np.sqrt(share))
+                out.append(Unexplained(f"J{j + 1}", name, size, noise, share, p))
     return sorted(out, key=lambda one: -one.share)
 
 
-def tested(field: Array, left: Array, group: Array, dof: int) -> tuple[float, float]:
-    """p-value of a probe beside the model, and the share of the squares that it explains.
-
-    The share is less what as many columns explain of noise.  field: (k, d).  left, group: (k,).
+def blocks(m: Moments) -> Array:
+    """(k,) folds of rows, each of short stretches of every run: what follows time is not foretold
+    far from where it was seen.
     """
-    size = np.maximum(np.linalg.norm(field, axis=0), 1e-300)
-    vectors, values, _ = np.linalg.svd(field / size, full_matrices=False)
-    span = vectors[:, values > RANK * max(values.max(initial=0.0), 1e-300)]
-    fitted = span @ (span.T @ left)
-    d, whole, gain = span.shape[1], float(left @ left), float(fitted @ fitted)
-    free = dof - d
-    if free < d or whole <= 0.0 or gain >= whole:
-        return 1.0, 0.0
-    wide = inflation(fitted, left, group, free)
-    p = float(fdtrc(d, free, gain / d / ((whole - gain) / free) / wide))
-    return p, max(1.0 - (whole - gain) / free / (whole / dof), 0.0)
+    return np.asarray((m.scene.logs.since[m.at] / BLOCK_S).astype(int) % TIME_FOLDS)
+
+
+def less(basis: Array, rows: Array) -> Array:
+    """Rows (k, ...) less what the model imitates.  basis: (k, r) orthonormal."""
+    return np.asarray(rows - basis @ (basis.T @ rows))
+
+
+def beside(basis: Array, columns: Array) -> Array:
+    """Columns (k, d) less what the model imitates, of unit size a row."""
+    field = less(basis, columns)
+    size = np.sqrt(np.mean(field**2, axis=0))
+    least = RANK * np.sqrt(np.mean(columns**2, axis=0)) + 1e-300
+    return np.asarray(field / np.maximum(size, least))
+
+
+def foretold(field: Array, left: Array, fold: Array, group: Array) -> tuple[float, float]:
+    """Share of the square of the remaining error that a probe foretells in folds left out, p-value.
+
+    The ridge is that of a probe that explains a part of the error, the part that foretells best.
+    The p-value is Student's, of relative gains over groups, each between -1 and 1: no group counts
+    for more than another.  field: (k, d).  left: (k,).  fold, group: (k,) from 0.
+    """
+    d, found = field.shape[1], (-np.inf, 1.0)
+    folds = [fold == f for f in np.unique(fold)]
+    gram, pull = field.T @ field, field.T @ left
+    parts = [(field[own].T @ field[own], field[own].T @ left[own]) for own in folds]
+    before = np.bincount(group, left**2)
+    for part in PARTS:
+        missed = left.copy()
+        for own, (inner, toward) in zip(folds, parts, strict=True):
+            value = np.linalg.solve(gram - inner + d / part * np.eye(d), pull - toward)
+            missed[own] -= field[own] @ value
+        after = np.bincount(group, missed**2)
+        share = 1.0 - float(after.sum()) / max(float(before.sum()), 1e-300)
+        if share > found[0]:
+            gain = (before - after) / np.maximum(np.maximum(before, after), 1e-300)
+            found = share, student(gain)
+    return found
+
+
+def student(gain: Array) -> float:
+    """p-value of gains (g,) whose mean is above 0."""
+    unsure = float(gain.std(ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
+    return float(stdtr(len(gain) - 1, -float(gain.mean()) / max(unsure, 1e-12)))

@@ -15,7 +15,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import toeplitz
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, sosfilt, sosfilt_zi
+from scipy.sparse import block_diag, coo_array, csr_array
 
 from minimax_cal.dynamics.regressor import Motion
 from minimax_cal.dynamics.run import Run
@@ -25,6 +26,7 @@ SAMPLE_HZ = 100.0  # of what the columns are computed from
 ROW_HZ = 25.0  # of rows
 THIN = 2  # every second row is fitted: near the filter's cutoff, noise of fewer rows is whiter
 CUTOFF_HZ, FILTER_ORDER = 8.0, 4  # of the zero-phase filter [Butterworth]
+LEAST_TAP = 1e-7  # of the filter's largest: what it takes of samples further off is nothing
 REVERSAL_S = 0.1  # about rest and reversals, without a fit
 REST = 0.01  # of the joint's largest speed: below it the joint is at rest
 SLOWEST = 2e-3  # below it a joint is at rest, however slow the log [rad/s, m/s]
@@ -36,16 +38,26 @@ LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
 
 @lru_cache(maxsize=32)
-def filter_sections(rate: float) -> Array:
-    """Second-order sections of the filter at a rate [Hz]."""
-    return np.asarray(butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos"))
+def filter_sections(rate: float) -> tuple[Array, Array]:
+    """Second-order sections of the filter at a rate [Hz], and its state at rest under a unit."""
+    sections = butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos")
+    return np.asarray(sections), np.asarray(sosfilt_zi(sections))[:, None, :]
 
 
 def smooth(values: Array, rate: float) -> Array:
-    """Values (m, ...) after the zero-phase filter.  rate: [Hz]."""
-    sections = filter_sections(rate)
+    """Values (m, ...) after the zero-phase filter: forwards and backwards.  rate: [Hz].
+
+    About the ends the values go on as they came, turned about the end [Gustafsson 1996].
+    """
+    sections, state = filter_sections(rate)
     pad = min(len(values) - 1, int(rate))
-    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=pad))
+    rows = values.reshape(len(values), -1).T
+    before = 2.0 * rows[:, :1] - rows[:, pad:0:-1]
+    after = 2.0 * rows[:, -1:] - rows[:, -2 : -pad - 2 : -1]
+    out = np.concatenate([before, rows, after], axis=1)
+    for _ in range(2):
+        out = sosfilt(sections, out, zi=state * out[:, :1])[0][:, ::-1]
+    return np.asarray(out[:, pad : pad + len(values)].T.reshape(values.shape))
 
 
 def slope(values: Array, rate: float) -> Array:
@@ -54,6 +66,37 @@ def slope(values: Array, rate: float) -> Array:
     wide = (values[4:] - values[:-4]) / 4.0
     out[2:-2] = (4.0 * out[2:-2] - wide) / 3.0
     return np.asarray(out * rate)
+
+
+@lru_cache(maxsize=4)
+def taps(rate: float) -> Array:
+    """(2 k + 1,) what the filter takes of the samples about one, as far as that can be seen."""
+    wide = int(4.0 * rate)
+    one = np.zeros(2 * wide + 1)
+    one[wide] = 1.0
+    found = smooth(one, rate)
+    seen = np.flatnonzero(np.abs(found) > LEAST_TAP * found[wide])
+    return np.asarray(found[seen[0] : seen[-1] + 1])
+
+
+@lru_cache(maxsize=32)
+def run_operator(samples: int) -> csr_array:
+    """(rows, samples) the filter of one run, from samples to rows, as `smooth` treats its ends."""
+    weight = taps(SAMPLE_HZ)
+    reach = len(weight) // 2
+    rows = np.arange(0, samples, int(SAMPLE_HZ / ROW_HZ))
+    at = rows[:, None] + np.arange(-reach, reach + 1)
+    end = np.clip(at, 0, samples - 1)
+    beyond = at != end
+    mirrored = np.clip(2 * end - at, 0, samples - 1)
+    row = np.broadcast_to(np.arange(len(rows))[:, None], at.shape)
+    value = np.broadcast_to(weight, at.shape)
+    entries = (
+        np.concatenate([np.where(beyond, -value, value).ravel(), 2.0 * value[beyond]]),
+        (np.concatenate([row.ravel(), row[beyond]]),
+         np.concatenate([mirrored.ravel(), end[beyond]])),
+    )  # fmt: skip
+    return csr_array(coo_array(entries, shape=(len(rows), samples)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +173,17 @@ class Logs:
         """(R, n) torques of the rows."""
         return self.filtered(self.torque)
 
+    @cached_property
+    def operator(self) -> csr_array:
+        """(R, M) the filter, from samples to rows."""
+        long = np.diff(self.start)
+        parts = [run_operator(int(m)) for m in long]
+        return csr_array(block_diag(parts, format="csr"))
+
     def filtered(self, columns: Array) -> Array:
         """Rows (R, ...) of columns (M, ...), filtered."""
-        out = np.empty((len(self.picked), *columns.shape[1:]))
-        for number, (a, b) in enumerate(zip(self.start[:-1], self.start[1:], strict=True)):
-            out[self.run == number] = smooth(columns[a:b], SAMPLE_HZ)[:: int(SAMPLE_HZ / ROW_HZ)]
-        return out
+        flat = self.operator @ columns.reshape(len(columns), -1)
+        return np.asarray(flat.reshape(len(self.picked), *columns.shape[1:]))
 
     def slope(self, values: Array) -> Array:
         """Derivative in time (M, ...) of values (M, ...), each run for itself."""

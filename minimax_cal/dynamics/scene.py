@@ -26,6 +26,11 @@ KEPT = ("regressor", "base_rows", "known_torque", "sense", "held", "since_revers
 SOFT = 0.0025  # of a joint's largest speed: where friction changes its sign
 
 
+def sense_of(qd: Array, soft: Array | float) -> Array:
+    """Sign of a speed, in proportion to it below `soft`, as simulators have it."""
+    return np.asarray(np.clip(qd / soft, -1.0, 1.0))
+
+
 @dataclass(frozen=True, eq=False)
 class Arm:
     """An arm, and how its torques are read.
@@ -119,7 +124,7 @@ class Scene:
     @cached_property
     def sense(self) -> Array:
         """(M, n) sign of the speed, soft where it changes."""
-        return np.tanh(self.logs.motion.qd / self.arm.soft)
+        return sense_of(self.logs.motion.qd, self.arm.soft)
 
     @cached_property
     def held(self) -> Array:

@@ -1,0 +1,46 @@
+"""Over which speeds friction changes its sign: simulators make it soft, and gears with much play.
+
+A friction that is softer than it is drawn to be looks like a force without a law; one column beside
+all that is named says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.scene import sense_of
+from minimax_cal.dynamics.search import Columns
+from minimax_cal.evidence.noise import orthonormal
+from minimax_cal.ground.arrays import Array
+
+SOFTER = np.geomspace(0.005, 0.1, 9)  # of a joint's largest speed
+WORTH = 0.15  # of the square of the remaining error that a softer friction must close
+
+
+def softened(columns: Columns, terms: Sequence[Term]) -> Array:
+    """(n,) speeds over which friction changes its sign; as they are where that is soft enough.
+
+    columns: of a scene.  terms: what is named.
+    """
+    scene, arm = columns.scene, columns.scene.arm
+    logs, error, out = scene.logs, columns.error(), arm.soft.copy()
+    parts = [columns.rigid(), columns.usual(), *map(columns.at_all, terms)]
+    for j in range(logs.joints):
+        rows = logs.fitted[:, j]
+        beside = np.concatenate([part[j, rows] for part in parts], axis=1)
+        if np.count_nonzero(rows) < 2 * beside.shape[1]:
+            continue
+        beside[:, parts[0].shape[2] + 2 * j] = 0.0  # the Coulomb friction of this joint
+        basis = orthonormal(beside)
+        speeds = np.concatenate([arm.soft[[j]], arm.fastest[j] * SOFTER])
+        sense = logs.filtered(sense_of(logs.motion.qd[:, j, None], speeds))[rows]
+        sense = sense - basis @ (basis.T @ sense)
+        left = error[j, rows] - basis @ (basis.T @ error[j, rows])
+        closed = (left @ sense) ** 2 / np.maximum((sense**2).sum(axis=0), 1e-300)
+        remaining, best = float(left @ left) - closed, int(np.argmax(closed))
+        if remaining[best] < (1.0 - WORTH) * remaining[0]:
+            out[j] = max(out[j], float(speeds[best]))
+    return out

@@ -1,0 +1,171 @@
+"""The blind study of torques: its arms are what they are said to be, its judge counts rightly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from experiments.motion_blind import (
+    BEYOND,
+    PAIR,
+    SINGLE,
+    SOUND,
+    Told,
+    interval,
+    oracle,
+    place_of,
+    plan,
+    questions_table,
+    run,
+)
+from experiments.motion_cases import (
+    CAUSES,
+    LIBRARY,
+    MUJOCO,
+    OUTSIDE,
+    OWN,
+    Case,
+    by_integration,
+    excitation,
+    hysteresis,
+    logged,
+    make,
+    some_arm,
+    sound,
+)
+from minimax_cal.dynamics.laws import LAWS
+
+
+def test_two_generators_agree_where_friction_is_no_matter_of_taste() -> None:
+    """MuJoCo's friction is soft about a reversal; rotor, body and the rest are the same."""
+    pytest.importorskip("mujoco")
+    from experiments.motion_cases import by_mujoco
+
+    rng = np.random.default_rng(4)
+    robot = some_arm(rng)
+    plant = replace(sound(rng, robot), armature=np.full(robot.joints, 0.2))
+    motion = excitation(rng, robot, 4.0, np.inf)
+    (_, ours), (_, theirs) = by_integration(plant, motion), by_mujoco(plant, motion)
+    off = np.abs(ours - theirs)
+    assert_allclose(off[np.abs(motion.qd) > 0.2], 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_every_cause_adds_torque_to_a_sound_arm(name: str) -> None:
+    made = make(Case(SINGLE, OWN, ((name, 1),), 7))
+    size = np.sqrt(np.mean(np.concatenate(made.signal) ** 2, axis=0))
+    noise = np.sqrt(np.mean(np.concatenate(made.noise) ** 2, axis=0))
+    assert size.max() > 0.5 * noise[np.argmax(size)]
+    if name in LIBRARY and not (LAWS[name].whole if name in LAWS else True):
+        assert np.all(size[np.arange(len(size)) != 1] < 1e-6)
+
+
+def test_a_sound_arm_has_nothing_to_be_seen() -> None:
+    made = make(Case(SOUND, OWN, (), 7))
+    again = make(Case(SOUND, OWN, (), 7))
+    assert all(np.abs(part).max() < 1e-9 for part in made.signal)
+    assert np.array_equal(made.runs[0].torque, again.runs[0].torque)
+    assert not np.array_equal(made.runs[0].torque, make(Case(SOUND, OWN, (), 8)).runs[0].torque)
+
+
+def test_a_flexible_joint_moves_its_link_otherwise_than_its_motor() -> None:
+    rng = np.random.default_rng(1)
+    robot = some_arm(rng)
+    plant = replace(sound(rng, robot), compliance=np.full(robot.joints, 1e-3))
+    motion = excitation(rng, robot, 2.0, np.inf)
+    motor, _ = logged(plant, OWN, motion, 0.0)
+    rigid, _ = by_integration(plant, motion)
+    assert_allclose(motor.q - motion.q, 1e-3 * rigid, atol=1e-12)
+
+
+def test_a_hysteretic_cable_remembers_where_it_turned() -> None:
+    there = np.linspace(0.0, 1.0, 101)
+    way = hysteresis(np.concatenate([there, there[::-1]]), 0.2)
+    assert way[100] == pytest.approx(1.0)
+    assert way[-1] == pytest.approx(-1.0)
+    assert way[20] == pytest.approx(1.0)  # 0.2 rad from where it began
+
+
+def test_the_oracle_tells_a_rotor_from_other_laws_and_sees_no_payload_in_a_torque() -> None:
+    case = Case(SINGLE, OWN, (("armature", 2),), 11)
+    made = make(case)
+    visible, separable = oracle(made, (("armature", "J3"),))
+    assert visible > separable > 0.0
+    twice = replace(made, signal=tuple(2.0 * part for part in made.signal))
+    assert_allclose(oracle(twice, (("armature", "J3"),)), (4.0 * visible, 4.0 * separable),
+                    rtol=1e-6)  # fmt: skip
+
+
+def told(condition: str, truth: str, verdict: str, *main: str, **more: object) -> Told:
+    """An answer.  truth, main: as `armature J3`."""
+
+    def pair(text: str) -> tuple[str, str]:
+        effect, _, place = text.rpartition(" ")
+        return effect, place
+
+    causes = () if not truth else ((pair(truth)[0], 0),)
+    given: dict[str, object] = {
+        "minor": (),
+        "others": (),
+        "unexplained": (),
+        "not_testable": (),
+        "visible": 1e4,
+        "separable": 1e4,
+        "seconds": 1.0,
+    }
+    given |= more
+    return Told(Case(condition, OWN, causes, 0), verdict, (pair(truth),) if truth else (),
+                tuple(map(pair, main)), **given)  # type: ignore[arg-type]  # fmt: skip
+
+
+def test_answers_are_judged_by_the_truth() -> None:
+    right = told(SINGLE, "stribeck J2", "named", "stribeck J2")
+    kin = told(SINGLE, "stribeck J2", "named", "degressive J2")
+    wrong = told(SINGLE, "stribeck J2", "named", "stribeck J3")
+    unsure = told(SINGLE, "stribeck J2", "unknown", "stribeck J3")
+    hidden = told(SINGLE, "drive_gain J1", "none", not_testable=("drive_gain",))
+    faint = told(SINGLE, "stribeck J2", "none", separable=3.0)
+    other = told(SINGLE, "armature J2", "one_of", "drive_gain J2", others=(("armature", "J2"),))
+    assert [one.right for one in (right, kin, wrong, unsure, other)] == [True, *[False] * 4]
+    assert [one.related for one in (right, kin, wrong, hidden, other)] == [True, True, False, True,
+                                                                          True]  # fmt: skip
+    assert [one.wrong for one in (right, kin, wrong, unsure, other)] == [False, False, True, False,
+                                                                        False]  # fmt: skip
+    answers = [right, kin, wrong, unsure, hidden, faint, other,
+               told(SOUND, "", "named", "cable J1"), told(SOUND, "", "named"),
+               told(BEYOND, "hysteretic cable J1", "unknown"),
+               told(BEYOND, "hysteretic cable J1", "named", "cable J1")]  # fmt: skip
+    counts = {row[0]: row[1:3] for row in questions_table(answers).rows}
+    assert counts["sound: a cause named or doubted"] == (2, 1)
+    assert counts["single: right"] == (6, 1)
+    assert counts["single: right, its family, or not to be told from it"] == (6, 4)
+    assert counts["single: sure and wrong"] == (6, 1)
+    assert counts["outside: unexplained said"] == (2, 1)
+    assert counts["outside: sure and wrong"] == (2, 1)
+
+
+def test_the_plan_holds_every_cause_by_both_generators() -> None:
+    cases = plan(3, 6, 2 * len(LIBRARY))
+    assert len({case.seed for case in cases}) == len(cases)
+    single = {(c.causes[0][0], c.generator) for c in cases if c.condition == SINGLE}
+    assert single == {(name, generator) for name in LIBRARY for generator in (MUJOCO, OWN)}
+    outside = {(c.causes[0][0], c.generator) for c in cases if c.condition == BEYOND}
+    assert outside == {(name, generator) for name in OUTSIDE for generator in (MUJOCO, OWN)}
+    assert all(len({n for n, _ in c.causes}) == 2 for c in cases if c.condition == PAIR)
+    assert place_of("payload", 0, 4) == ("payload", "L4")
+    assert place_of("link_inertia", 1, 3) == ("link_inertia", "L2")
+    assert place_of("delay", 2, 3) == ("delay", "all")
+    assert place_of("cable", 5, 4) == ("cable", "J2")
+
+
+def test_an_interval_of_none_of_sixty() -> None:
+    assert interval(0, 60) == pytest.approx((0.0, 5.96), abs=0.01)
+    assert interval(60, 60) == pytest.approx((94.04, 100.0), abs=0.01)
+
+
+def test_a_rotor_that_nobody_told_is_named() -> None:
+    answer = run(Case(SINGLE, OWN, (("armature", 2),), 11))
+    assert answer.truth == (("armature", "J3"),)
+    assert answer.right
+    assert 0.0 < answer.seconds < 20.0
