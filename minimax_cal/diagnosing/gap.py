@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.diagnosing.trial import Predicting, Trials
 from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
@@ -39,6 +41,33 @@ FAULTS = ("outliers", "swapped_rows", RESEAT)  # that are mended before anything
 Ends = tuple[float, float]
 
 
+class Fits(Sequence[Joint]):
+    """Geometry, then with each of some effects more; each fit is made when it is first asked for.
+
+    steps: the terms of each effect.
+    """
+
+    def __init__(self, study: Study, steps: Sequence[Sequence[Term]]) -> None:
+        self.study, self.steps = study, steps
+        self.made: dict[int, Joint] = {}
+
+    def __len__(self) -> int:
+        return 1 + len(self.steps)
+
+    @overload
+    def __getitem__(self, at: int) -> Joint: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[Joint]: ...
+    def __getitem__(self, at: int | slice) -> Joint | list[Joint]:
+        if isinstance(at, slice):
+            return [self[i] for i in range(*at.indices(len(self)))]
+        number = range(len(self))[at]
+        if number not in self.made:
+            terms = [term for some in self.steps[:number] for term in some]
+            self.made[number] = joint(self.study, terms)
+        return self.made[number]
+
+
 @dataclass(frozen=True, eq=False)
 class Ladder:
     """Geometry, then with each effect that helps.
@@ -48,7 +77,7 @@ class Ladder:
     parts: masks (m,) of those groups.
     """
 
-    fits: tuple[Joint, ...]
+    fits: Sequence[Joint]
     taken: tuple[int, ...]
     parts: tuple[Array, ...]
 
@@ -80,27 +109,28 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
     joint's angle, or of the time, are then believed only if the ends of what drives them, left out,
     are met no worse either: there a law that is not the machine's goes astray.
     """
-    part = folds(study.data, FOLDS)
-    fits, taken = [joint(study, ())], []
-    spared = fits[0].spared([part == number for number in range(FOLDS)])
+    part, trials = folds(study.data, FOLDS), Trials(study, effects)
+    last, taken = trials.trial(()), list[int]()
+    spared = last.spared([part == number for number in range(FOLDS)])
     mapped = any(EFFECTS[term.effect].is_map for terms in effects for term in terms)
-    waiting = by_size(study, effects) if mapped else list(range(len(effects)))
+    waiting = by_size(trials, study, effects) if mapped else list(range(len(effects)))
     while waiting:
         refused: list[tuple[int, int]] = []  # with how many were taken before
         for number in waiting:
-            terms = effects[number]
-            wide = joint(study, (*fits[-1].terms, *terms))
-            helps = wide.no_worse(fits[-1]) and tells(fits[-1], wide, wide.spared(spared))
-            if helps and not (wary and astray(fits[-1], wide, terms)):
-                fits.append(wide)
+            wide = trials.trial((*taken, number))
+            helps = wide.no_worse(last) and tells(last, wide, wide.spared(spared))
+            ends = ends_of(study.scene, effects[number][0]) if wary else []
+            if helps and not astray(last, wide, ends):
+                last = wide
                 taken.append(number)
             else:
                 refused.append((number, len(taken)))
         waiting = [number for number, before in refused if mapped and before < len(taken)]
-    return Ladder(tuple(fits), tuple(taken), tuple(spared))
+    fits = Fits(study, [effects[number] for number in taken])
+    return Ladder(fits, tuple(taken), tuple(spared))
 
 
-def tells(before: Joint, wide: Joint, folds: Sequence[Array]) -> bool:
+def tells(before: Predicting, wide: Predicting, folds: Sequence[Array]) -> bool:
     """Whether groups that are left out are met better with more effects.
 
     All alike, as they are claimed; or weighed as they can be foretold: where groups are clusters
@@ -111,30 +141,28 @@ def tells(before: Joint, wide: Joint, folds: Sequence[Array]) -> bool:
     return any(new < (1.0 - HELPS) * old for old, new in (alike, weighed))
 
 
-def by_size(study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:
+def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:
     """Effects in the order of how far they move the points beside what geometry does.
 
     All are fitted together; rows weigh as those in which they were sought.
     """
-    fit = joint(study, [term for terms in effects for term in terms])
-    moved: dict[str, Array] = {}
-    at, scene, rows = 0, study.scene, study.rows
-    for term in fit.terms:
-        fields = term.columns(scene).displacement(scene)
-        value = fit.state.effects[at : at + len(fields)]
-        at += len(fields)
-        moved[term.text] = rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
-    whole = np.zeros((len(effects), len(rows.error)))
+    whole, rows = np.zeros((len(effects), len(study.rows.error))), study.rows
+    values, at = trials.trial(range(len(effects))).values, 0
     for number, terms in enumerate(effects):
         for term in terms:
-            whole[number] += moved.get(term.text, 0.0)
+            if term.frees_frames:
+                continue
+            fields = term.columns(study.scene).displacement(study.scene)
+            value = values[at : at + len(fields)]
+            at += len(fields)
+            whole[number] += rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
     clear = whole - (whole @ rows.basis) @ rows.basis.T
     return [int(number) for number in np.argsort(-(clear**2).sum(axis=1), kind="stable")]
 
 
-def astray(before: Joint, wide: Joint, terms: Sequence[Term]) -> bool:
+def astray(before: Predicting, wide: Predicting, ends: Sequence[Array]) -> bool:
     """Whether the ends of what drives an effect are met worse with it, when they are left out."""
-    told = wide.spared(before.spared(ends_of(wide.study.scene, terms[0])))
+    told = wide.spared(before.spared(ends))
     return wide.cross_validated(told) > before.cross_validated(told)
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.fitting.beyond import moved, needed, step_without
+from minimax_cal.diagnosing.trial import Predicting
+from minimax_cal.fitting.beyond import moved
 from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
@@ -30,15 +31,13 @@ from minimax_cal.modelling.joint_fit import extended, fitted
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.bounded import bounded
-from minimax_cal.solvers.least_squares import solve_normal
 
 PASSES = 6  # of Gauss and Newton at most; columns of effects are made anew in each
 SETTLED = 1e-4  # relative change of the weighed square that ends them
-WORSE = 1e-3  # relative rise of the training error that is none
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class Joint(Predicting):
     """Geometry with some effects, fitted together.
 
     state: with the effects' values.  model: linear where the fit ended.
@@ -81,67 +80,12 @@ class Joint:
         """On the poses of the fit."""
         return accuracy(self.cell.error(self.study.data))
 
-    def no_worse(self, other: Joint) -> bool:
-        """Whether the poses of the fit are met as well as by another."""
-        return self.train.rms_mm <= (1.0 + WORSE) * other.train.rms_mm
-
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Of all parameters, by leaving out groups of poses; NaN on a bound."""
         units = names_of(self.terms, self.cell.scene(self.study.data))[1] if self.terms else ()
         group = clusters(self.study.data)
         return uncertainty_of(self.estimator, self.state, group, units)
-
-    @cached_property
-    def needs(self) -> dict[bytes, bool]:
-        """Of folds that were asked for, whether the fit needs them."""
-        return {}
-
-    @cached_property
-    def lefts(self) -> dict[bytes, Array]:
-        """Of folds that were asked for, what `left_at` told."""
-        return {}
-
-    def spared(self, folds: Sequence[Array]) -> list[Array]:
-        """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
-        for fold in folds:
-            if fold.tobytes() not in self.needs:
-                self.needs[fold.tobytes()] = needed(self.poses, fold)
-        return [fold for fold in folds if not self.needs[fold.tobytes()]]
-
-    def cross_validated(self, folds: Sequence[Array]) -> float:
-        """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
-        total = 0.0
-        if len(self.spared(folds)) < len(folds):
-            return float("inf")
-        for mine in folds:
-            total += float((self.left_at(mine) ** 2).sum())
-        return total
-
-    def foretold(self, folds: Sequence[Array], known: Joint) -> float:
-        """The same, errors weighed as one that is known foretells them without each fold.
-
-        left' (1 + A C A')^-1 left, C being the covariance of its parameters without the fold, over
-        the variance of a coordinate.  That is left' left - (A' left)' B^-1 (A' left), where B are
-        the products of all poses.  Where a fold alone tells a direction, its errors count little.
-        """
-        poses, total = known.poses, 0.0
-        for mine in folds:
-            left = self.left_at(mine)
-            score = np.einsum("mrp,mr->p", poses.jacobian[mine], left)
-            total += float(
-                (left**2).sum() - score @ solve_normal(poses.bread, score[:, None])[:, 0]
-            )
-        return total
-
-    def left_at(self, fold: Array) -> Array:
-        """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
-        mark = fold.tobytes()
-        if mark not in self.lefts:
-            step = step_without(self.poses, fold)
-            told = np.einsum("mrp,p->mr", self.poses.jacobian[fold], step)
-            self.lefts[mark] = np.asarray(self.poses.error[fold] - told)
-        return self.lefts[mark]
 
 
 def joint(study: Study, terms: Sequence[Term]) -> Joint:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.fitting.uncertainty import Poses
+from minimax_cal.fitting.uncertainty import Linearised
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
@@ -36,7 +36,7 @@ def unsized(terms: Sequence[Term], scene: Scene) -> list[slice]:
     return out
 
 
-def weights_of(poses: Poses, values: Array, parts: Sequence[slice]) -> Array:
+def weights_of(poses: Linearised, values: Array, parts: Sequence[slice]) -> Array:
     """(e,) weights of the priors, beside squares of errors [m^2 per unit^2]; 0 outside the parts.
 
     poses: linear at a state with effects of values (e,), the last of its parameters, all free.

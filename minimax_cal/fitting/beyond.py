@@ -16,7 +16,7 @@ import numpy as np
 
 from minimax_cal.fitting.identify import redundant
 from minimax_cal.fitting.intervals import max_interval, rms_interval, told
-from minimax_cal.fitting.uncertainty import Estimator, Poses
+from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
@@ -271,7 +271,7 @@ def pooled(every: Sequence[Accuracy]) -> float:
     return math.sqrt(total / count) if count else math.nan
 
 
-def needed(poses: Poses, part: Array, of: Array | None = None) -> bool:
+def needed(poses: Linearised, part: Array, of: Array | None = None) -> bool:
     """Whether a fit loses parameters, or much sureness, without some poses.
 
     part: mask (m,).  of: (p,) True for the parameters asked about, the others left out; all unless
@@ -290,7 +290,7 @@ def needed(poses: Poses, part: Array, of: Array | None = None) -> bool:
     return bool(kept < had or rest[-1] * whole[-had] > WORSE * whole[-1] * rest[-had])
 
 
-def step_without(poses: Poses, part: Array) -> Array:
+def step_without(poses: Linearised, part: Array) -> Array:
     """(p,) the step of the free parameters once some poses are left out.  part: mask (m,)."""
     gram, pull = poses.sums_of(part)
     left = poses.pull - pull + poses.prior * poses.off

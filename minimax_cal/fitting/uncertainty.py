@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import gammaincinv, stdtrit
@@ -99,6 +99,44 @@ def point_share(mu: Array, seen: Array) -> Array:
     out = np.zeros(seen.shape)
     out[seen] = np.maximum(mu * np.count_nonzero(seen), LEAST_POINT)
     return out
+
+
+class Linearised(Protocol):
+    """A fit at its solution: p free parameters, r coordinates a pose, of m poses."""
+
+    @property
+    def error(self) -> Array:
+        """(m, r) errors."""
+
+    @property
+    def jacobian(self) -> Array:
+        """(m, r, p) derivative by the free parameters."""
+
+    @property
+    def seen(self) -> Array:
+        """(k, m) which points were measured."""
+
+    @property
+    def prior(self) -> Array:
+        """(p,) weights of a prior."""
+
+    @property
+    def off(self) -> Array:
+        """(p,) how far the parameters are from the prior's mean."""
+
+    @property
+    def bread(self) -> Array:
+        """(p, p) normal matrix, the prior in it."""
+
+    @property
+    def pull(self) -> Array:
+        """(p,) J'e of all poses."""
+
+    def sums_of(self, part: Array) -> tuple[Array, Array]:
+        """Normal matrix (p, p), without the prior, and J'e (p,) of some poses.  part: mask (m,)."""
+
+    def gram_of(self, part: Array) -> Array:
+        """(p, p) normal matrix of some poses, without the prior.  part: mask (m,)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from minimax_cal.diagnosing.gap import (
     with_shares,
 )
 from minimax_cal.diagnosing.joint import Joint, joint
+from minimax_cal.diagnosing.trial import Trial
 from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.limits import FOLDS
@@ -150,7 +151,7 @@ def test_a_rung_has_to_help_by_so_much(play: Study, monkeypatch: pytest.MonkeyPa
 def test_what_meets_the_training_poses_worse_is_no_rung(
     play: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Joint, "no_worse", lambda self, other: False)
+    monkeypatch.setattr(Trial, "no_worse", lambda self, other: False)
     assert climbed(play, [(PLAY,)]).taken == ()
 
 

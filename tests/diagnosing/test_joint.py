@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.gap import climbed, folds
 from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import SUM, Study, studied
+from minimax_cal.diagnosing.trial import Trials
 from minimax_cal.fitting.options import Options, silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.measuring.accuracy import accuracy
@@ -98,11 +99,27 @@ def test_what_rounding_leaves_of_a_bound_is_at_it() -> None:
 
 
 def test_a_fit_is_worse_beyond_a_part_in_a_thousand(play: Study) -> None:
-    fit = joint(play, ())
+    fit = Trials(play, ()).trial(())
     for factor, no_worse in ((0.9995, True), (0.998, False), (2.0, True)):
-        other = replace(fit)
-        other.__dict__["train"] = replace(fit.train, rms_mm=factor * fit.train.rms_mm)
-        assert fit.no_worse(other) == no_worse
+        linear = replace(fit.linear)
+        linear.__dict__["error"] = factor * fit.linear.error
+        assert fit.no_worse(replace(fit, linear=linear)) == no_worse
+
+
+def test_a_trial_is_the_joint_fit_to_first_order(play: Study) -> None:
+    """Values and errors on groups left out, beside an effect of several parameters and a bound."""
+    wave = (Term("gear_error", "J3", {"turns": 1.0}), Term("gear_error", "J3", {"turns": 2.0}))
+    trials = Trials(play, [(PLAY,), wave, (SOFT,)])
+    part = folds(play.data, 5)
+    masks = [part == number for number in range(5)]
+    for numbers in ((), (0,), (1, 0), (0, 1, 2)):
+        terms = [term for i in numbers for term in ((PLAY,), wave, (SOFT,))[i]]
+        one, exact = trials.trial(numbers), joint(play, terms)
+        assert_allclose(one.values, exact.state.effects, rtol=2e-2, atol=2e-6)
+        assert_allclose(one.cross_validated(masks), exact.cross_validated(masks), rtol=1e-2)
+        assert_allclose(one.foretold(masks, one), exact.foretold(masks, exact), rtol=1e-2)
+        square = float(np.nansum(exact.cell.error(play.data) ** 2))
+        assert_allclose(one.square, square, rtol=1e-3)
 
 
 def test_no_effect_moves_a_point_by_more_than_a_fiftieth_of_the_reach(play: Study) -> None:

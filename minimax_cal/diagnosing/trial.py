@@ -1,0 +1,239 @@
+"""Effects tried together with the geometry: linear at the geometric fit, no column made twice.
+
+Every step of the error budget compares fits of some of the same columns.  The columns are made
+once, and a trial is the solution of its share of one set of normal equations.  What a second pass
+would change is of second order in the effects; the fits that are kept are exact (`joint`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from minimax_cal.diagnosing.sizes import unsized, weights_of
+from minimax_cal.diagnosing.study import Study
+from minimax_cal.fitting.beyond import needed, step_without
+from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
+from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.bounds import at_bounds, bounds
+from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.joint_fit import extended
+from minimax_cal.solvers.bounded import bounded
+from minimax_cal.solvers.least_squares import solve_normal
+
+MAX_RISE = 1e-3  # of the training error, relative: more is worse
+
+
+class Predicting:
+    """A linearised fit that predicts groups of poses, each without that group."""
+
+    @property
+    def poses(self) -> Linearised:
+        """Where the fit ended."""
+        raise NotImplementedError
+
+    @cached_property
+    def needs(self) -> dict[bytes, bool]:
+        """Of folds that were asked for, whether the fit needs them."""
+        return {}
+
+    @cached_property
+    def lefts(self) -> dict[bytes, Array]:
+        """Of folds that were asked for, what `left_at` found."""
+        return {}
+
+    def spared(self, folds: Sequence[Array]) -> list[Array]:
+        """The folds, masks (m,) of the poses, without which the fit keeps all of its parameters."""
+        for fold in folds:
+            if fold.tobytes() not in self.needs:
+                self.needs[fold.tobytes()] = needed(self.poses, fold)
+        return [fold for fold in folds if not self.needs[fold.tobytes()]]
+
+    def cross_validated(self, folds: Sequence[Array]) -> float:
+        """Sum of squares at folds left out in turn [m^2], linear; infinite where one is needed."""
+        if len(self.spared(folds)) < len(folds):
+            return float("inf")
+        return sum((float((self.left_at(fold) ** 2).sum()) for fold in folds), 0.0)
+
+    def foretold(self, folds: Sequence[Array], known: Predicting) -> float:
+        """The same, errors weighed as a known fit predicts them without each fold.
+
+        left' (1 + A C A')^-1 left, C being the covariance of its parameters without the fold, over
+        the variance of a coordinate.  That is left' left - (A' left)' B^-1 (A' left), where B are
+        the products of all poses.  Where a direction is identified by a fold alone, its errors
+        count little.
+        """
+        poses, total = known.poses, 0.0
+        for fold in folds:
+            left = self.left_at(fold)
+            score = np.tensordot(poses.jacobian[fold], left, ((0, 1), (0, 1)))
+            total += float(
+                (left**2).sum() - score @ solve_normal(poses.bread, score[:, None])[:, 0]
+            )
+        return total
+
+    def left_at(self, fold: Array) -> Array:
+        """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
+        mark = fold.tobytes()
+        if mark not in self.lefts:
+            step = step_without(self.poses, fold)
+            self.lefts[mark] = self.poses.error[fold] - self.poses.jacobian[fold] @ step
+        return self.lefts[mark]
+
+
+class Trials:
+    """Columns of geometry and effects, made once at the geometric fit."""
+
+    def __init__(self, study: Study, effects: Sequence[Sequence[Term]]) -> None:
+        free, scene = study.fit.effects.terms, study.scene
+        parts = [[term for term in terms if not term.frees_frames] for terms in effects]
+        every = [*free, *(term for terms in parts for term in terms)]
+        model, state = study.model.only(study.fit.identification.active), study.fit.state
+        if every:
+            model, state = extended(model, study.robot, study.data, state, every)
+        self.whole = Poses.of(Estimator(model, np.ones(len(model.y))), state)
+        self.error, self.jacobian = self.whole.error, self.whole.jacobian
+        allowed = bounds(scene, every)
+        count = self.jacobian.shape[2] - len(allowed)
+        inf = np.full((count, 2), np.inf) * [-1.0, 1.0]
+        self.allowed = np.concatenate([inf, allowed])
+        starts = np.cumsum([count, *(len(term.columns(scene).names) for term in every)])
+        self.geometry = np.arange(starts[len(free)])
+        # of each effect: columns, and which of them have priors of their own size
+        self.columns: list[Array] = []
+        self.sized: list[list[Array]] = []
+        at = len(free)
+        for terms in parts:
+            spans = [np.arange(starts[at + i], starts[at + i + 1]) for i in range(len(terms))]
+            at += len(terms)
+            self.columns.append(np.concatenate([np.arange(0), *spans]))
+            self.sized.append(
+                [span[part] for term, span in zip(terms, spans, strict=True)
+                 for part in unsized([term], scene)]
+            )  # fmt: skip
+        self.known: dict[bytes, tuple[Array, Array]] = {}
+
+    def sums_of(self, part: Array) -> tuple[Array, Array]:
+        """J'J (p, p) and J'e (p,) of some poses.  part: mask (m,)."""
+        mark = part.tobytes()
+        if mark not in self.known:
+            rows = self.jacobian[part].reshape(-1, self.jacobian.shape[2])
+            self.known[mark] = rows.T @ rows, rows.T @ self.error[part].ravel()
+        return self.known[mark]
+
+    def trial(self, numbers: Sequence[int]) -> Trial:
+        """Geometry with some of the effects, by their numbers."""
+        index = np.concatenate([self.geometry, *(self.columns[i] for i in numbers)])
+        start = Linear(self, index, np.zeros(len(index)), np.zeros(len(index)))
+        first, place = len(self.geometry), {at: i for i, at in enumerate(index.tolist())}
+        parts = [
+            slice(place[int(span[0])] - first, place[int(span[-1])] + 1 - first)
+            for i in numbers
+            for span in self.sized[i]
+        ]
+        weight = np.zeros(len(index))
+        weight[first:] = weights_of(start, np.zeros(len(index) - first), parts)
+        bread = start.bread + np.diag(weight)
+        pull = start.pull + start.prior * start.off
+        step = bounded(bread, pull, *self.allowed[index].T)
+        rests = at_bounds(step, self.allowed[index])
+        return Trial(Linear(self, index, step, weight, rests), step[first:])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Some of the columns, after a step of their parameters.
+
+    index: (p,) of all columns.  step: (p,).  weight: (p,) of priors of mean 0 besides the model's.
+    rests: (p,) True for parameters at a bound, which are not free.
+    """
+
+    trials: Trials
+    index: Array
+    step: Array
+    weight: Array
+    rests: Array | None = None
+
+    @cached_property
+    def free(self) -> Array:
+        """(q,) where the free parameters stand among the p."""
+        every = np.arange(len(self.index))
+        return every if self.rests is None else every[~self.rests]
+
+    @cached_property
+    def error(self) -> Array:
+        """(m, r) errors."""
+        return np.asarray(self.trials.error - self.trials.jacobian[..., self.index] @ self.step)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(m, r, q) derivative by the free parameters."""
+        return np.asarray(self.trials.jacobian[..., self.index[self.free]])
+
+    @cached_property
+    def prior(self) -> Array:
+        """(q,) its weights."""
+        return np.asarray((self.trials.whole.prior[self.index] + self.weight)[self.free])
+
+    @cached_property
+    def off(self) -> Array:
+        """(q,) how far the parameters are from the prior's mean."""
+        return np.asarray((self.trials.whole.off[self.index] - self.step)[self.free])
+
+    @property
+    def seen(self) -> Array:
+        """(k, m) which points were measured."""
+        return self.trials.whole.seen
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """`sums_of` all poses."""
+        return self.sums_of(np.ones(len(self.trials.error), dtype=bool))
+
+    @cached_property
+    def bread(self) -> Array:
+        """(q, q) normal matrix."""
+        return np.asarray(self.sums[0] + np.diag(self.prior))
+
+    @property
+    def pull(self) -> Array:
+        """(q,) J'e of all poses."""
+        return self.sums[1]
+
+    def sums_of(self, part: Array) -> tuple[Array, Array]:
+        """J'J (q, q) and J'e (q,) of some poses.  part: mask (m,)."""
+        gram, pull = self.trials.sums_of(part)
+        own = self.index[self.free]
+        return gram[np.ix_(own, own)], pull[own] - gram[np.ix_(own, self.index)] @ self.step
+
+    def gram_of(self, part: Array) -> Array:
+        """(q, q) J'J of some poses.  part: mask (m,)."""
+        return self.sums_of(part)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial(Predicting):
+    """Geometry with some effects, fitted together in one step.
+
+    linear: where the step ends.  values: (e,) of the effects' parameters.
+    """
+
+    linear: Linear
+    values: Array
+
+    @property
+    def poses(self) -> Linear:
+        """Where the step ends."""
+        return self.linear
+
+    @property
+    def square(self) -> float:
+        """Sum of squares at the poses of the fit [m^2]."""
+        return float((self.linear.error**2).sum())
+
+    def no_worse(self, other: Trial) -> bool:
+        """Whether the poses of the fit are predicted as well as by another."""
+        return self.square <= (1.0 + MAX_RISE) ** 2 * other.square
