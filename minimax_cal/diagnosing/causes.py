@@ -16,7 +16,8 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.what_remains import left_by, loudest
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.library import Candidate, Library
+from minimax_cal.evidence.bench import Added
+from minimax_cal.evidence.library import Library
 from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.evidence.remains import Remains, rest_of
 from minimax_cal.evidence.selection import Choice
@@ -72,7 +73,7 @@ def causes_of(
     plain, study = study, weighed_anew(study, choice.known, each=clear)
     if study is not plain:
         progress("effects beside noises that differ")
-        lib, choice = chosen(study, exclude, choice.chosen)
+        lib, choice = chosen(study, exclude, choice.found)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
@@ -151,7 +152,7 @@ def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
 
 
 def chosen(
-    study: Study, exclude: Sequence[str], first: Sequence[Candidate] = ()
+    study: Study, exclude: Sequence[str], first: Sequence[Added] = ()
 ) -> tuple[Library, Choice]:
     """The library and what it explains.  first: what was chosen with other weights."""
     lib = arm_library(study.scene, study.rows, exclude)

@@ -13,7 +13,8 @@ from scipy.special import fdtrc
 from minimax_cal.evidence.library import Aside, Candidate, Kind, Library, kinds
 from minimax_cal.evidence.limits import CREDIBLE, LINES
 from minimax_cal.evidence.noise import Noise, inflation, triangles
-from minimax_cal.evidence.products import LEAST, At, within
+from minimax_cal.evidence.products import LEAST, At, Products, within
+from minimax_cal.evidence.sweeping import Swept
 from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.bounded import bounded
 
@@ -211,8 +212,15 @@ class Bench:
     def wide(self, one: Added) -> float:
         """By how much rows are noisier along a candidate than all together."""
         at = int(np.argmax(self.settings.ratios == one.ratio))
-        field, rest = self.fixed.white(self.library.fields(one.candidate)[: len(one.value)], at)
-        return inflation(one.value @ field, rest, self.library.rows.group, self.dof)
+        motion = one.value @ self.library.fields(one.candidate)[: len(one.value)]
+        field, rest = self.fixed.white(motion[None], at)[0], self.errors[at]
+        return inflation(field, rest, self.library.rows.group, self.dof)
+
+    @cached_property
+    def errors(self) -> Array:
+        """(s, N) the error at each ratio, projected, its rows of the same variance."""
+        error, ratios = self.fixed.error[None], range(len(self.settings.ratios))
+        return np.concatenate([self.fixed.white(error, at) for at in ratios])
 
     def likeness(self, one: Added, other: Candidate) -> tuple[float, float]:
         """lambda of an effect found, and rho^2: the share of its motion that another imitates."""
@@ -263,15 +271,22 @@ class Bench:
 class Fixed:
     """What is projected out, in rows, for columns that are stored nowhere.
 
-    rows: (f, N).  factors: (s, f, f) lower triangles of the rows' products.  weights: (s, N).
-    before: (s, f) as in `Settings`.  error: (N,).
+    products, index: geometry's columns and some of the candidates' (q,).  factors: (s, f, f) lower
+    triangles of the rows' products.  weights: (s, N).  before: (s, f) as in `Settings`.
+    error: (N,).
     """
 
-    rows: Array
+    products: Products | Swept
+    index: Array
     factors: Array
     weights: Array
     before: Array
     error: Array
+
+    @cached_property
+    def rows(self) -> Array:
+        """(f, N)."""
+        return np.concatenate([self.products.geometry(), self.products.clear(self.index)])
 
     def gram(self, columns: Array, at: int) -> Array:
         """(d, d) products of columns (d, N), projected, at one of the ratios."""
@@ -279,15 +294,12 @@ class Fixed:
         part = solve_triangular(self.factors[at], self.rows @ own.T, lower=True)
         return np.asarray(own @ columns.T - part.T @ part)
 
-    def white(self, columns: Array, at: int) -> tuple[Array, Array]:
-        """Columns (d, N) and the error (N,), projected, their rows of the same variance."""
-        both = np.concatenate([columns, self.error[None]])
-        root = np.sqrt(self.weights[at])
+    def white(self, columns: Array, at: int) -> Array:
+        """Columns (d, N), projected, their rows of the same variance."""
         factor = self.factors[at]
-        part = solve_triangular(factor, self.rows @ (both * self.weights[at]).T, lower=True)
+        part = solve_triangular(factor, self.rows @ (columns * self.weights[at]).T, lower=True)
         value = solve_triangular(factor, part, lower=True, trans="T")
-        left = (both - value.T @ self.rows) * root
-        return left[:-1], left[-1]
+        return np.asarray((columns - value.T @ self.rows) * np.sqrt(self.weights[at]))
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
@@ -347,7 +359,8 @@ def bench(lib: Library, chosen: Sequence[Candidate], fits: Sequence[Added] = ())
         own=at.among,
     )
     held = Fixed(
-        np.concatenate([products.geometry(), products.clear(index)]),
+        products,
+        index,
         stacked(at.factor, at.part[:, :, 1:], factor),
         products.kept / (1.0 + np.outer(ratios, rows.variance_ratio)),
         np.concatenate([at.part[:, :, 0], before], axis=1),

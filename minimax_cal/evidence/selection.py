@@ -112,7 +112,7 @@ def select(
     *,
     ripple: bool = True,
     level: float = LEVEL,
-    first: Sequence[Candidate] = (),
+    first: Sequence[Added] = (),
 ) -> Choice:
     """Forward selection behind a Bonferroni gate, with replacement, dropping and noise updates.
 
@@ -164,17 +164,18 @@ def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
     return fits
 
 
-def begun(lib: Library, first: Sequence[Candidate]) -> tuple[Library, list[Added]]:
-    """The library and the effects that were chosen of another, in their order."""
+def begun(lib: Library, first: Sequence[Added]) -> tuple[Library, list[Added]]:
+    """The library and the effects chosen of another, in their order, with their values."""
     fits: list[Added] = []
     known = {c.text: c for c in lib.candidates}
-    for c in first:
+    for one in first:
+        c = one.candidate
         mine = known.get(c.text) or next(iter(lib.with_terms([(c.term, c.tries)])), None)
         if mine is None:
             continue
         if c.text not in known:
             lib = replace(lib, candidates=(*lib.candidates, mine))
-        fits.append(bench(lib, [one.candidate for one in fits], fits).added(mine))
+        fits.append(replace(one, candidate=mine))
     return lib, fits
 
 
