@@ -178,8 +178,8 @@ def test_one_law_of_another_course_is_one_name(law: str, place: str, key: tuple[
 def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
     made = opened("irb120", Cause("backlash", "J2", 500.0))
     lib, choice = chosen(made, ())
-    (right,) = choice.chosen
-    idle = next(c for c in lib.candidates if c.key == ("gear_error", "J4"))
+    (right,) = choice.found
+    idle = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("gear_error", "J4")))
     again = select(lib, first=(idle, right))
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
 
@@ -187,7 +187,7 @@ def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
 def test_the_only_one_that_other_weights_chose_is_compared_anew() -> None:
     made = opened("irb120", Cause("backlash", "J2", 500.0))
     lib, _ = chosen(made, ())
-    alike = next(c for c in lib.candidates if c.key == ("settling", "J2"))
+    alike = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("settling", "J2")))
     again = select(lib, first=(alike,))
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
 
