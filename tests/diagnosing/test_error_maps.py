@@ -242,6 +242,6 @@ def test_a_ladder_keeps_a_map_whatever_its_place_among_the_effects(
     bare = climbed(study, [(law,)])
     assert no_worse(ladder, bare)
     assert not no_worse(bare, ladder)
-    monkeypatch.setattr(gap, "by_size", lambda study, effects: list(range(len(effects))))
+    monkeypatch.setattr(gap, "by_size", lambda trials, study, effects: list(range(len(effects))))
     again = climbed(study, effects)  # the curve by itself is refused, and tried again
     assert again.taken == ladder.taken

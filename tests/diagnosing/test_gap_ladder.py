@@ -33,10 +33,10 @@ from minimax_cal.diagnosing.gap import (
     valued,
     with_shares,
 )
-from minimax_cal.diagnosing.joint import Joint, joint
-from minimax_cal.diagnosing.trial import Trial
+from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
+from minimax_cal.diagnosing.trial import Trial
 from minimax_cal.evidence.limits import FOLDS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
