@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import click
@@ -63,6 +64,7 @@ DRIFT = 3e-5  # usual drift of a joint's zero during a session [rad]
 COMMANDS = {  # and where what they name is kept
     "compare": "compared", "check": "checked", "calibrate": "fitted", "diagnose": "diagnosed",
 }  # fmt: skip
+Names = tuple[str, ...] | None  # that a command names; None where it was not asked, or could not
 NOT_MOVED, DRAWN, AS_NOISE = "", "as drawn", "as noise"  # how lack of fit counts
 
 
@@ -72,7 +74,8 @@ class Job:
 
     arm: of `ARMS`, or of `REAL` where is_real.  way: time, or a joint's number from 1.  moved:
     how the lack of fit counts in the noncentrality of a joint's shift in the second half, or
-    nothing where none is shifted.  flip: whether the second half comes first.
+    nothing where none is shifted.  flip: whether the second half comes first.  commands: that are
+    asked.
     """
 
     arm: str
@@ -81,6 +84,7 @@ class Job:
     moved: str = NOT_MOVED
     flip: bool = False
     is_real: bool = False
+    commands: tuple[str, ...] = tuple(COMMANDS)
 
 
 @dataclass(frozen=True)
@@ -91,10 +95,10 @@ class Found:
     joint: that was moved, as J3; shift: by how much [mrad].
     """
 
-    compared: tuple[str, ...] | None
-    checked: tuple[str, ...] | None
-    fitted: tuple[str, ...] | None = None
-    diagnosed: tuple[str, ...] | None = None
+    compared: Names = None
+    checked: Names = None
+    fitted: Names = None
+    diagnosed: Names = None
     joint: str = ""
     shift: float = 0.0
 
@@ -242,7 +246,7 @@ def place(term: str) -> str:
     return at if effect == ENCODER_ZERO.name else term
 
 
-def in_one_fit(robot: object, both: Measurements) -> tuple[str, ...] | None:
+def in_one_fit(robot: object, both: Measurements) -> Names:
     """What one fit of two sessions says has moved of arm and reflectors."""
     try:
         fit = calibrate(robot, both, "sum")  # type: ignore[arg-type]
@@ -252,7 +256,7 @@ def in_one_fit(robot: object, both: Measurements) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys(map(place, labels)))
 
 
-def in_one_diagnosis(robot: object, both: Measurements) -> tuple[str, ...] | None:
+def in_one_diagnosis(robot: object, both: Measurements) -> Names:
     """What a diagnosis of two sessions has confirmed of what moved."""
     try:
         found = diagnose(robot, both, quick=True)  # type: ignore[arg-type]
@@ -267,23 +271,32 @@ def in_one_diagnosis(robot: object, both: Measurements) -> tuple[str, ...] | Non
     return tuple(dict.fromkeys(named))
 
 
+def of_halves(job: Job, robot: object, data: Measurements, first: Array) -> dict[str, Names]:
+    """What `compare` of both halves and `check` of the first by the second name, if they can."""
+    if not {"compare", "check"} & set(job.commands):
+        return {}
+    out: dict[str, Names] = {}
+    with suppress(CalibrationError):  # half a session may not calibrate the arm
+        a, b = (calibrate(robot, data.take(half), "sum") for half in (first, ~first))  # type: ignore[arg-type]
+        out["compared"] = tuple(dict.fromkeys(m.joint for m in compare(a, b).changed))
+        moved = check(a, data.take(~first), "rms 0.5").moved
+        out["checked"] = tuple(dict.fromkeys(m.joint for m in moved))
+    return out
+
+
 def run(job: Job) -> Found:
     """Both halves calibrated, compared, the first checked by the second, and both in one fit."""
     warnings.simplefilter("ignore", CalibrationWarning)
     robot, data, first, joint, shift = session(job)
     if job.flip:
         first = ~first
-    early, late = data.take(first), data.take(~first)
-    compared = checked = None
-    try:
-        a, b = (calibrate(robot, half, "sum") for half in (early, late))  # type: ignore[arg-type]
-        compared = tuple(dict.fromkeys(m.joint for m in compare(a, b).changed))
-        checked = tuple(dict.fromkeys(m.joint for m in check(a, late, "rms 0.5").moved))
-    except CalibrationError:
-        pass  # half a session does not calibrate the arm, or cannot be checked
+    found = of_halves(job, robot, data, first)
     both = as_sessions(data, first, job.seed)
-    fitted, diagnosed = in_one_fit(robot, both), in_one_diagnosis(robot, both)
-    return Found(compared, checked, fitted, diagnosed, joint, 1e3 * shift)
+    if "calibrate" in job.commands:
+        found["fitted"] = in_one_fit(robot, both)
+    if "diagnose" in job.commands:
+        found["diagnosed"] = in_one_diagnosis(robot, both)
+    return Found(**found, joint=joint, shift=1e3 * shift)
 
 
 def real_jobs(seed: int) -> Iterator[Job]:
@@ -347,10 +360,14 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
 @click.command()
 @study_options("one_session")
 @click.option("--arms", "count", type=int, default=200, show_default=True, help="Simulated ones.")
-def main(study: Study, count: int) -> None:
+@click.option("--real/--no-real", "with_real", default=True, help="Whether real arms, too.")
+@click.option("--command", "commands", type=click.Choice(list(COMMANDS)), multiple=True,
+              default=tuple(COMMANDS), help="Ask these alone.")  # fmt: skip
+def main(study: Study, count: int, with_real: bool, commands: tuple[str, ...]) -> None:
     """Rates at which halves of one session are said to differ, and at which a move is found."""
     jobs = list(simulated_jobs(study.seed, 4 if study.quick else count))
-    jobs += [] if study.quick else list(real_jobs(study.seed))
+    jobs += list(real_jobs(study.seed)) if with_real and not study.quick else []
+    jobs = [replace(job, commands=commands) for job in jobs]
     results = study.sweep(run, jobs, "halves of a session")
     table = Table(
         f"halves of one session; a joint moved has a noncentrality of {LAMBDA:g}",

@@ -16,7 +16,7 @@ from minimax_cal.fitting.options import Options
 @click.command(name="relative", cls=InGroups)
 @ROBOT
 @DATA
-@options_from(Options, "holdout", "seed", "fix", "free")
+@options_from(Options, "holdout", "seed", "fix", "free", "priors")
 @options_from(RelativeOptions)
 @options_from(Options, "method")
 @result_options("the result (JSON)")

@@ -266,7 +266,12 @@ def check_options(options: Options) -> None:
     ):
         if length is not None and not 0.0 < length < np.inf:
             raise OptionError(f"{name} {length:g} m: must be positive and finite")
-    for pattern, sigma in options.priors.items():
+    check_priors(options.priors)
+
+
+def check_priors(priors: Mapping[str, float]) -> None:
+    """Raise OptionError for a sigma that says nothing.  priors: sigma by name or pattern [SI]."""
+    for pattern, sigma in priors.items():
         if not (np.isfinite(sigma) and sigma > 0.0):
             raise OptionError(f"prior {pattern}: sigma {sigma:g} must be positive")
         if not LEAST_SIGMA <= sigma <= MOST_SIGMA:

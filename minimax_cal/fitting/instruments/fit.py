@@ -11,10 +11,16 @@ from minimax_cal.fitting.fit import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
 from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified
-from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, wishes
+from minimax_cal.fitting.instruments.options import (
+    Progress,
+    RelativeOptions,
+    sigmas_of,
+    wishes,
+)
 from minimax_cal.fitting.instruments.rows import (
     Closures,
     Instrument,
+    Known,
     Squares,
     Wires,
     arm_at,
@@ -22,13 +28,16 @@ from minimax_cal.fitting.instruments.rows import (
 )
 from minimax_cal.fitting.instruments.split import before_and_after, free_numbers, misclosures
 from minimax_cal.fitting.instruments.start import ball_start, wire_start
+from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.grouping import groups
-from minimax_cal.modelling.parameters import State
+from minimax_cal.modelling.parameters import State, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
+
+SETTLED = 0.01  # relative change of the noise that ends the weighing of priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,40 +94,78 @@ def fit_instrument(
     progress("start")
     instrument = instrument_of(robot, train, options)
     allowed, wanted = allowed_of(robot, instrument, options)
+    known = known_of(robot, instrument, options)
+    held = np.pad(np.isfinite(known.sigma), (0, len(allowed) - len(known.sigma)))
     nominal = start_of(robot, instrument, train.at.q, allowed)
     progress("identifiable parameters")
-    unknowns = generic_count(robot, instrument, nominal, allowed)
+    unknowns = generic_count(robot, instrument, nominal, allowed & ~held)
     numbers = check_count(train, unknowns, len(options.known_distances))
-    known = identified(robot, instrument, nominal, allowed, wanted, resolution=options.resolution)
-    progress("least squares")
-    found = least_squares.solve(
-        Squares(instrument, known.active),
-        nominal.batch(),
-        1,
-        float(instrument.points),
-        method_of(options.method),
-        least_squares.NEAR,
+    found = identified(
+        robot, instrument, nominal, allowed, wanted, known=held, resolution=options.resolution
     )
-    state = found.x.take(np.array(0))
-    covariance = covariance_of(instrument, state, known.active, float(found.cost[0]), numbers)
-    return InstrumentFit(instrument, nominal, state, known, found, numbers, covariance)
+    progress("least squares")
+    problem = Squares(instrument, found.active, known)
+    problem, ended = believed(problem, nominal, numbers, options)
+    state = ended.x.take(np.array(0))
+    return InstrumentFit(
+        instrument, nominal, state, found, ended, numbers, covariance_of(problem, state, numbers)
+    )
 
 
-def covariance_of(
-    instrument: Instrument, x: State, active: Array, cost: float, numbers: int
-) -> Array:
+def known_of(robot: Robot, instrument: Instrument, options: RelativeOptions) -> Known:
+    """What the user knows of the links."""
+    return Known(links_of(robot.mdh), sigmas_of(instrument.names, options))
+
+
+def believed(
+    problem: Squares, begin: State, numbers: int, options: RelativeOptions
+) -> tuple[Squares, LeastSquares[State]]:
+    """Least squares; with priors, weighed against the noise that remains.
+
+    The problem with the weights that it ended with.  As `solve.Task.squares` does.
+    """
+
+    def solved(problem: Squares) -> LeastSquares[State]:
+        points, method = float(problem.instrument.points), method_of(options.method)
+        return least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
+
+    if problem.known is None or not problem.known.any:
+        return problem, solved(problem)
+    count = problem.instrument.names.count
+    variance = float(problem.normal(begin.batch())[0][0]) / numbers
+    for _ in range(PRIOR_ROUNDS):
+        problem = replace(problem, weight=problem.known.weights(variance, count))
+        found = solved(problem)
+        previous, variance = variance, noise_of(problem, found.x.take(np.array(0)), numbers)
+        if abs(variance - previous) <= SETTLED * previous:
+            break
+    return problem, found
+
+
+def noise_of(problem: Squares, x: State, numbers: int) -> float:
+    """Variance of a number by what a fit leaves [m^2]; a prior pays for parameters of its own."""
+    error, jacobian = problem.instrument.rows(x, problem.active)
+    gram = jacobian @ jacobian.T
+    held = np.diag(problem.weight[problem.active]) if len(problem.weight) else 0.0 * gram
+    paid = float(np.trace(solve_normal(gram + held, gram)))
+    least = LEAST_NOISE**2 if len(problem.weight) else 0.0
+    return max(float(error @ error) / max(numbers - paid, 1.0), least)
+
+
+def covariance_of(problem: Squares, x: State, numbers: int) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
-    s^2 H^-1 F H^-1 with H = sum w j j' and F = sum w^2 j j' over the rows j of weight w: a known
-    distance weighs much and is no surer than a coordinate.  s^2: cost over spare numbers.
+    s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
+    the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: cost over
+    spare numbers.
     """
-    _, jacobians = instrument.rows(x, active)
-    weight = instrument.weights
-    bread = solve_normal(jacobians @ jacobians.T, np.eye(len(jacobians)))
-    meat = (jacobians * weight) @ jacobians.T
-    variance = cost / max(numbers - len(jacobians), 1)
+    active = problem.active
+    _, jacobians = problem.instrument.rows(x, active)
+    known = np.diag(problem.weight[active]) if len(problem.weight) else np.zeros((1, 1))
+    bread = solve_normal(jacobians @ jacobians.T + known, np.eye(len(jacobians)))
+    meat = (jacobians * problem.instrument.weights) @ jacobians.T + known
     covariance = np.full((len(active),) * 2, np.nan)
-    covariance[np.ix_(active, active)] = variance * bread @ meat @ bread
+    covariance[np.ix_(active, active)] = noise_of(problem, x, numbers) * bread @ meat @ bread
     return covariance
 
 

@@ -120,12 +120,13 @@ def identified(
     allowed: Array,
     wanted: Array,
     *,
+    known: Array,
     resolution: float = RESOLUTION,
 ) -> Identification:
     """The largest set of allowed parameters that the measurements determine; see `identify`.
 
     x: the arm as drawn, with the instrument's own parameters fitted to it.  wanted: (p,) those to
-    give up last.
+    give up last.  known: (p,) True where a prior stands in for measurements.
     """
     names = instrument.names
     reference = reference_of(robot, instrument, x)
@@ -146,7 +147,8 @@ def identified(
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active, order, RANK)
     kept = kept.without(gone, SAME_MOTION).without([i for i in gone if i in keeper], SCALE)
-    kept = kept.without(redundant(gram, kept.active, order, resolution), NOT_TOLD)
+    told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK), 0.0))
+    kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
     anchors = {name.partition("_")[0] for name in names.all if name.startswith("anchor")}
     return kept.identification(gram, scale, anchors, "all anchors moved together")
 

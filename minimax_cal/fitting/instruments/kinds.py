@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from minimax_cal.fitting.instruments.options import (
 )
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.split import held_out
-from minimax_cal.fitting.options import listed
+from minimax_cal.fitting.options import listed, sigmas_of
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
@@ -41,6 +41,7 @@ def relative(
     offset: bool = False,
     known_distances: Sequence[Known] = (),
     lever: float | None = None,
+    priors: Mapping[str, float | str] | None = None,
     method: str = AUTO,
     resolution: float = RESOLUTION,
 ) -> RelativeCalibration:
@@ -50,7 +51,8 @@ def relative(
     share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as ``beta*``.
     offset: of lengths, fit a constant one of each wire.  known_distances: of closures, sockets A, B
     and the distance of their centres [m].  lever: of poses, what a radian counts as [m]; the
-    file's own unless given.  method: of the least squares.  resolution: relative singular value
+    file's own unless given.  priors: sigma of a parameter's deviation from nominal, by name [m,
+    rad], or a text as 5mm.  method: of the least squares.  resolution: relative singular value
     that counts as not measured.  Raises CalibrationError for wrong input; how the numbers ended is
     in the result's `status`.
 
@@ -64,6 +66,7 @@ def relative(
         offset=offset,
         known_distances=known_distances,
         lever=lever,
+        priors=sigmas_of(priors or {}),
         method=method,
         resolution=resolution,
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.options import Options, check_priors
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
@@ -47,7 +47,8 @@ class RelativeOptions:
     holdout: share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as
     ``beta*``.  offset: fit a constant offset of each wire.  known_distances: sockets A, B and the
     distance of their centres [m].  lever: of poses, metres that a radian counts as; None for the
-    file's own.  method: of the least squares.  resolution: relative singular value that counts as
+    file's own.  priors: sigma of a parameter's deviation from nominal by name or pattern [m, rad].
+    method: of the least squares.  resolution: relative singular value that counts as
     not measured.
     """
 
@@ -76,12 +77,14 @@ class RelativeOptions:
         "mm",
         group="What is fitted",
     )
+    priors: Mapping[str, float] = field(default_factory=dict)
     method: str = Options.method
     resolution: float = Options.resolution
 
     def settings(self) -> dict[str, object]:
         """For the record."""
-        return {**vars(self), "known_distances": [list(known) for known in self.known_distances]}
+        told = [list(known) for known in self.known_distances]
+        return {**vars(self), "known_distances": told, "priors": dict(self.priors)}
 
 
 def check_options(data: RelativeData, options: RelativeOptions) -> None:
@@ -120,3 +123,17 @@ def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:
         name = names.all[int(np.argmax(fixed & wanted))]
         raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
     return ~fixed, wanted
+
+
+def sigmas_of(names: Names, options: RelativeOptions) -> Array:
+    """(5 n,) sigma of each link's prior, infinite where nothing is known.  Raises OptionError."""
+    check_priors(options.priors)
+    sigma = np.full(names.count, np.inf)
+    for pattern, value in options.priors.items():
+        chosen = names.match([pattern], "prior")
+        if (chosen & ~names.links).any():
+            raise OptionError(
+                f"prior {pattern}: targets and anchors have no nominal value to keep to"
+            )
+        sigma[chosen] = value
+    return sigma[names.links]

@@ -18,7 +18,12 @@ from minimax_cal.fitting.instruments.fit import (
     instrument_of,
     start_of,
 )
-from minimax_cal.fitting.instruments.options import RelativeOptions, known_text, silent
+from minimax_cal.fitting.instruments.options import (
+    RelativeOptions,
+    known_text,
+    sigmas_of,
+    silent,
+)
 from minimax_cal.fitting.instruments.result import RelativeCalibration
 from minimax_cal.fitting.instruments.rows import Closures, Instrument, places
 from minimax_cal.ground.arrays import Array
@@ -29,6 +34,7 @@ from minimax_cal.robots.robot import Robot
 
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
 LEAST = 5e-3  # a fit that misses by less leaves nothing to explain [mm]
+FAR = 4.0  # sigmas of a prior that an arm may be off
 RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
 
 
@@ -41,7 +47,7 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
     instrument, state = started(robot, data, options)
     given, limit = mean_square(instrument, state), POOR_FIT * robot.reach()
     if np.sqrt(given) <= limit:
-        check_known(data, options, instrument, state, 4.0 * limit)
+        check_known(robot, data, options, instrument, state)
         return
     whole = size(instrument, state)
     trials = []
@@ -111,17 +117,19 @@ def slips(robot: Robot, data: RelativeData) -> Iterator[tuple[str, RelativeData]
 
 
 def check_known(
+    robot: Robot,
     data: RelativeData,
     options: RelativeOptions,
     instrument: Instrument,
     state: State,
-    limit: float,
 ) -> None:
-    """Raise OptionError for a known distance that the arm as drawn misses by more than a limit."""
+    """Raise OptionError for a known distance that no arm like the drawn one can have."""
     if not isinstance(instrument, Closures):
         return
     centre = instrument.barycentres(places(instrument.model, state)).T
-    for known, (a, b) in zip(options.known_distances, instrument.pairs, strict=True):
+    limits = farthest(robot, options, instrument, state)
+    pairs = zip(options.known_distances, instrument.pairs, limits, strict=True)
+    for known, (a, b), limit in pairs:
         drawn, told = float(np.linalg.norm(centre[a] - centre[b])), known[2]
         if abs(drawn - told) <= limit:
             continue
@@ -130,6 +138,21 @@ def check_known(
             f"{known_text(known)}: by the arm as drawn these sockets of {data.at.source} are "
             f"{1e3 * drawn:.4g} mm apart{metres or '; check the labels and the length'}"
         )
+
+
+def farthest(
+    robot: Robot, options: RelativeOptions, closures: Closures, state: State
+) -> list[float]:
+    """By how much the drawn arm may miss each known distance: more where priors let it [m]."""
+    sigma = sigmas_of(closures.names, options)
+    free = np.pad(np.isfinite(sigma), (0, closures.names.count - len(sigma)))
+    limit = 4.0 * POOR_FIT * robot.reach()
+    if not (free.any() and len(closures.pairs)):
+        return [limit] * len(closures.pairs)
+    _, jacobian = closures.rows(state, free)
+    slope = jacobian[:, -len(closures.pairs) :] / np.sqrt(closures.weights[-1])
+    spread = np.linalg.norm(slope * sigma[np.isfinite(sigma)][:, None], axis=0)
+    return [limit + FAR * float(one) for one in spread]
 
 
 def contradiction(

@@ -18,7 +18,12 @@ from minimax_cal.fitting import identify
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit, Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
-from minimax_cal.fitting.instruments.options import Progress, RelativeOptions, wishes
+from minimax_cal.fitting.instruments.options import (
+    Progress,
+    RelativeOptions,
+    sigmas_of,
+    wishes,
+)
 from minimax_cal.fitting.instruments.split import before_and_after
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import DataError, OptionError
@@ -109,7 +114,7 @@ def fit_poses(
 ) -> PoseFit:
     """The calibration of the virtual reflectors.  Raises CalibrationError."""
     spots, targets = spots_of(lever), poses_as_targets(data, lever)
-    shared = ("holdout", "seed", "fix", "free", "method", "resolution")
+    shared = ("holdout", "seed", "fix", "free", "priors", "method", "resolution")
     chosen: dict[str, Any] = {name: getattr(options, name) for name in shared}
     try:
         fit = calibrate(
@@ -120,12 +125,16 @@ def fit_poses(
     train, state = targets.take(~fit.held), fit.cell.state
     model = model_of(fit.before.robot, train).only(fit.identification.active)
     tool, nominal_tool = tool_of(fit.cell, spots), tool_of(fit.before, spots)
-    covariance = covariance_of(model, state)
+    sigma = np.pad(sigmas_of(model.names, options), (0, model.names.count - 5 * robot.joints),
+                   constant_values=np.inf)  # fmt: skip
+    covariance = covariance_of(model, state, sigma)
     return PoseFit(fit, train, spots, model, state, tool, nominal_tool, covariance)
 
 
-def covariance_of(model: Model, state: State) -> Array:
+def covariance_of(model: Model, state: State, sigma: Array) -> Array:
     """The covariance (p, p) of a fit to poses, NaN where not identified [SI].
+
+    sigma: (p,) of the prior, infinite where there is none.
 
     The reflectors' errors are those of six numbers a pose, not of 3k: with k = 4 their covariance
     is 4 s^2 times the projector on rigid motions, s^2 being the variance of a coordinate of the
@@ -135,7 +144,7 @@ def covariance_of(model: Model, state: State) -> Array:
     dof = 6 * len(model.q) - (int(active.sum()) - (3 * len(model.y) - 6))
     variance = float(normal.cost.sum()) / max(dof, 1)
     covariance = np.full((model.names.count,) * 2, np.nan)
-    gram = normal.gram.sum(axis=0)
+    gram = normal.gram.sum(axis=0) + np.diag(variance / sigma[active] ** 2)
     covariance[np.ix_(active, active)] = variance * solve_normal(gram, np.eye(len(gram)))
     return covariance
 

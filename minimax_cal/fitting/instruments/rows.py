@@ -7,7 +7,7 @@ the places of sockets are eliminated.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -200,15 +200,44 @@ Instrument = Wires | Closures
 
 
 @dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of the links before any measurement.
+
+    mean: (5 n,) as drawn.  sigma: (5 n,) how far they may be from there, infinite where nothing is
+    known [SI].
+    """
+
+    mean: Array
+    sigma: Array
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is known."""
+        return bool(np.isfinite(self.sigma).any())
+
+    def weights(self, variance: float, count: int) -> Array:
+        """(count,) weights of all parameters beside rows of a variance [m^2 per unit^2]."""
+        return np.pad(variance / self.sigma**2, (0, count - len(self.sigma)))
+
+    def off(self, x: State) -> Array:
+        """(..., 5 n) how far the links are from their mean."""
+        links = np.swapaxes(x.mdh, -1, -2)  # in the order of `parameters.links_of`
+        return np.asarray(self.mean - links.reshape(*links.shape[:-2], -1))
+
+
+@dataclass(frozen=True, eq=False)
 class Squares:
     """The sum of squared rows over the active parameters, for `solvers.least_squares`.
 
     Nothing is left to eliminate linearly: sockets are gone, and lengths of wires are affine in
-    none of the parameters but the offsets.
+    none of the parameters but the offsets.  known: of the links, which counts with the weights (p,)
+    where these are given.
     """
 
     instrument: Instrument
     active: Array
+    known: Known | None = None
+    weight: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def linear(self) -> Array:
@@ -220,7 +249,15 @@ class Squares:
         error, jacobian = self.instrument.rows(x, self.active)
         cost = np.einsum("...r,...r->...", error, error)
         gradient = (jacobian @ error[..., None])[..., 0]
-        return np.asarray(cost), np.asarray(gradient), jacobian @ np.swapaxes(jacobian, -1, -2)
+        gram = jacobian @ np.swapaxes(jacobian, -1, -2)
+        if self.known and len(self.weight):
+            off = np.zeros((*cost.shape, len(self.active)))
+            off[..., : len(self.known.mean)] = self.known.off(x)
+            off, weight = off[..., self.active], self.weight[self.active]
+            cost = cost + (weight * off**2).sum(axis=-1)
+            gradient = gradient + weight * off
+            gram = gram + np.diag(weight)
+        return np.asarray(cost), np.asarray(gradient), gram
 
     def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
         """The same: there is nothing to eliminate."""
