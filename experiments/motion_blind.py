@@ -46,6 +46,7 @@ from minimax_cal.ground.tables import Cell, Table
 
 VISIBLE = 50.0  # squared size, over the noise, from which a cause must be seen
 SEPARABLE = 25.0  # the same beside the nearest other law, from which it must be told from that
+SIGMAS = 1.96  # standard deviations of a 95 % interval
 MASSES = ("payload", "link_inertia")  # names of masses that are not as given
 ARMS, CASES = 80, 80  # sound arms; cases of each other condition
 QUICK = 4
@@ -60,7 +61,8 @@ class Told:
     truth: causes with their places; of a law outside the library its words.  main, minor: confirmed
     effects beside usual friction.  lone: whether one of the alternatives of the first is the truth.
     visible, separable: squared size over the noise of the (first) cause, alone and beside the
-    nearest other law.
+    nearest other law.  mass: of a payload that nobody told, as it is said, its standard deviation,
+    and as it is [kg]; 0 where there is none.
     """
 
     case: Case
@@ -74,6 +76,7 @@ class Told:
     visible: float
     separable: float
     seconds: float
+    mass: tuple[float, float, float]
 
     @property
     def names(self) -> bool:
@@ -129,7 +132,14 @@ def run(case: Case) -> Told:
         visible=visible,
         separable=separable,
         seconds=seconds,
+        mass=mass_of(found.effects, made.extra),
     )
+
+
+def mass_of(effects: Sequence[mc.MotionEffect], extra: float) -> tuple[float, float, float]:
+    """The mass of a payload that is named, its standard deviation, and the true one [kg]."""
+    said = [one.parameters[0] for one in effects if one.effect == "payload"]
+    return (said[0].value, said[0].sigma, extra) if said else (0.0, 0.0, extra)
 
 
 def place_of(name: str, joint: int, joints: int) -> Name:
@@ -244,6 +254,11 @@ def clear(told: Sequence[Told]) -> list[Told]:
     return [one for one in condition(told, BEYOND) if one.separable >= SEPARABLE]
 
 
+def payloads(told: Sequence[Told]) -> list[Told]:
+    """Payloads that nobody told and the logs show."""
+    return [one for one in separable(told) if one.truth[0][0] == "payload"]
+
+
 QUESTIONS: tuple[tuple[str, Callable[[Sequence[Told]], list[Told]], Callable[[Told], bool], str],
                  ...] = (
     ("sound: a cause named or doubted", lambda t: condition(t, SOUND),
@@ -255,6 +270,10 @@ QUESTIONS: tuple[tuple[str, Callable[[Sequence[Told]], list[Told]], Callable[[To
      lambda one: one.related, ">= 92"),
     ("single: sure and wrong", separable, lambda one: one.wrong, "<= 4"),
     ("single: nothing named", separable, lambda one: not one.main, ""),
+    ("payload: the link named, its mass within 3 %", payloads,
+     lambda one: abs(one.mass[0] - one.mass[2]) < 0.03 * one.mass[2], ""),
+    ("payload: the true mass within its 95 % interval", payloads,
+     lambda one: abs(one.mass[0] - one.mass[2]) < SIGMAS * one.mass[1], ""),
     ("pair: both named, nothing else", lambda t: condition(t, PAIR), lambda one: one.right, ""),
     ("pair: something named that is not there", lambda t: condition(t, PAIR),
      lambda one: one.wrong, ""),

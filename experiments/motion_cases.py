@@ -81,7 +81,7 @@ class Made:
     """Runs of a case, the arm as its file has it, and what a sound arm would show of the same logs.
 
     signal: (m, n) of each run, what the causes add to the torques of the logged motion.  noise: the
-    same, of the log.
+    same, of the log.  extra: mass at the flange that nobody told [kg].
     """
 
     robot: Robot
@@ -89,6 +89,7 @@ class Made:
     signal: tuple[Array, ...]
     noise: tuple[Array, ...]
     payload: tuple[float, tuple[float, float, float]] | None
+    extra: float
 
 
 # ---- arms ----------------------------------------------------------------------------------------
@@ -297,7 +298,8 @@ def make(case: Case) -> Made:
         signals.append((torque - usual)[::EVERY])
         noises.append(noise)
         began += seconds + 60.0
-    return Made(robot, tuple(runs), tuple(signals), tuple(noises), CARRIED if loaded else None)
+    return Made(robot, tuple(runs), tuple(signals), tuple(noises), CARRIED if loaded else None,
+                float(true.body[-1, 0] - healthy.body[-1, 0]))  # fmt: skip
 
 
 def coloured(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -47,6 +48,12 @@ class LeftOut:
         """(R,) rows that some fit leaves out."""
         return np.asarray(self.fold >= 0)
 
+    @cached_property
+    def compact(self) -> list[tuple[Array, Array]]:
+        """Of each joint the columns (q,) that add to its rows, and these rows (R, q)."""
+        each = [np.flatnonzero(rows.any(axis=0)) for rows in self.raw]
+        return [(used, rows[:, used]) for used, rows in zip(each, self.raw, strict=True)]
+
     def values(self, parts: Sequence[str]) -> list[Array]:
         """(p,) values of some parts, of the fit without each fold."""
         index = self.normal.index(parts)
@@ -70,7 +77,8 @@ class LeftOut:
         value = np.zeros((self.raw.shape[2], len(self.gram)))
         for f, (gram, pull) in enumerate(zip(self.gram, self.pull, strict=True)):
             value[index, f] = solve_scaled(gram[np.ix_(index, index)], pull[index])
-        fitted, own = self.raw @ value, np.where(self.fold == NEVER_OUT, 0, self.fold)
+        fitted = np.stack([rows @ value[used] for used, rows in self.compact])
+        own = np.where(self.fold == NEVER_OUT, 0, self.fold)
         out = seen - np.take_along_axis(fitted, own[None, :, None], axis=2)[..., 0]
         missed = np.asarray(out.T)
         return missed if self.normal.place[FRICTION].start not in index else self.less_held(missed)

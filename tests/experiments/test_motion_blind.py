@@ -145,6 +145,22 @@ def test_answers_are_judged_by_the_truth() -> None:
     assert counts["outside: sure and wrong"] == (2, 1)
 
 
+def test_a_payload_is_judged_by_its_mass_and_interval() -> None:
+    near = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.02, 0.005, 1.0))
+    far = told(SINGLE, "payload L3", "named", "payload L3", mass=(1.05, 0.05, 1.0))
+    counts = {row[0]: row[1:3] for row in questions_table([near, far]).rows}
+    assert counts["payload: the link named, its mass within 3 %"] == (2, 1)
+    assert counts["payload: the true mass within its 95 % interval"] == (2, 1)
+
+
+def test_a_payload_that_nobody_told_is_named_with_its_mass() -> None:
+    answer = run(Case(SINGLE, OWN, (("payload", 0),), 3))
+    value, sigma, true = answer.mass
+    assert answer.right
+    assert value == pytest.approx(true, rel=0.03)
+    assert abs(value - true) < 3.0 * sigma
+
+
 def test_the_plan_holds_every_cause_by_both_generators() -> None:
     cases = plan(3, 6, 2 * len(LIBRARY))
     assert len({case.seed for case in cases}) == len(cases)
