@@ -37,6 +37,7 @@ from minimax_cal.dynamics.given import known_of
 from minimax_cal.dynamics.laws import USUAL, terms_of
 from minimax_cal.dynamics.model import first_body
 from minimax_cal.dynamics.regressor import PER_LINK
+from minimax_cal.dynamics.result import MotionEffect
 from minimax_cal.dynamics.rows import Logs, Whitening, prepare, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, dictionary_of
@@ -136,7 +137,7 @@ def run(case: Case) -> Told:
     )
 
 
-def mass_of(effects: Sequence[mc.MotionEffect], extra: float) -> tuple[float, float, float]:
+def mass_of(effects: Sequence[MotionEffect], extra: float) -> tuple[float, float, float]:
     """The mass of a payload that is named, its standard deviation, and the true one [kg]."""
     said = [one.parameters[0] for one in effects if one.effect == "payload"]
     return (said[0].value, said[0].sigma, extra) if said else (0.0, 0.0, extra)

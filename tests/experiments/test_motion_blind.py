@@ -113,6 +113,7 @@ def told(condition: str, truth: str, verdict: str, *main: str, **more: object) -
         "visible": 1e4,
         "separable": 1e4,
         "seconds": 1.0,
+        "mass": (0.0, 0.0, 0.0),
     }
     given |= more
     return Told(Case(condition, OWN, causes, 0), verdict, (pair(truth),) if truth else (),

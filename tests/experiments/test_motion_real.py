@@ -28,6 +28,12 @@ def test_withheld_effects_are_named_and_help_on_a_run_that_no_fit_saw(told: Told
     assert np.all(told.reached[-1] <= told.whole[-1])  # rows at rest only add
 
 
+def test_boosting_takes_little_where_all_has_a_name(told: Told) -> None:
+    moving, whole = told.boosted
+    assert np.all(moving > 0.85 * told.reached[-1])
+    assert np.all(whole > 0.85 * told.whole[-1])
+
+
 def test_tables_count_runs_and_compare_with_the_claim(told: Told) -> None:
     table = steps_table(SIMULATED, [told, told])
     last = dict(zip((row[0] for row in table.rows), table.rows, strict=True))
