@@ -63,8 +63,8 @@ def report_command(
     """A page to sign of RESULTS: a calibration, a diagnosis, or both of the same measurements.
 
     RESULTS are files that `calibrate`, `diagnose` or `relative` wrote with -o; that of `gap -o` may
-    come with them.  The page needs no network; PDF and PNG need an installed Chromium, Chrome or
-    Edge.
+    come with them; that of `torques -o` stands alone.  The page needs no network; PDF and PNG need
+    an installed Chromium, Chrome or Edge.
     """
     found = signed(results, path, Chosen(**chosen), pdf, to.notice)
     for line in found.lines():

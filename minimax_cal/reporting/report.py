@@ -15,6 +15,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.judging.tolerance import claim_called, limits_of
 from minimax_cal.reporting.html import (
+    Report,
     Wording,
     compose,
     find_browser,
@@ -25,6 +26,7 @@ from minimax_cal.reporting.html import (
 )
 from minimax_cal.reporting.html.facts import WORDS, read_facts
 from minimax_cal.reporting.html.first_page import Signed
+from minimax_cal.reporting.html.motion import MotionSource, compose_motion, motion_of
 from minimax_cal.reporting.html.page import needed
 from minimax_cal.reporting.html.sources import Result
 
@@ -50,9 +52,9 @@ def report(
     """A page to sign of a calibration, a diagnosis, or both of the same measurements.
 
     results: each itself or the file that it was saved to; a gap in a simulator may come with them,
-    a relative calibration stands
-    alone.  path: of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
-    title: that of the robot unless given.  customer, author: who accepts, who measured.  date:
+    a relative calibration and a motion diagnosis stand alone.  path: of the HTML, which needs no
+    network, or of a PDF, or of a PNG of the first page.  title: that of the robot unless given.
+    customer, author: who accepts, who measured.  date:
     YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  tolerance: what is required in mm, as
     ``rms 0.2, max 0.5``; tolerance_for: inside or outside the measured poses. facts: a TOML file
     with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.
@@ -101,7 +103,7 @@ def signed(
     chosen: Chosen,
     pdf: Path | str | None,
     notify: Callable[[str], object],
-) -> Signed:
+) -> Signed | MotionSource:
     """Write the report; what it judges."""
     check_writable(path, (*PAGES, *PAPERS, *PICTURES))
     needed()
@@ -112,9 +114,7 @@ def signed(
     browser = find_browser() if pdf is not None or suffix not in PAGES else ""
     if not isinstance(results, Sequence) or isinstance(results, str):
         results = [results]
-    sources = read_sources(results)
-    found = wording.judge(sources)
-    content = compose(sources, wording, found)
+    content, found, notices = composed(results, wording)
     if suffix in PAGES:
         write_whole(path, render(content))
     elif suffix in PAPERS:
@@ -123,9 +123,20 @@ def signed(
         picture(render(content, paper=True), Path(path), browser)
     if pdf is not None:
         print_pdf(render(content, paper=True), Path(pdf), browser)
-    for notice in sources.notices:
+    for notice in notices:
         notify(notice)
     return found
+
+
+def composed(
+    results: Sequence[Result], wording: Wording
+) -> tuple[Report, Signed | MotionSource, tuple[str, ...]]:
+    """The page, what it judges, and what the reader should know of the results."""
+    if motion := motion_of(results):
+        return compose_motion(motion, wording), motion, ()
+    sources = read_sources(results)
+    found = wording.judge(sources)
+    return compose(sources, wording, found), found, sources.notices
 
 
 def date_of(given: str) -> str:

@@ -67,7 +67,7 @@ class Report:
     """The whole document.
 
     facts: of the title block, label and text, empty where people write by hand.  sections: the
-    first is the one to sign.  digest: of the data.
+    first is the one to sign.  digest: of the data.  kind: above the title.
     """
 
     title: str
@@ -76,6 +76,7 @@ class Report:
     signatures: tuple[tuple[str, str], ...]
     sections: tuple[Section, ...]
     digest: str
+    kind: str = "Calibration report"
 
 
 def text(sentence: str) -> Note:

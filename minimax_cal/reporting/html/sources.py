@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis
+from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.instruments import RelativeCalibration
 from minimax_cal.fitting.opened import RELATIVE
@@ -26,7 +27,7 @@ from minimax_cal.simulators.result import KIND, SimulatorGap
 
 AGAIN = "write it again with minimax-cal"
 
-Result = Fit | Diagnosis | RelativeCalibration | SimulatorGap | Path | str
+Result = Fit | Diagnosis | RelativeCalibration | SimulatorGap | MotionDiagnosis | Path | str
 
 
 @dataclass(frozen=True, eq=False)

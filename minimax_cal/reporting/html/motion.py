@@ -1,0 +1,221 @@
+"""The report of a motion diagnosis: verdict, budget, friction and torques of a run left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.result import KIND, WORDS, MotionDiagnosis
+from minimax_cal.ground.errors import CalibrationError, OptionError
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.ground.words import visible
+from minimax_cal.reporting.html.charts import (
+    LOOKS,
+    axis,
+    frame,
+    heading,
+    key,
+    line,
+    log_axis,
+    long_key,
+    span,
+)
+from minimax_cal.reporting.html.content import (
+    Block,
+    Figure,
+    Note,
+    Report,
+    Section,
+    caveat,
+    label,
+    plain,
+    text,
+)
+from minimax_cal.reporting.html.document import Wording, signers
+from minimax_cal.reporting.html.facts import told_facts
+from minimax_cal.reporting.html.sources import File, Result, content_of
+
+BAND = 2.0  # standard deviations of a band
+SPEEDS = "speed [rad/s, m/s]"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSource:
+    """A motion diagnosis, and its file."""
+
+    found: MotionDiagnosis
+    file: File
+
+    def lines(self) -> list[str]:
+        """For a terminal."""
+        return [self.found.headline()]
+
+
+def motion_of(results: Sequence[Result]) -> MotionSource | None:
+    """The motion diagnosis among results; None where there is none.  Raises CalibrationError."""
+    for result in filter(is_motion, results):
+        content, path, digest = content_of(result)
+        if len(results) > 1:
+            raise CalibrationError(f"{path}: is a motion diagnosis; report it alone")
+        return MotionSource(MotionDiagnosis.from_dict(content, path), File(KIND, path, digest))
+    return None
+
+
+def is_motion(result: Result) -> bool:
+    """Whether a result is a motion diagnosis.  Raises CalibrationError for a file without JSON."""
+    if isinstance(result, Path | str):
+        return bool(content_of(result)[0].get("kind") == KIND)
+    return isinstance(result, MotionDiagnosis)
+
+
+def compose_motion(source: MotionSource, wording: Wording) -> Report:
+    """The whole report.  Raises OptionError for what is asked of positions."""
+    for name, given in (("tolerance", wording.limits), ("deliver", wording.deliver),
+                        ("step", wording.rung is not None)):  # fmt: skip
+        if given:
+            raise OptionError(
+                f"{name}= is of positions; a motion diagnosis is of torques: leave it"
+            )
+    found = source.found
+    robot = found.arm.robot.name
+    facts = [("Robot", visible(robot)), *told_facts(wording.facts, None)]
+    facts += [("Customer", visible(wording.customer))] if wording.customer else []
+    facts += [("Date of this report", wording.date), ("Held out", found.held_out)]
+    facts += [("Logs", ", ".join(map(visible, found.runs)))]
+    sections = (
+        Section("verdict", "Result", verdict_blocks(found)),
+        Section("budget", "Error budget, step by step", budget_blocks(found)),
+        Section("effects", "Effects", effect_blocks(found)),
+        Section("torques", "Torques and friction of each joint", joint_figures(found)),
+        Section("unexplained", "What has no name", unexplained_blocks(found)),
+        Section("untestable", "What could not be tested", untestable_blocks(found)),
+        Section("provenance", "Provenance", provenance_blocks(source)),
+    )
+    return Report(
+        title=visible(wording.title) or f"Torques of {visible(robot)}",
+        robot=visible(robot),
+        facts=tuple(facts),
+        signatures=signers(visible(wording.author), visible(wording.customer)),
+        sections=sections,
+        digest="",
+        kind="Motion diagnosis",
+    )
+
+
+def verdict_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """The answer, and what to bear in mind."""
+    return (Note(found.headline(), "banner"), *(Note(one, "notice") for one in found.notices))
+
+
+def budget_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """Tables of all rows and of moving ones, and how both fall."""
+    whole = found.summary()
+    moving: tuple[tuple[Cell, ...], ...] = tuple(
+        (step.name, *step.holdout_rms_moving) for step in found.budget
+    )
+    title = f"Held-out RMS torque [{found.unit}], moving rows ({found.held_out})"
+    return (budget_figure(found), whole, Table(title, whole.header, moving, whole.formats))
+
+
+def budget_figure(found: MotionDiagnosis) -> Figure:
+    """What each step leaves, one panel a joint."""
+    joints, steps = len(found.curves), [step.name.replace("_", " ") for step in found.budget]
+    values = np.array([step.holdout_rms_moving for step in found.budget]).T
+    traces: list[dict[str, Any]] = []
+    layout = frame(annotations=[heading(f"J{j + 1}", j, joints) for j in range(joints)])
+    for j in range(joints):
+        trace = line("after", f"J{j + 1}", values[j], np.arange(len(steps)), panel=j)
+        traces.append({**trace, "mode": "lines+markers", "showlegend": False})
+        x = {**log_axis(f"[{found.unit}]", values[j]), "domain": span(j, joints, 0.03)}
+        y = axis("", autorange="reversed", showticklabels=j == 0, tickmode="array",
+                 tickvals=list(range(len(steps))), ticktext=list(map(label, steps)))  # fmt: skip
+        if j:
+            x["anchor"], y["anchor"] = key("y", j), key("x", j)
+        layout |= {long_key("x", j): x, long_key("y", j): y}
+    layout["margin"] = {**layout["margin"], "l": 170}
+    says = "RMS torque that each step leaves of moving rows, on runs that its fit did not see."
+    return Figure("budget", "What each step leaves", says, tuple(traces), layout, 380)
+
+
+def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """Effects with their values, and what else they could be."""
+    rows: list[tuple[Cell, ...]] = [
+        (one.words, f"{WORDS[other.effect]} at {other.place}", other.rho2, other.separate_with)
+        for one in found.effects
+        for other in one.alternatives
+    ]
+    if not found.effects:
+        return (text("No effect is shown by these logs."),)
+    header = ("effect", "could be", "similarity", "what tells them apart")
+    others = [Table("Alternatives", header, tuple(rows), ("", "", ".2f", ""))] if rows else []
+    return (found.effects_table(), *others)
+
+
+def joint_figures(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """Of each joint, a run left out and the friction curve."""
+    return tuple(joint_figure(found, j) for j in range(len(found.curves)))
+
+
+def joint_figure(found: MotionDiagnosis, j: int) -> Figure:
+    """Measured and predicted torque, and friction over speed with its band."""
+    run, curve, unit = found.held_run, found.curves[j], found.unit
+    time, speed = np.array(run.time), np.array(curve.speed)
+    friction, wide = np.array(curve.torque), BAND * np.array(curve.sigma)
+    colour, _, _, soft = LOOKS["after"]
+    band = {
+        "type": "scatter", "mode": "lines", "name": "two standard deviations",
+        "x": plain(np.concatenate([speed, speed[::-1]])),
+        "y": plain(np.concatenate([friction + wide, (friction - wide)[::-1]])),
+        "fill": "toself", "fillcolor": soft, "line": {"color": colour, "width": 0},
+        "hoverinfo": "skip", "showlegend": False, "xaxis": "x2", "yaxis": "y2",
+    }  # fmt: skip
+    traces = (
+        line("before", "measured", time, np.array(run.measured[j])),
+        line("after", "predicted without this run", time, np.array(run.predicted[j])),
+        band,
+        line("after", "friction", speed, friction, panel=1, showlegend=False),
+    )
+    layout = frame(
+        xaxis=axis("time [s]", domain=[0.0, 0.62]),
+        yaxis=axis(f"J{j + 1} [{unit}]"),
+        xaxis2=axis(SPEEDS, domain=[0.72, 1.0], anchor="y2"),
+        yaxis2=axis(f"friction [{unit}]", anchor="x2"),
+    )
+    left = found.budget[-1].holdout_rms_moving[j]
+    says = (
+        f"Torque of joint {j + 1} on a part of {visible(run.name)}, which the fit did not see "
+        f"(it misses {left:.3g} {unit} RMS where the joint moves), and its friction over speed."
+    )
+    return Figure(f"joint-{j + 1}", f"Joint {j + 1}", says, traces, layout, 320)
+
+
+def unexplained_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """What remains that follows something."""
+    if not found.unexplained:
+        return (text("What remains looks random."),)
+    return (found.unexplained_table(),)
+
+
+def untestable_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
+    """What these logs cannot tell, and the run that would."""
+    if not found.not_testable:
+        return (text("These logs test every effect."),)
+    rows = tuple((WORDS[one.effect], one.place, one.needs) for one in found.not_testable)
+    notes = [caveat(f"Too little motion: {one}.") for one in found.too_little]
+    return (*notes, Table("Not testable", ("effect", "at", "what would tell"), rows))
+
+
+def provenance_blocks(source: MotionSource) -> tuple[Block, ...]:
+    """The file and the programs."""
+    one = source.file
+    made = (("minimax-cal", version("minimax-cal")), ("plotly", version("plotly")))
+    return (
+        Table("Files", ("what", "file", "SHA-256"),
+              (("motion diagnosis", visible(one.path), one.digest),)),
+        Table("This report was made by", ("package", "version"), made),
+    )  # fmt: skip
