@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.fitting.instruments.kinds import relative
     from minimax_cal.fitting.many import calibrate_many
     from minimax_cal.fitting.options import Options
+    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
     from minimax_cal.ground.errors import (
         CalibrationError,
         CalibrationWarning,
@@ -84,6 +85,7 @@ __all__ = [
     "builtin_robots",
     "calibrate",
     "calibrate_many",
+    "calibrate_pixels",
     "check",
     "compare",
     "compensate",
@@ -148,6 +150,7 @@ MODULES = {  # name: where it is defined
     "Options": "fitting.options",
     "calibrate": "fitting.calibrate",
     "calibrate_many": "fitting.many",
+    "calibrate_pixels": "fitting.pixels.calibrate",
     "relative": "fitting.instruments.kinds",
     "bootstrap": "judging.bootstrap",
     "evaluate": "judging.saved",

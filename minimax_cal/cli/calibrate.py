@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
-    CAMPAIGNS,
+    PATH,
     ROBOT,
     ROWS,
+    SOME_CAMPAIGNS,
     InGroups,
     Output,
     options_from,
     plain_option,
     result_options,
+    stacked,
 )
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.pixels.options import CAMERAS, PixelOptions, camera_of
+from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
@@ -31,10 +38,46 @@ if TYPE_CHECKING:
 BRIEF = 1000  # poses that one fit needs no compiled kernels for
 
 
+PIXEL_FILES = stacked(
+    plain_option(
+        CAMERAS,
+        "--pixels",
+        type=PATH,
+        metavar="FILE",
+        help="What cameras saw (CSV): pose, camera, target, u_px, v_px; takes the place of DATA.",
+    ),
+    plain_option(
+        CAMERAS,
+        "--joints",
+        type=PATH,
+        metavar="FILE",
+        help="The joint values of each pose of the detections (CSV): pose, q1_rad, ...",
+    ),
+    plain_option(
+        CAMERAS,
+        "--camera",
+        multiple=True,
+        metavar="NAME=FILE",
+        help="The K and D of a camera, as OpenCV or ROS write them (YAML); may be given several "
+        "times.",
+    ),
+    plain_option(
+        CAMERAS,
+        "--board",
+        type=PATH,
+        metavar="FILE",
+        help="The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags "
+        "of unknown place].",
+    ),
+    options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior"),
+)
+
+
 @click.command(name="calibrate", cls=InGroups)
 @ROBOT
-@CAMPAIGNS
+@SOME_CAMPAIGNS
 @options_from(Options)
+@PIXEL_FILES
 @ROWS
 @plain_option(
     "What is known",
@@ -57,10 +100,28 @@ def calibrate_command(
     replicates: int | None,
     in_rows: bool,
     without: bool,
+    pixels: Path | None,
+    joints: Path | None,
+    camera: Sequence[str],
+    board: Path | None,
+    camera_on: str,
+    fix_camera: bool,
+    camera_prior: str,
     to: Output,
     **chosen: Any,
 ) -> int:
-    """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA."""
+    """Calibrate ROBOT (a file or a built-in name) from the measurements in DATA.
+
+    Or from what cameras saw, with --pixels, --joints and --camera in place of DATA.
+    """
+    if pixels or joints or camera or board:
+        files = PixelFiles(data, pixels, joints, tuple(camera), board)
+        lens = {"camera_on": camera_on, "fix_camera": fix_camera, "camera_prior": camera_prior}
+        return by_cameras(robot, files, to, lens, chosen)
+    if not data:
+        raise click.UsageError(
+            "Missing argument 'DATA...', or --pixels with --joints and --camera."
+        )
     measured = options.measured(data, in_rows)
     brief = replicates is None and measured.poses <= BRIEF
     with work(brief=brief), to.stages() as progress:
@@ -75,6 +136,51 @@ def calibrate_command(
         tables = (*fit.tables(), *(found.table() for found in more))
         options.show(*tables, headline=fit.headline())
     to.draw(save_errors, fit)
+    return options.exit_code(fit.status, fit.reason)
+
+
+@dataclass(frozen=True)
+class PixelFiles:
+    """What was given of a calibration by cameras."""
+
+    data: tuple[Path, ...]
+    pixels: Path | None
+    joints: Path | None
+    camera: tuple[str, ...]
+    board: Path | None
+
+
+def by_cameras(
+    robot: str, files: PixelFiles, to: Output, lens: dict[str, Any], chosen: dict[str, Any]
+) -> int:
+    """Calibrate from pixels.  Raises OptionError for what they do not know."""
+    from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
+
+    if files.data:
+        raise OptionError(
+            f"{files.data[0]}: DATA and pixels are two calibrations; give one of them"
+        )
+    if not (files.pixels and files.joints and files.camera):
+        raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
+    at = click.get_current_context()
+    given = ParameterSource.COMMANDLINE
+    known = {field.name for field in fields(PixelOptions)}
+    for name in chosen:
+        if name not in known and at.get_parameter_source(name) is given:
+            if name == "objective" and chosen[name] == "sum":
+                continue
+            raise OptionError(f"{name}= is not for pixels: leave it out")
+    own = {name: value for name, value in chosen.items() if name in known}
+    cameras = dict(camera_of(text) for text in files.camera)
+    if len(cameras) < len(files.camera):
+        raise OptionError("camera= gives one name twice; each camera has its own")
+    with to.stages() as progress:
+        fit = calibrate_pixels(
+            robot, files.pixels, files.joints, cameras, files.board, progress, **lens, **own
+        )
+    to.notice(*fit.notices)
+    if to.deliver(fit.json, fit.status):
+        options.show(*fit.tables(), headline=fit.headline())
     return options.exit_code(fit.status, fit.reason)
 
 

@@ -42,6 +42,7 @@ PATH = click.Path(path_type=Path)
 ROBOT = click.argument("robot")
 DATA = click.argument("data", type=PATH)
 CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, required=True, metavar="DATA...")
+SOME_CAMPAIGNS = click.argument("data", type=PATH, nargs=-1, metavar="[DATA...]")
 SOME_DATA = click.argument("data", type=PATH, required=False)
 FIT = click.argument("fit", type=PATH)
 ROWS = click.option(

@@ -215,8 +215,10 @@ def of_relative(content: Mapping[str, Any], source: str) -> Opened:
         robot = robot_from_dict(content.get(key, {}), f"{source}: {key}")
         return Cell(robot, np.eye(4), (), np.zeros((0, 3)))
 
-    rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, bare("robot")))
-    return Opened(source, rungs, 1, placed=False)
+    calibrated = "calibrated_robot" if "calibrated_robot" in content else "robot"
+    rungs = (Rung(NOMINAL, bare("nominal_robot")), Rung(CALIBRATED, bare(calibrated)))
+    kept = content.get("status") == Status.NO_BETTER  # the drawn arm is the robot of such a file
+    return Opened(source, rungs, 1, placed=False, status=Status.NO_BETTER if kept else None)
 
 
 def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:

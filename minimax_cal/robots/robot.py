@@ -31,6 +31,8 @@ CONVENTION = FORMULAS["standard"]
 METRES = {"mm": 1e-3, "m": 1.0}
 RADIANS = {"rad": 1.0, "deg": np.pi / 180.0}
 
+DRAWN_WITHIN = (0.3e-3, 0.5e-3)  # sigmas of a length and of an angle of most drawings [m, rad]
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 LEVER = 0.1  # of the reach: what a radian counts as
 TURNING = 1e-6  # how far a rotation may be from one
@@ -119,6 +121,21 @@ class EndSchema(BaseModel):
         return only_known(cls.model_fields, given)
 
 
+class WithinSchema(BaseModel):
+    """How well the drawing is known: standard deviations of its lengths and of its angles."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mm: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.3
+    mrad: Annotated[float, Field(gt=0.0, lt=100.0)] = 0.5
+
+    @model_validator(mode="before")
+    @classmethod
+    def no_slip(cls, given: object) -> object:
+        """What is not known would be ignored in silence."""
+        return only_known(cls.model_fields, given)
+
+
 class RobotSchema(BaseModel):
     """A robot file.  Keys that begin as `FREE` says are notes; others are refused."""
 
@@ -139,6 +156,7 @@ class RobotSchema(BaseModel):
     up: Vector = (0.0, 0.0, 1.0)
     repeatability_mm: Annotated[float, Field(gt=0.0, lt=100.0)] | None = None
     nominal: Literal["drawn", "rough"] = "drawn"
+    drawn_within: WithinSchema = WithinSchema()
 
     @model_validator(mode="before")
     @classmethod
@@ -164,6 +182,7 @@ class Robot:
     inertia: (n, 6) xx, xy, xz, yy, yz, zz of each link about its centre of gravity, in the axes of
     frame i, NaN where unknown; empty where no link's is known [kg m^2].
     drive_gain: (n,) torque for one ampere, NaN where unknown; may be empty [N m/A, N/A].
+    drawn_within: how well its lengths and its angles are known as drawn, as sigmas [m, rad].
     coupling: (n, n) how far each joint goes per unit of each joint value; (0, 0) for each its own.
     notation: how the robot's file writes its links.
     """
@@ -182,6 +201,7 @@ class Robot:
     rough: bool = False
     inertia: Array = field(default_factory=lambda: np.zeros((0, 6)))
     drive_gain: Array = field(default_factory=lambda: np.zeros(0))
+    drawn_within: tuple[float, float] = DRAWN_WITHIN
     coupling: Array = field(default_factory=lambda: np.zeros((0, 0)))
     notation: Notation = PLAIN
 
@@ -296,6 +316,7 @@ class Robot:
 
         known = np.isfinite(self.repeatability)
         coupling = couplings.to_dict(self.coupling)
+        within = dict(zip(("mm", "mrad"), (1e3 * each for each in self.drawn_within), strict=True))
         after = dict(a=end[0] * 1e3, alpha=end[3], beta=end[4])
         return {
             "name": self.name,
@@ -304,6 +325,7 @@ class Robot:
             "up": [float(u) for u in self.up],
             **({"repeatability_mm": 1e3 * self.repeatability} if known else {}),
             **({"nominal": "rough"} if self.rough else {}),
+            **({"drawn_within": within} if self.drawn_within != DRAWN_WITHIN else {}),
             **({"coupling": coupling} if coupling else {}),
             **({"flange": {k: float(v) for k, v in after.items()}} if end.any() else {}),
             "joints": [joint(i) for i in range(self.joints)],
@@ -436,6 +458,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         up=up / np.linalg.norm(up),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
         rough=schema.nominal == "rough",
+        drawn_within=(1e-3 * schema.drawn_within.mm, 1e-3 * schema.drawn_within.mrad),
         inertia=inertia,
         drive_gain=where_given([j.drive_gain for j in joints], np.nan),
         coupling=coupling,

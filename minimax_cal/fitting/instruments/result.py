@@ -31,6 +31,7 @@ QUANTITY = {
     "distances": "length of a wire",
     "closures": "ball about its socket",
     "poses": "position of the flange",
+    "pixels": "pixel at the target",
 }
 CAUTION = {
     "distances": "An error of lengths is no error of position: what lies across the wires does "
@@ -38,6 +39,7 @@ CAUTION = {
     "closures": "A misclosure is no error of position: what moves all visits of a socket alike "
     "does not show in it. ",
     "poses": "",
+    "pixels": "A pixel is no position: what moves along the line of sight does not show in it. ",
 }
 
 
@@ -47,12 +49,14 @@ class ErrorsPart(ScoresPart):
     numbers: int = 0
     rms_mrad: Number = math.nan
     max_mrad: Number = math.nan
+    rms_px: Number = math.nan
+    max_px: Number = math.nan
 
 
 class RelativePart(Part):
     """The file of `minimax-cal relative -o`."""
 
-    measured: Literal["distances", "closures", "poses"]
+    measured: Literal["distances", "closures", "poses", "pixels"]
     robot: dict[str, Any]
     nominal_robot: dict[str, Any]
     parts: tuple[str, ...]

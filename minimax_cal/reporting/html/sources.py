@@ -16,6 +16,7 @@ from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.instruments import RelativeCalibration
 from minimax_cal.fitting.opened import RELATIVE
+from minimax_cal.fitting.pixels.result import PIXELS, PixelCalibration
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import json_of, read_raw
@@ -134,7 +135,8 @@ def read_sources(results: Sequence[Result]) -> Sources:
         if kind == RELATIVE:
             if len(results) > 1:
                 raise CalibrationError(f"{path}: is a {RELATIVE}; report it alone")
-            told = RelativeCalibration.from_dict(content, path)
+            read = PixelCalibration if content.get("measured") == PIXELS else RelativeCalibration
+            told = read.from_dict(content, path)
             return Sources(None, None, (File(kind, path, digest),), relative=told)
         if kind == "calibration" and "parameters" in content:
             fits.append(Fit.from_dict(content, path))

@@ -1,0 +1,235 @@
+"""Simulated cells with cameras: an arm, a board or tags, and the pixels that cameras saw of them.
+
+The projection is written here a second time, corner by corner as OpenCV's manual states it, so that
+no fit is judged by its own formulas.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import minimax_cal as mc
+from minimax_cal.fitting.pixels.camera import Camera
+from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.judge import arms_apart
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots.transforms import transform
+
+SIZE = (2448, 2048)  # five megapixels
+LENS = (2500.0, 2500.0, 1223.5, 1023.5)
+BARREL = (-0.12, 0.08, 2e-4, -3e-4, 0.0)
+BOARD, SQUARE = (11, 8), 0.025  # corners, and their distance [m]
+NOISE = 0.106  # of u and v [px]: 0.15 px together
+OFF_LENGTH, OFF_ANGLE = 0.5e-3, 1e-3  # of each link parameter [m, rad]
+MARGIN = 20.0  # from the edge of the image [px]
+POSES = 1000  # that an arm is judged by
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera: where it is in what it is fixed to, and its lens.
+
+    pose: (4, 4) [m].  lens: fx, fy, cx, cy [px].  distortion: (5,).
+    """
+
+    pose: Array
+    lens: tuple[float, float, float, float] = LENS
+    distortion: tuple[float, ...] = BARREL
+    size: tuple[int, int] = SIZE
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """drawn, true: the arm.  q: (m, n).  points: (k, 3) targets in their own frame [m].
+
+    place: (4, 4) of that frame in the base or on the flange.  pixel: (c, m, k, 2) [px], NaN where
+    a target is not in the image.
+    """
+
+    drawn: mc.Robot
+    true: mc.Robot
+    on_flange: bool
+    views: tuple[View, ...]
+    points: Array
+    place: Array
+    q: Array
+    pixel: Array
+    names: tuple[str, ...] = field(default_factory=tuple)
+
+
+def board_points(corners: tuple[int, int] = BOARD, square: float = SQUARE) -> Array:
+    """(k, 3) corners of a board about its middle [m]."""
+    x, y = np.meshgrid(np.arange(corners[0]), np.arange(corners[1]))
+    flat = square * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return np.asarray(flat - flat.mean(axis=0))
+
+
+def projected(view: View, point: Array) -> Array:
+    """Pixels (..., 2) of points (..., 3) in the camera's axes; NaN outside the image."""
+    fx, fy, cx, cy = view.lens
+    k1, k2, p1, p2, k3 = view.distortion
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = point[..., 0] / point[..., 2], point[..., 1] / point[..., 2]
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + cx
+        v = fy * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + cy
+    pixel = np.stack([u, v], axis=-1)
+    seen = (point[..., 2] > 0.05) & (r2 < 0.6)
+    seen &= ((pixel >= MARGIN) & (pixel <= np.array(view.size) - MARGIN)).all(axis=-1)
+    return np.where(seen[..., None], pixel, np.nan)
+
+
+def seen_by(view: View, robot: mc.Robot, q: Array, points: Array, on_flange: bool) -> Array:
+    """Pixels (m, k, 2) of targets (k, 3), which stand in the base or ride on the flange."""
+    flange = robot.pose(q)
+    camera = flange @ view.pose if on_flange else np.broadcast_to(view.pose, flange.shape)
+    own = np.broadcast_to(np.eye(4), flange.shape) if on_flange else flange
+    world = np.einsum("mij,kj->mki", own[:, :3, :3], points) + own[:, None, :3, 3]
+    local = np.einsum("mji,mkj->mki", camera[:, :3, :3], world - camera[:, None, :3, 3])
+    return projected(view, local)
+
+
+def off_drawing(robot: mc.Robot, rng: np.random.Generator, length: float = OFF_LENGTH,
+                angle: float = OFF_ANGLE) -> mc.Robot:  # fmt: skip
+    """A copy of the arm whose links are off their drawing."""
+    scale = np.array([length, length, angle, angle, angle])
+    return robot.with_mdh(robot.mdh + rng.normal(size=robot.mdh.shape) * scale)
+
+
+def looking(rng: np.random.Generator, distance: tuple[float, float], tilt: float) -> Array:
+    """(4, 4) a camera that looks at the origin from above, more or less, rolled anyhow."""
+    away = rng.uniform(*distance)
+    turn = Rotation.from_euler(
+        "zxz", [rng.uniform(0, 2 * np.pi), np.pi - rng.uniform(0, tilt), rng.uniform(0, 2 * np.pi)]
+    ).as_matrix()
+    aim = rng.normal(size=3) * 0.03
+    return transform(turn, aim - away * turn[:, 2])
+
+
+def make_cell(
+    rng: np.random.Generator,
+    *,
+    robot: str = "ur5",
+    poses: int = 60,
+    on_flange: bool = True,
+    views: Sequence[View] = (),
+    points: Array | None = None,
+    noise: float = NOISE,
+    distance: tuple[float, float] = (0.35, 0.75),
+    tilt: float = 0.7,
+    off: tuple[float, float] = (OFF_LENGTH, OFF_ANGLE),
+    least: float = 0.6,
+) -> Cell:
+    """A cell: poses where every camera sees most of the targets.
+
+    distance: of the camera from the targets [m].  off: of the arm's links from their drawing [m,
+    rad].  least: share of the targets in an image.
+    """
+    drawn = mc.load_robot(robot)
+    true = off_drawing(drawn, rng, *off)
+    points = board_points() if points is None else points
+    mounted = transform(Rotation.from_euler("xyz", rng.uniform(-0.3, 0.3, 3)).as_matrix(),
+                        np.array([0.04, -0.03, 0.08]))  # fmt: skip
+    stands = transform(Rotation.from_euler("xyz", rng.uniform(-0.2, 0.2, 3)).as_matrix(),
+                       np.array([0.5 * drawn.reach(), 0.1, 0.05]))  # fmt: skip
+    views = tuple(views) or (View(mounted if on_flange else stands),)
+    place = stands if on_flange else mounted
+    q = np.zeros((0, drawn.joints))
+    world = points @ place[:3, :3].T + place[:3, 3]
+    while len(q) < poses:
+        relative = np.stack([looking(rng, distance, tilt) for _ in range(poses)])
+        if on_flange:
+            goal = place @ relative @ np.linalg.inv(views[0].pose)
+        else:
+            goal = views[0].pose @ np.linalg.inv(relative) @ np.linalg.inv(place)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = drawn.inverse(goal, near=rng.uniform(-1.5, 1.5, (poses, drawn.joints)))
+        found = (found + np.pi) % (2 * np.pi) - np.pi
+        share = np.mean([np.isfinite(seen_by(v, true, found, world, on_flange)[..., 0]).mean(axis=1)
+                         for v in views], axis=0)  # fmt: skip
+        q = np.concatenate([q, found[share >= least]])
+    q = q[:poses]
+    pixel = np.stack([seen_by(view, true, q, world, on_flange) for view in views])
+    pixel = pixel + noise * rng.normal(size=pixel.shape)
+    names = tuple(f"c{i}" for i in range(len(points)))
+    return Cell(drawn, true, on_flange, views, points, place, q, pixel, names)
+
+
+def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:
+    """Write the files of a cell; the options of `calibrate` that read them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    n = cell.q.shape[1]
+    joints = ["pose," + ",".join(f"q{i + 1}_rad" for i in range(n))]
+    joints += [
+        f"P{j}," + ",".join(f"{value:.12f}" for value in row) for j, row in enumerate(cell.q)
+    ]
+    rows = ["pose,camera,target,u_px,v_px"]
+    for c in range(len(cell.views)):
+        for j, k in np.argwhere(np.isfinite(cell.pixel[c, ..., 0])):
+            u, v = cell.pixel[c, j, k]
+            rows.append(f"P{j},cam{c},{cell.names[k]},{u:.6f},{v:.6f}")
+    (folder / "joints.csv").write_text("\n".join(joints) + "\n")
+    (folder / "detections.csv").write_text("\n".join(rows) + "\n")
+    given = ["--pixels", str(folder / "detections.csv"), "--joints", str(folder / "joints.csv")]
+    for c, view in enumerate(cell.views):
+        path = folder / f"cam{c}.yaml"
+        path.write_text(camera_text(view))
+        given += ["--camera", f"cam{c}={path}"]
+    if board:
+        lines = ["target,x_mm,y_mm,z_mm"]
+        places = zip(cell.names, 1e3 * cell.points, strict=True)
+        lines += [f"{name},{x:.6f},{y:.6f},{z:.6f}" for name, (x, y, z) in places]
+        (folder / "board.csv").write_text("\n".join(lines) + "\n")
+        given += ["--board", str(folder / "board.csv")]
+    return [*given, "--camera-on", "flange" if cell.on_flange else "ground"]
+
+
+def data_of(cell: Cell, *, board: bool = True) -> PixelData:
+    """What the files of `write_cell` are read as."""
+    camera, pose, target = np.nonzero(np.isfinite(cell.pixel[..., 0]))
+    cameras = tuple(
+        Camera(f"cam{c}", np.array([*v.lens, *v.distortion, *np.zeros(7)]), v.size, f"cam{c}.yaml")
+        for c, v in enumerate(cell.views)
+    )
+    nothing, lines = np.zeros((len(cell.q), 0, 3)), np.arange(len(cell.q)) + 2
+    sliding = cell.drawn.prismatic
+    return PixelData(
+        at=Measurements(cell.q, nothing, (), sliding, lines, {}),
+        labels=tuple(f"P{j}" for j in range(len(cell.q))),
+        cameras=cameras,
+        targets=cell.names,
+        board=cell.points if board else np.zeros((0, 3)),
+        pose=pose,
+        camera=camera,
+        target=target,
+        pixel=cell.pixel[camera, pose, target],
+        line=np.arange(len(pose)) + 2,
+    )
+
+
+def camera_text(view: View) -> str:
+    """A camera's file as OpenCV's FileStorage writes it."""
+    fx, fy, cx, cy = view.lens
+    matrix = ", ".join(f"{x:.17g}" for x in (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0))
+    distortion = ", ".join(f"{x:.17g}" for x in view.distortion)
+    return (
+        f"%YAML:1.0\n---\nimage_width: {view.size[0]}\nimage_height: {view.size[1]}\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        f"   data: [ {matrix} ]\n"
+        "distortion_coefficients: !!opencv-matrix\n"
+        f"   rows: {len(view.distortion)}\n   cols: 1\n   dt: d\n   data: [ {distortion} ]\n"
+    )
+
+
+def arm_error(cell: Cell, arm: mc.Robot) -> float:
+    """RMS error of an arm over the joints' whole range, base and tool fitted [mm]."""
+    return 1e3 * arms_apart(cell.true, arm, POSES)

@@ -1,0 +1,307 @@
+"""The fit of pixels: start, identifiable parameters, least squares, wrong pixels, covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.instruments.options import Progress
+from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.identify import identified, lengths_of
+from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
+from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.pixels.start import Started
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import DataError, OptionError
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.modelling.model import Prior
+from minimax_cal.modelling.parameters import Names, links_of
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers import least_squares
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits, solve_normal
+from minimax_cal.solvers.status import Status
+
+TYPICAL = 1.1774  # median of the length of two normal errors over their sigma [Rayleigh]
+SOFT = 3.0  # times sigma: from here on a pixel counts less, until the fit is near
+APART = 6.0  # times sigma: no pixel of a right corner is so far off (p = 2e-8)
+FINEST = 1e-3  # no corner is found better [px]
+ROUNDS = 8  # in which wrong pixels are looked for
+HOPELESS = 0.01  # of the focal length: a fit with such errors is not worth finishing
+FAR_LENS = 4.0  # times its doubt: the pixels contradict the file of a lens
+LOOSE = 300.0  # times its doubt: what is then known of such a lens
+DEPTH_ROUNDS = 2  # in which depths follow the lengths
+COARSE = Limits(step=1e-2, iterations=40)  # of a fit that another follows [px]
+FINE = Limits(step=1e-7, iterations=100, damping=1e-9)
+METHOD, AFFINE = METHODS["nllm"], METHODS["snllm-kaufman"]
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of parameters besides pixels: mean, sigma (p,), inf where nothing is."""
+
+    mean: Array
+    sigma: Array
+
+    def prior(self, noise: float) -> Prior:
+        """As a prior beside pixels as noisy as `noise` [px]."""
+        return Prior(self.mean, (noise / self.sigma) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFit:
+    """What the solver found.
+
+    model: of the training pixels, weight 0 where set aside.  nominal: the arm as drawn with cameras
+    and targets fitted to it.  scene: the calibrated one.  noise: sigma of u and v [px].
+    lens_sigma: (c, 9) how well the files know the lenses.  held: whether lenses are held so.
+    by_drawing: whether nothing but the drawing tells the scale.  lens: (c, 9) the lenses as the
+    pixels say they are, also where they are held; doubt: (c, 9) as it was given.
+    """
+
+    model: PixelModel
+    nominal: Scene
+    scene: Scene
+    identification: Identification
+    found: LeastSquares[Scene]
+    noise: float
+    lens_sigma: Array
+    held: bool
+    by_drawing: bool
+    lens: Array
+    doubt: Array
+
+    @property
+    def active(self) -> Array:
+        """(p,) True where a parameter was fitted."""
+        return self.identification.active
+
+
+def sigma_of(error: Array, weight: Array | None = None) -> float:
+    """Sigma of u and v from errors (2, N), by their median [px]."""
+    size = np.linalg.norm(error, axis=0)
+    size = size if weight is None else size[weight > 0.0]
+    return max(float(np.median(size)) / TYPICAL, FINEST)
+
+
+def softly(error: Array) -> Array:
+    """(N,) weights of pixels in a fit that is not near yet [Cauchy]."""
+    size = np.linalg.norm(error, axis=0) / (SOFT * sigma_of(error))
+    return np.asarray(1.0 / (1.0 + size**2))
+
+
+def right(error: Array, weight: Array) -> Array:
+    """(N,) 1, or 0 where a pixel stands out from the errors (2, N) of those that count."""
+    return np.asarray(np.linalg.norm(error, axis=0) <= APART * sigma_of(error, weight), dtype=float)
+
+
+def solved(
+    model: PixelModel, x: Scene, limits: Limits, method: least_squares.Method = METHOD
+) -> LeastSquares[Scene]:
+    """Least squares over the model's active parameters from one scene."""
+    return least_squares.solve(model, x, 1, float(max(len(model.pose), 1)), method, limits)
+
+
+def placing(names: Names, lenses: int) -> Array:
+    """(p,) True for the poses of cameras and the places of targets."""
+    mask = np.arange(names.count) >= names.geometric
+    mask[-lenses:] = False
+    return mask
+
+
+def fit_drawn(model: PixelModel, x: Scene) -> Scene:
+    """The arm as drawn with the cameras and targets that fit it best, wrong pixels weighed down."""
+    model = replace(model, active=placing(model.names, x.lens[0].size))
+    for _ in range(3):
+        model = replace(model, weight=softly(model.errors(x)))
+        x = solved(model, x, COARSE).x
+    return x
+
+
+def wishes(names: Names, lenses: int, options: PixelOptions) -> tuple[Array, Array]:
+    """(p,) what may be fitted, and what is to be given up last.  Raises OptionError."""
+    fixed, wanted = names.match(options.fix, "fix"), names.match(options.free, "free")
+    if (fixed & wanted).any():
+        name = names.all[int(np.argmax(fixed & wanted))]
+        raise OptionError(f"{name} is both fixed and freed; take it out of fix or free")
+    allowed = ~fixed
+    if options.fix_camera:
+        allowed[-lenses:] = False
+    return allowed, wanted
+
+
+def known_of(robot: Robot, model: PixelModel, lens: Array, *, by_drawing: bool) -> Known:
+    """What the files know of the lenses, and, where nothing else tells the scale, the drawing.
+
+    lens: (c, 9) sigmas.
+    """
+    names = model.names
+    mean, sigma = np.zeros(names.count), np.full(names.count, np.inf)
+    mean[-lens.size :] = model.intrinsic[:, : lens.shape[1]].reshape(-1)
+    sigma[-lens.size :] = lens.reshape(-1)
+    mean[names.links] = links_of(robot.mdh)
+    sigma[lengths_of(names)] = robot.drawn_within[0] if by_drawing else np.inf
+    return Known(mean, sigma)
+
+
+def fit_pixels(
+    robot: Robot, train: PixelData, started: Started, options: PixelOptions, progress: Progress
+) -> PixelFit:
+    """Fit the identifiable parameters to the training pixels.  Raises DataError."""
+    model, x = PixelModel.of(robot, train, started.on_flange), started.scene
+    lenses = x.lens[0].size
+    sigma = options.lens_sigma(model.intrinsic)
+    allowed, wanted = wishes(model.names, lenses, options)
+    nominal = fit_drawn(model, x)
+    progress("identifiable parameters")
+    told = identified(robot, model, nominal, allowed, wanted, options.resolution)
+    known = told.identification
+    check_count(train, int(known.active.sum()))
+    beside = known_of(robot, model, sigma, by_drawing=told.by_drawing)
+    progress("lengths and angles at given depths")
+    lens = np.arange(model.names.count) >= model.names.count - lenses
+    near = replace(model, active=known.active & ~lens)
+    near = replace(near, prior=beside.prior(sigma_of(model.errors(nominal))))
+    x = by_depths(near, nominal, started)
+    progress("reprojection")
+    model = replace(model, active=known.active)
+    model, found, noise = reprojected(model, x, beside)
+    held = options.fix_camera
+    own = found.x if not held else with_lenses(model, found.x, beside)
+    if np.abs(lens_off(model, own, sigma)).max() > FAR_LENS and not held:
+        loose = replace(beside, sigma=np.where(lens, LOOSE * beside.sigma, beside.sigma))
+        model, found, noise = reprojected(model, found.x, loose)
+        own = found.x
+    off = np.abs(lens_off(model, own, sigma)) * sigma
+    if held:  # the doubt of a lens that the pixels contradict is how far they say it is off
+        sigma = np.where(off > FAR_LENS * sigma, off, sigma)
+    return PixelFit(
+        model, nominal, found.x, known, found, noise, sigma, held, told.by_drawing, own.lens[0],
+        options.lens_sigma(model.intrinsic),
+    )  # fmt: skip
+
+
+def by_depths(model: PixelModel, x: Scene, started: Started) -> Scene:
+    """A fit of lengths and angles in errors that are affine in the lengths, from far away.
+
+    Depths are those that the images tell by themselves, as far as they do; then those of the fit.
+    """
+    for at in range(DEPTH_ROUNDS):
+        depth = np.maximum(model.seen(x).point[2], started.nearest)
+        if at == 0 and len(started.depth):
+            depth = np.where(started.depth > 0.0, started.depth, depth)
+        sight = replace(model, sight=Sight(depth, started.direction))
+        sight = replace(sight, weight=softly(sight.rows(x, np.zeros(0, dtype=bool))[0]))
+        x = solved(sight, x, COARSE, AFFINE).x
+    return x
+
+
+def with_lenses(model: PixelModel, x: Scene, beside: Known) -> Scene:
+    """What the pixels say of lenses that are held: a fit that frees them, from that which does not.
+
+    Of what the files know of them hardly anything counts.
+    """
+    lens = np.arange(model.names.count) >= model.names.count - x.lens[0].size
+    prior = replace(beside, sigma=np.where(lens, LOOSE * beside.sigma, beside.sigma))
+    free = replace(model, active=model.active | lens, weight=softly(model.errors(x)))
+    return solved(replace(free, prior=prior.prior(sigma_of(model.errors(x)))), x, COARSE).x
+
+
+def reprojected(
+    model: PixelModel, x: Scene, beside: Known
+) -> tuple[PixelModel, LeastSquares[Scene], float]:
+    """The fit of the pixels, those that stand out set aside; the noise of the others [px]."""
+    for _ in range(2):
+        noise = sigma_of(model.errors(x))
+        model = replace(model, weight=softly(model.errors(x)), prior=beside.prior(noise))
+        found = solved(model, x, COARSE)
+        x = found.x
+    model = replace(model, weight=np.ones(len(model.pose)))
+    if sigma_of(model.errors(x)) > HOPELESS * model.intrinsic[:, 0].max():
+        return model, replace(found, status=(Status.FAILED,)), spread_of(model, x)
+    for _ in range(ROUNDS):
+        before, error = model.weight, model.errors(x)
+        weight = right(error, before)
+        model = replace(model, weight=weight, prior=beside.prior(sigma_of(error, before)))
+        found = solved(model, x, FINE)
+        x = found.x
+        if np.array_equal(weight, before):
+            break
+    return model, found, spread_of(model, x)
+
+
+def lens_off(model: PixelModel, x: Scene, sigma: Array) -> Array:
+    """(c, 9) how far the lenses are from their files, in doubts sigma (c, 9)."""
+    return np.asarray((x.lens[0] - model.intrinsic[:, : sigma.shape[1]]) / sigma)
+
+
+def spread_of(model: PixelModel, x: Scene) -> float:
+    """Sigma of u and v by the squares of the pixels that count [px]."""
+    counted = model.weight > 0.0
+    freedom = max(2 * int(counted.sum()) - int(model.active.sum()), 1)
+    return max(float(np.sqrt((model.errors(x)[:, counted] ** 2).sum() / freedom)), FINEST)
+
+
+def check_count(train: PixelData, unknowns: int) -> None:
+    """Raise DataError if the training pixels cannot determine the unknowns."""
+    poses = len(np.unique(groups(train.at)[np.unique(train.pose)]))
+    seen = min(2.0 * train.count / max(poses, 1), 6.0 * len(train.cameras))
+    needed = int(np.ceil(unknowns / max(seen, 1.0))) + 1
+    if poses < needed or 2 * train.count <= unknowns:
+        raise DataError(
+            f"{train.source}: {poses} poses with {2 * train.count} numbers for the fit, but "
+            f"{unknowns} unknown parameters need at least {needed} poses; take more images, hold "
+            "out fewer or fix parameters (fix)"
+        )
+
+
+def scores(model: PixelModel, x: Scene, group: Array) -> tuple[Array, Array]:
+    """Gradients (g, free) and Gram matrices (g, free, free) of the pixels of each group.
+
+    group: (N,) numbers from 0.
+    """
+    error, rows = model.rows(x, model.active)
+    root = np.sqrt(model.weight)
+    error, rows = error * root, rows * root
+    count = int(group.max()) + 1
+    gradient, gram = np.zeros((count, len(rows))), np.zeros((count, len(rows), len(rows)))
+    for each in range(count):
+        mine = group == each
+        part = rows[..., mine].reshape(len(rows), -1)
+        gradient[each], gram[each] = part @ error[:, mine].reshape(-1), part @ part.T
+    return gradient, gram
+
+
+def covariance_of(fit: PixelFit, group: Array) -> Array:
+    """Covariance (p, p) of all parameters [SI, px], NaN where not identified.
+
+    The jackknife over groups of pixels [Bell and McCaffrey 2002], since the errors of one image go
+    together; a prior on a lens is as uncertain as it says; so is a lens that is held.
+    group: (N,) of the training pixels, numbers from 0.
+    """
+    model, x, active = fit.model, fit.scene, fit.active
+    gradient, gram = scores(model, x, group)
+    prior = model.prior.weight[active]
+    bread = gram.sum(axis=0) + np.diag(prior)
+    cover = solve_normal(bread, np.eye(len(bread)))
+    counted = [i for i in range(len(gram)) if gram[i].any()]
+    change = np.stack([solve_normal(bread - gram[i], gradient[i][:, None])[:, 0] for i in counted])
+    share = (len(counted) - 1) / len(counted)
+    found = share * change.T @ change + cover @ np.diag(fit.noise**2 * prior) @ cover
+    if fit.held:
+        found = found + of_held_lenses(fit, cover)
+    covariance = np.full((len(active),) * 2, np.nan)
+    covariance[np.ix_(active, active)] = found
+    return covariance
+
+
+def of_held_lenses(fit: PixelFit, cover: Array) -> Array:
+    """What lenses that are held, and may be wrong, add to the covariance.  cover: H^-1."""
+    model, x = fit.model, fit.scene
+    lens = np.arange(model.names.count) >= model.names.count - x.lens[0].size
+    _, rows = model.rows(x, fit.active | lens)
+    rows = (rows * np.sqrt(model.weight)).reshape(len(rows), -1)
+    split = int(fit.active.sum())
+    shift = cover @ (rows[:split] @ rows[split:].T) * fit.lens_sigma.reshape(-1)
+    return np.asarray(shift @ shift.T)

@@ -1,0 +1,107 @@
+"""What can be chosen of a calibration by cameras."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.pixels.camera import INTRINSICS
+from minimax_cal.fitting.pixels.model import FLANGE, GROUND
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.options import option
+
+CAMERAS = "Cameras in place of DATA"
+# How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
+# the first radial and both tangential coefficients; higher radial ones are known worse.
+DOUBTS = {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
+SHARES = {  # of each intrinsic: which doubt it has, and how many times
+    "fx": ("f", 1.0), "fy": ("f", 1.0), "cx": ("c", 1.0), "cy": ("c", 1.0), "k1": ("k", 1.0),
+    "k2": ("k", 5.0), "k3": ("k", 10.0), "p1": ("p", 1.0), "p2": ("p", 1.0),
+}  # fmt: skip
+UNITS = {"f": ("%", 0.01), "c": ("px", 1.0), "k": ("", 1.0), "p": ("", 1.0)}
+ITEM = re.compile(r"\s*([fckp])\s+([\d.]+(?:[eE][-+]?\d+)?)\s*(%|px)?\s*")
+
+
+def doubts_of(text: str) -> Mapping[str, float]:
+    """How well a lens is known, from a text as ``f 0.1%, c 2px``.  Raises OptionError."""
+    found = dict(DOUBTS)
+    for part in filter(str.strip, text.split(",")):
+        match = ITEM.fullmatch(part)
+        if not match or (match[3] or "") != UNITS[match[1]][0] or not float(match[2]) > 0.0:
+            raise OptionError(
+                f"camera_prior={text!r}: write f in %, c in px, k and p as they are, all more than "
+                "0, as 'f 0.1%, c 2px'"
+            )
+        found[match[1]] = float(match[2]) * UNITS[match[1]][1]
+    return found
+
+
+def camera_of(text: str) -> tuple[str, str]:
+    """NAME=FILE.  Raises OptionError."""
+    name, _, path = text.partition("=")
+    if not (name.strip() and path.strip()):
+        raise OptionError(f"camera={text!r}: give a name and a file, as cam0=camera.yaml")
+    return name.strip(), path.strip()
+
+
+@dataclass(frozen=True)
+class PixelOptions:
+    """How to calibrate.
+
+    camera_on: flange or ground; "" for what fits better.  fix_camera: hold the lenses as their
+    files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.  holdout: share of the
+    poses kept out of the fit; seed: of that choice.  fix, free: names or patterns as ``beta*``.
+    resolution: relative singular value that counts as not measured.  allow_large_changes: accept an
+    arm that is another than the one drawn.
+    """
+
+    camera_on: str = option(
+        "",
+        "What the cameras are fixed to: flange or ground [default: what fits better].",
+        metavar="flange|ground",
+        group=CAMERAS,
+    )
+    fix_camera: bool = option(
+        False,
+        "Hold the lenses as their files say; how well these know them still counts in the sigmas.",
+        group=CAMERAS,
+    )
+    camera_prior: str = option(
+        "",
+        "How well the files know the lenses: focal length, centre, radial and tangential "
+        "distortion [default: f 0.1%, c 2px, k 0.005, p 0.0005].",
+        metavar='"f 0.1%, c 2px"',
+        group=CAMERAS,
+    )
+    holdout: float = Options.holdout
+    seed: int = Options.seed
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    resolution: float = Options.resolution
+    allow_large_changes: bool = Options.allow_large_changes
+
+    def settings(self) -> dict[str, object]:
+        """For the record."""
+        return dict(vars(self))
+
+    def lens_sigma(self, intrinsic: Array) -> Array:
+        """(c, 9) standard deviations of the lenses.  intrinsic: (c, 16)."""
+        doubts = doubts_of(self.camera_prior)
+        sigma = np.array([times * doubts[kind] for kind, times in map(SHARES.get, INTRINSICS)])  # type: ignore[misc]
+        every = np.tile(sigma, (len(intrinsic), 1))
+        every[:, :2] *= intrinsic[:, :2]
+        return every
+
+
+def check_options(options: PixelOptions) -> None:
+    """Raise OptionError for a choice that does not exist."""
+    if options.camera_on not in ("", FLANGE, GROUND):
+        raise OptionError(f"camera_on={options.camera_on!r}: give {FLANGE} or {GROUND}")
+    if not 0.0 <= options.resolution < 1.0:
+        raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    doubts_of(options.camera_prior)

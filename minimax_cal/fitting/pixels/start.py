@@ -1,0 +1,374 @@
+"""Where cameras and targets are, without a guess.
+
+With a flat board each image tells the camera's pose by itself (a homography), so that poses start
+it; with tags of unknown place, or where images show too few corners, a search over the camera's
+rotation does: everything else is then linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.poses import poses_as_targets, spots_of, tool_of
+from minimax_cal.fitting.pixels.camera import undistorted
+from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
+from minimax_cal.fitting.start import fit_base
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.model import model_of
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import nearest_rotation, transform
+
+CORNERS = 6  # in an image: fewer do not tell a wrong one by the others
+IMAGES = 4  # whose poses tell where a camera and a board are
+FLAT = 1e-3  # of a board's size: what it may stick out of its plane
+REWEIGHED = 5  # rounds that take wrong corners, or wrong images, out
+ROBUST = 3.0  # times the typical error: beyond it a corner counts less
+LEVER = 0.1  # of the virtual reflectors at a measured pose [m]
+ROTATIONS = 600  # of a camera that are looked at, some 25 degrees from each other
+TARGETS = 6  # of unknown place, which tell one rotation from another
+ENOUGH, SCREENED = 300, 100  # of their pixels, for the few that go on and for all
+REFINED, STEPS = 6, 15  # rotations that go on, and how often each is improved
+DEPTHS = 3  # rounds in which depths follow the lengths
+RIDGE = 1e-12  # of the normal equations' typical entry, for what no ray tells
+NEARBY = 1e-3  # least depth of a target [m]
+SHALLOW = 0.05  # of the largest depth: what is nearer counts no more
+BEHIND = 0.2  # error of what lies behind a camera, as a tangent
+SOFT = 0.01  # errors count less from here on
+
+
+@dataclass(frozen=True, eq=False)
+class Started:
+    """The arm as drawn, among cameras and targets that fit it.
+
+    on_flange: whether the cameras ride on it.  direction: (2, N) that was seen, in the plane at
+    depth one.  depth: (N,) of each target as its image tells it alone, 0 where it does not [m].
+    nearest: least depth of a target [m].
+    """
+
+    scene: Scene
+    on_flange: bool
+    direction: Array
+    depth: Array
+    nearest: float = NEARBY
+
+    def miss(self, robot: Robot, data: PixelData) -> float:
+        """Typical error at the targets, infinite where most lie behind a camera [m]."""
+        model = PixelModel.of(robot, data, self.on_flange)
+        depth = model.seen(self.scene).point[2]
+        size = np.linalg.norm(model.errors(self.scene) / model.intrinsic[data.camera, :2].T, axis=0)
+        return float(np.median(np.where(depth > self.nearest, size * depth, np.inf)))
+
+
+def start_scene(robot: Robot, data: PixelData, on_flange: bool) -> Started:
+    """Cameras and targets that fit the arm as drawn."""
+    model = PixelModel.of(robot, data, on_flange)
+    seen = directions(model)
+    image = poses_of_images(data, seen) if is_flat(data.board) else {}
+    every = range(len(data.cameras))
+    told = [by_poses(robot, data, model, image, camera) for camera in every]
+    found = [each for each in told if each is not None]
+    if len(found) < len(told):
+        found = [by_rotations(robot, data, model, seen, camera) for camera in every]
+    return Started(merged(robot, data, found), on_flange, seen, depths(data, image))
+
+
+def depths(data: PixelData, image: dict[tuple[int, int], Array]) -> Array:
+    """(N,) of each target by the pose of its board in its image, 0 where there is none [m]."""
+    out = np.zeros(data.count)
+    if image:
+        none = np.full((3, 4), 0.0)
+        keys = zip(data.camera.tolist(), data.pose.tolist(), strict=True)
+        row = np.stack([image[key][2] if key in image else none[2] for key in keys])
+        out = np.einsum("ni,ni->n", row[:, :3], data.board[data.target]) + row[:, 3]
+    return out
+
+
+def directions(model: PixelModel) -> Array:
+    """(2, N) what was seen, in the plane at depth one, by the lenses as their files say."""
+    return undistorted(model.intrinsic[model.camera].T, model.pixel.T)
+
+
+def is_flat(board: Array) -> bool:
+    """Whether a board lies in a plane."""
+    if not len(board):
+        return False
+    size = np.linalg.svd(board - board.mean(axis=0), compute_uv=False)
+    return bool(size[2] < FLAT * size[0])
+
+
+# ---- a flat board: a pose from each image ----------------------------------------------------
+
+
+def plane_of(board: Array) -> Array:
+    """(4, 4) pose, in the board's frame, of a frame whose z = 0 holds all its targets."""
+    centre = board.mean(axis=0)
+    axes = np.linalg.svd(board - centre)[2]
+    axes[2] *= np.linalg.det(axes)
+    return transform(axes.T, centre)
+
+
+def poses_of_images(data: PixelData, seen: Array) -> dict[tuple[int, int], Array]:
+    """Pose (4, 4) of the board in the camera by camera and pose, where it shows [m]."""
+    plane = plane_of(data.board)
+    local = (data.board - plane[:3, 3]) @ plane[:3, :3]
+    out = {}
+    for camera, pose in sorted(set(zip(data.camera.tolist(), data.pose.tolist(), strict=True))):
+        rows = np.flatnonzero((data.camera == camera) & (data.pose == pose))
+        if len(rows) >= CORNERS:
+            found = pose_of_plane(local[data.target[rows], :2], seen[:, rows].T)
+            if found is not None:
+                out[camera, pose] = found @ np.linalg.inv(plane)
+    return out
+
+
+def pose_of_plane(corner: Array, direction: Array) -> Array | None:
+    """Pose (4, 4) of a plane from where its corners are seen; None where they do not tell.
+
+    corner: (c, 2) in the plane [m].  direction: (c, 2) in the camera's plane at depth one.
+    Direct linear transform with wrong corners weighed down, then the nearest rotation.
+    """
+    (a, moved), (b, shown) = centred(corner), centred(direction)
+    ones, none = np.ones((len(moved), 1)), np.zeros((len(moved), 3))
+    point = np.hstack([moved, ones])
+    rows = np.stack(
+        [
+            np.hstack([point, none, -shown[:, :1] * point]),
+            np.hstack([none, point, -shown[:, 1:] * point]),
+        ],
+        axis=1,
+    )
+    weight = np.ones(len(moved))
+    for _ in range(REWEIGHED):
+        size, axes = np.linalg.svd((weight[:, None, None] * rows).reshape(-1, 9))[1:]
+        if size[7] < 1e-6 * size[0]:
+            return None
+        flat = axes[8].reshape(3, 3)
+        image = point @ flat.T
+        error = np.linalg.norm(image[:, :2] / image[:, 2:] - shown, axis=1)
+        limit = ROBUST * np.median(error)
+        weight = np.where(error > limit, limit / np.maximum(error, 1e-300), 1.0) ** 2
+    whole = np.linalg.inv(b) @ flat @ a
+    whole /= np.sqrt(np.linalg.norm(whole[:, 0]) * np.linalg.norm(whole[:, 1]))
+    whole *= np.sign(whole[2, 2])  # before the camera
+    first, second, place = whole.T
+    rotation = nearest_rotation(np.stack([first, second, np.cross(first, second)], axis=1))
+    return transform(rotation, place)
+
+
+def centred(places: Array) -> tuple[Array, Array]:
+    """The map (3, 3) that brings places (c, 2) about zero and to size one, and what it gives."""
+    middle = places.mean(axis=0)
+    size = np.sqrt(((places - middle) ** 2).sum(axis=1).mean() / 2.0)
+    scale = 1.0 / max(float(size), 1e-300)
+    change = np.array([[scale, 0.0, -scale * middle[0]], [0.0, scale, -scale * middle[1]],
+                       [0.0, 0.0, 1.0]])  # fmt: skip
+    return change, scale * (places - middle)
+
+
+def by_poses(
+    robot: Robot,
+    data: PixelData,
+    model: PixelModel,
+    image: dict[tuple[int, int], Array],
+    camera: int,
+) -> tuple[Array, Array, Array] | None:
+    """Pose (4, 4) of a camera, pose (4, 4) of the board, and the places (k, 3) of its targets.
+
+    As a tracker sees whole poses: the still one of camera and board is the tracker.  None where
+    too few images tell a pose.
+    """
+    rows = [pose for each, pose in image if each == camera]
+    if len(rows) < IMAGES:
+        return None
+    pose = np.stack([image[camera, row] for row in rows])
+    if model.on_flange:
+        pose = np.linalg.inv(pose)
+    targets = reflectors(data, np.array(rows), pose)
+    for _ in range(REWEIGHED):  # images that the arm contradicts are left out
+        found = fit_base(model_of(robot, targets), robot.mdh).state
+        error = np.linalg.norm(model_of(robot, targets).error(found), axis=-1).max(axis=0)
+        kept = error <= 2.0 * ROBUST * np.median(error)
+        if kept.all() or kept.sum() < IMAGES:
+            break
+        targets = targets.take(kept)
+    tool = tool_of(Cell.of(robot, found, targets.target_names), spots_of(LEVER))
+    still = np.linalg.inv(found.base)
+    place, board = (tool, still) if model.on_flange else (still, tool)
+    return place, board, data.board @ board[:3, :3].T + board[:3, 3]
+
+
+def reflectors(data: PixelData, rows: Array, pose: Array) -> Measurements:
+    """Poses (r, 4, 4) at some rows as virtual reflectors, which say the same [m]."""
+    at = replace(data.at.take(rows), columns={})
+    return poses_as_targets(RelativeData(at, "poses", pose=pose), LEVER)
+
+
+# ---- anything else: a search over rotations --------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """What is linear in the places of one camera and of its targets, once its rotation is given.
+
+    A target w is at R' (turn w - off - t) in the camera's axes, R its rotation and t its place.
+    turn: (N, 3, 3).  off: (N, 3) [m].  direction: (N, 2).  target: (N,) numbers from 0, each there.
+    """
+
+    turn: Array
+    off: Array
+    direction: Array
+    target: Array
+
+    def some(self, rows: Array) -> Rays:
+        """Some of the rays, their targets numbered anew."""
+        _, target = np.unique(self.target[rows], return_inverse=True)
+        return Rays(self.turn[rows], self.off[rows], self.direction[rows], target.reshape(-1))
+
+    def across(self, view: Array) -> Array:
+        """(N, 2, 3) what makes a point's two errors of the point.  view: (3, 3) R'."""
+        return np.asarray(view[None, :2] - self.direction[..., None] * view[2])
+
+    def solved(self, view: Array) -> tuple[Array, Array, Array]:
+        """Place (3,), targets (k, 3) [m] and errors (N, 2) in the plane at depth one, robustly.
+
+        Errors of what lies behind the camera are `BEHIND`.
+        """
+        across, count = self.across(view), int(self.target.max()) + 1
+        rows = np.zeros((len(self.off), 2, 3 * count + 3))
+        own = across @ self.turn
+        for axis in range(3):
+            rows[np.arange(len(rows)), :, 3 * self.target + axis] = own[..., axis]
+        rows[..., -3:] = -across
+        right = (across @ self.off[..., None])[..., 0]
+        weight = np.ones(len(rows))
+        for _ in range(DEPTHS):
+            matrix = (weight[:, None, None] * rows).reshape(-1, rows.shape[-1])
+            gram = matrix.T @ matrix
+            gram += RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+            found = np.linalg.solve(gram, matrix.T @ (weight[:, None] * right).reshape(-1))
+            spots, place = found[:-3].reshape(-1, 3), found[-3:]
+            depth = self.depth(view, place, spots[self.target])
+            error = (rows @ found - right) / np.maximum(depth, NEARBY)[:, None]
+            error = np.where(depth[:, None] > NEARBY, error, BEHIND)
+            size = np.linalg.norm(error, axis=1)
+            limit = ROBUST * np.median(size) + 1e-12
+            weight = np.minimum(1.0, limit / np.maximum(size, 1e-300))
+            weight /= np.maximum(depth, SHALLOW * np.abs(depth).max())
+        return place, spots, error
+
+    def depth(self, view: Array, place: Array, spot: Array) -> Array:
+        """(N,) of the targets before the camera [m]."""
+        fixed = (self.turn @ spot[..., None])[..., 0] - self.off - place
+        return np.asarray(fixed @ view[2])
+
+
+def rays_of(robot: Robot, data: PixelData, model: PixelModel, seen: Array, camera: int) -> Rays:
+    """Those of one camera, for the arm as drawn.  The targets' numbers are those of the data."""
+    rows = np.flatnonzero(data.camera == camera)
+    links = kinematics.chain(robot.mdh, model.q, model.prismatic)
+    axes = np.moveaxis(links.axes[..., data.pose[rows]], -1, 0)
+    origin = links.origin[:, data.pose[rows]].T
+    target, direction = data.target[rows], seen[:, rows].T
+    if model.on_flange:
+        return Rays(axes, (axes @ origin[..., None])[..., 0], direction, target)
+    return Rays(axes.swapaxes(1, 2), -origin, direction, target)
+
+
+def by_rotations(
+    robot: Robot, data: PixelData, model: PixelModel, seen: Array, camera: int
+) -> tuple[Array, Array, Array]:
+    """As `by_poses`, for targets taken as of unknown place, NaN where one camera cannot tell it."""
+    rays = rays_of(robot, data, model, seen, camera)
+    few, fewest = (rays.some(thinned(rays.target, most)) for most in (ENOUGH, SCREENED))
+    looks = Rotation.random(ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
+    cost = [clipped(fewest.solved(look)[2]) for look in looks]
+    best = np.argsort(cost)[:REFINED]
+    view = min((refined(few, looks[i]) for i in best), key=lambda v: clipped(few.solved(v)[2]))
+    place = few.solved(view)[0]
+    spots = np.full((len(data.targets), 3), np.nan)
+    for target in np.unique(rays.target):
+        rows = np.flatnonzero(rays.target == target)
+        if len(rows) > 1:
+            spots[target] = crossing(rays.some(rows), view, place)
+    camera_pose = transform(view.T, place)
+    if not len(data.board):
+        return camera_pose, np.eye(4), spots
+    known = np.isfinite(spots[:, 0])
+    board = rigid(data.board[known], spots[known])
+    return camera_pose, board, np.asarray(data.board @ board[:3, :3].T + board[:3, 3])
+
+
+def thinned(target: Array, most: int) -> Array:
+    """Rows that tell one rotation from another: of the targets seen most often."""
+    chosen = np.argsort(-np.bincount(target), kind="stable")[:TARGETS]
+    rows = np.flatnonzero(np.isin(target, chosen))
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)])
+
+
+def clipped(error: Array) -> float:
+    """Mean size of errors (N, 2), wrong ones no more than `BEHIND`."""
+    return float(np.minimum(np.linalg.norm(error, axis=1), BEHIND).mean())
+
+
+def refined(rays: Rays, view: Array) -> Array:
+    """The rotation (3, 3) near one that fits the rays best."""
+
+    def errors(turn: Array) -> Array:
+        return rays.solved(kinematics.rotation(turn) @ view)[2].reshape(-1)
+
+    found = least_squares(errors, np.zeros(3), loss="soft_l1", f_scale=SOFT, max_nfev=STEPS)
+    return np.asarray(kinematics.rotation(found.x) @ view)
+
+
+def crossing(rays: Rays, view: Array, place: Array) -> Array:
+    """(3,) where the rays of one target cross best [m]."""
+    across = rays.across(view)
+    rows = across @ rays.turn
+    right = (across @ (rays.off + place)[..., None])[..., 0]
+    weight = np.ones(len(rows))
+    for _ in range(DEPTHS):
+        matrix = (weight[:, None, None] * rows).reshape(-1, 3)
+        spot = np.linalg.lstsq(matrix, (weight[:, None] * right).reshape(-1), rcond=1e-9)[0]
+        size = np.linalg.norm(rows @ spot - right, axis=1)
+        limit = ROBUST * np.median(size) + 1e-12
+        weight = np.minimum(1.0, limit / np.maximum(size, 1e-300))
+    return np.asarray(spot)
+
+
+def rigid(local: Array, place: Array) -> Array:
+    """Pose (4, 4) that brings points (k, 3) to their places best [Kabsch 1976]."""
+    a, b = local.mean(axis=0), place.mean(axis=0)
+    turn = nearest_rotation((place - b).T @ (local - a))
+    return transform(turn, b - turn @ a)
+
+
+def merged(robot: Robot, data: PixelData, found: Sequence[tuple[Array, Array, Array]]) -> Scene:
+    """One scene of what each camera told by itself; the board as the one that saw most tells it."""
+    poses = np.stack([place for place, _, _ in found])
+    first = int(np.bincount(data.camera).argmax())
+    board = found[first][1]
+    points = np.zeros((0, 3))
+    if not len(data.board):
+        points = found[first][2].copy()
+        for _, _, more in found:
+            points = np.where(np.isfinite(points), points, more)
+        points = np.where(np.isfinite(points), points, np.nanmean(points, axis=0))
+    return Scene(
+        mdh=robot.mdh[None],
+        turn=poses[None, :, :3, :3],
+        place=poses[None, :, :3, 3],
+        board_turn=board[None, :3, :3],
+        board_place=board[None, :3, 3],
+        points=points[None],
+        lens=lens_of(data.cameras),
+    )

@@ -1,0 +1,320 @@
+"""Pixels as an instrument: the lens, the derivatives, the fit, and what it must not claim."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from experiments.pixel_cells import (
+    Cell,
+    View,
+    arm_error,
+    board_points,
+    data_of,
+    make_cell,
+    projected,
+)
+from minimax_cal.fitting.pixels.calibrate import fitted
+from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
+from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.judge import Claim
+from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
+from minimax_cal.fitting.pixels.options import PixelOptions, doubts_of
+from minimax_cal.fitting.pixels.result import PixelCalibration
+from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
+from minimax_cal.solvers.status import Status
+
+LENS = np.array([2500, 2510, 1220, 1030, -0.1, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.01, 3e-3,
+                 1e-3, 2e-3, -1e-3, 5e-4])  # fmt: skip
+EXACT = 1e-9  # of pixels, beside 1e3 of them
+SMALL, WIDE = (6, 5), 0.04  # a board with few corners
+GIVEN_MM = 0.03  # arm error with 30 poses of 30 corners, lenses known to the data
+
+
+def cell_of(seed: int, **more: object) -> Cell:
+    """A small cell."""
+    points = board_points(SMALL, WIDE)
+    return make_cell(np.random.default_rng(seed), **{"points": points, "poses": 30} | more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["eye in hand", "eye to hand"])
+def cell(request: pytest.FixtureRequest) -> Cell:
+    return cell_of(2, on_flange=request.param)
+
+
+@pytest.fixture(scope="module")
+def ground() -> Cell:
+    return cell_of(2, on_flange=False)
+
+
+# ---- the lens --------------------------------------------------------------------------------
+
+
+def test_projection_is_that_of_the_manual() -> None:
+    rng = np.random.default_rng(0)
+    view = View(np.eye(4))
+    point = rng.uniform(-0.2, 0.2, (40, 3)) + np.array([0.0, 0.0, 0.7])
+    lens = np.array([*view.lens, *view.distortion, *np.zeros(7)])[:, None]
+    x, y = (point[:, :2] / point[:, 2:]).T
+    assert_allclose(distorted(lens, x, y).T, projected(view, point), rtol=0, atol=EXACT)
+
+
+def test_projection_is_that_of_opencv() -> None:
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed")
+    rng = np.random.default_rng(0)
+    point = rng.uniform(-0.3, 0.3, (40, 3)) + np.array([0.0, 0.0, 0.7])
+    matrix = np.array([[LENS[0], 0, LENS[2]], [0, LENS[1], LENS[3]], [0, 0, 1]])
+    for count in (4, 5, 8, 12):
+        given = np.concatenate([LENS[4 : 4 + count], np.zeros(12 - count)])
+        theirs, _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), matrix, LENS[4 : 4 + count])
+        x, y = (point[:, :2] / point[:, 2:]).T
+        ours = distorted(np.array([*LENS[:4], *given])[:, None], x, y)
+        assert_allclose(ours.T, theirs[:, 0], rtol=0, atol=EXACT)
+
+
+def test_slopes_are_the_derivatives_of_the_projection() -> None:
+    rng, step = np.random.default_rng(0), 1e-30
+    x, y = rng.uniform(-0.4, 0.4, (2, 30))
+    lens = LENS[:, None]
+    pixel, by, own = slopes(lens, x, y)
+    assert_allclose(pixel, distorted(lens, x, y), rtol=0, atol=EXACT)
+    assert_allclose(by[0], distorted(lens, x + 1j * step, y + 0j).imag / step, rtol=1e-12)
+    assert_allclose(by[1], distorted(lens, x + 0j, y + 1j * step).imag / step, rtol=1e-12)
+    for i in range(len(INTRINSICS)):
+        moved = lens.astype(complex)
+        moved[i] += 1j * step
+        slope = distorted(moved, x + 0j, y + 0j).imag / step
+        assert_allclose(own[i], slope, rtol=0, atol=1e-10)
+
+
+def test_undistorted_is_the_inverse() -> None:
+    x, y = np.random.default_rng(0).uniform(-0.4, 0.4, (2, 50))
+    back = undistorted(LENS[:, None], distorted(LENS[:, None], x, y))
+    assert_allclose(back, np.stack([x, y]), rtol=0, atol=1e-13)
+
+
+# ---- the model -------------------------------------------------------------------------------
+
+
+def scene_of(cell: Cell, data: PixelData) -> tuple[PixelModel, Scene]:
+    """Every twentieth pixel, and a scene near the truth; the base is no parameter."""
+    x = start_scene(cell.drawn, data_of(cell), cell.on_flange).scene
+    if not len(data.board):
+        spots = cell.points @ x.board_turn[0].T + x.board_place[0]
+        x = replace(x, points=spots[None])
+    model = PixelModel.of(cell.drawn, data, cell.on_flange)
+    active = np.ones(model.names.count, dtype=bool)
+    active[5 * cell.drawn.joints : model.names.geometric] = False
+    return replace(model.some(np.arange(0, data.count, 20)), active=active), x
+
+
+@pytest.mark.parametrize("board", [True, False], ids=["board", "tags"])
+@pytest.mark.parametrize("affine", [False, True], ids=["pixels", "given depths"])
+def test_rows_are_the_derivatives_of_the_pixels(cell: Cell, board: bool, affine: bool) -> None:
+    data = data_of(cell, board=board)
+    model, x = scene_of(cell, data)
+    if affine:
+        depth = np.linspace(0.3, 0.6, len(model.pose))
+        model = replace(model, sight=Sight(depth, directions(model)))
+    _, rows = model.rows(x, model.active)
+    free, step = int(model.active.sum()), 1e-6
+    for i in range(free):
+        move = np.zeros((1, free))
+        move[0, i] = step
+        there, back = (model.rows(model.step(x, way * move), model.active)[0] for way in (1, -1))
+        slope = (back - there) / (2.0 * step)
+        size = max(float(np.abs(rows[i]).max()), 1.0)
+        assert_allclose(rows[i] / size, slope / size, rtol=0, atol=2e-6)
+
+
+def test_errors_at_given_depths_are_affine_in_the_lengths(cell: Cell) -> None:
+    model, x = scene_of(cell, data_of(cell))
+    model = replace(model, sight=Sight(np.full(len(model.pose), 0.5), directions(model)))
+    move = np.where(model.linear, np.random.default_rng(0).normal(size=model.linear.size), 0.0)
+    near, once, twice = (
+        model.rows(model.step(x, 0.1 * times * move[None]), model.active)[0] for times in (0, 1, 2)
+    )
+    assert_allclose(twice - once, once - near, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "board", [pytest.param(True, marks=pytest.mark.slow), False], ids=["board", "tags"]
+)
+def test_a_search_over_rotations_needs_no_board(cell: Cell, board: bool) -> None:
+    data = data_of(cell, board=board)
+    model = PixelModel.of(cell.drawn, data, cell.on_flange)
+    found = merged(cell.drawn, data, [by_rotations(cell.drawn, data, model, directions(model), 0)])
+    away = np.linalg.norm(found.place[0, 0] - cell.views[0].pose[:3, 3])
+    assert away < 0.01
+    assert np.median(np.linalg.norm(model.errors(found), axis=0)) < 30.0
+
+
+# ---- the fit ---------------------------------------------------------------------------------
+
+
+def test_the_arm_comes_out_and_its_sigma_is_true(cell: Cell) -> None:
+    fit = fitted(cell.drawn, data_of(cell), PixelOptions())
+    assert fit.status is Status.CONVERGED
+    assert arm_error(cell, cell.drawn) > 0.5
+    assert arm_error(cell, fit.robot) < GIVEN_MM
+    assert arm_error(cell, fit.robot) < 2.0 * 1e3 * fit.claim.sigma < 4.0 * GIVEN_MM
+    assert fit.instrument["cameras_in"] == ("flange" if cell.on_flange else "base")
+    assert 0.1 < fit.pixels["holdout"][0] < 0.25
+    assert fit.pixels["nominal"][0] > 2.0
+
+
+def test_two_cameras_are_better_than_one() -> None:
+    second = np.eye(4)
+    second[:3, 3] = -0.06, 0.02, 0.08
+    first = np.eye(4)
+    first[:3, 3] = 0.04, -0.03, 0.08
+    views = (View(first), View(second, lens=(2300.0, 2300.0, 1200.0, 1000.0)))
+    cell = cell_of(4, views=views)
+    data = data_of(cell)
+    both = fitted(cell.drawn, data, PixelOptions())
+    one = replace(data.some(data.camera == 0), cameras=data.cameras[:1])
+    alone = fitted(cell.drawn, one, PixelOptions())
+    assert both.claim.sigma < alone.claim.sigma
+    assert arm_error(cell, both.robot) < GIVEN_MM
+
+
+def test_tags_of_unknown_place_leave_the_scale_to_the_drawing() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (15, 3)) * [0.3, 0.3, 0.05]
+    cell = make_cell(rng, points=points, least=0.3, off=(0.3e-3, 0.5e-3))
+    fit = fitted(cell.drawn, data_of(cell, board=False), PixelOptions(camera_on="flange"))
+    assert fit.status is Status.CONVERGED
+    assert any("scale is that of the drawing" in notice for notice in fit.notices)
+    assert 0.1e-3 < fit.claim.sigma < 0.5e-3  # 0.3 mm of drawn lengths
+    assert arm_error(cell, fit.robot) < 2.0 * 1e3 * fit.claim.sigma
+    scaled = cell.true.mdh.copy()  # the same arm, larger as the pixels allow
+    scaled[:, :2] *= fit.robot.mdh[1, 0] / cell.true.mdh[1, 0]
+    assert arm_error(replace(cell, true=cell.true.with_mdh(scaled)), fit.robot) < 0.1
+
+
+@pytest.mark.parametrize("off", [1.001, pytest.param(0.999, marks=pytest.mark.slow)])
+def test_lenses_that_are_wrong_and_held_are_counted(cell: Cell, off: float) -> None:
+    data = wrong_lens(data_of(cell), off)
+    fit = fitted(cell.drawn, data, PixelOptions(fix_camera=True))
+    assert arm_error(cell, fit.robot) < 2.0 * 1e3 * fit.claim.sigma
+    free = fitted(cell.drawn, data, PixelOptions())
+    assert arm_error(cell, free.robot) < GIVEN_MM
+
+
+def test_wrong_pixels_are_named(cell: Cell) -> None:
+    rng, data = np.random.default_rng(1), data_of(cell)
+    wrong = rng.random(data.count) < 0.05
+    pixel = data.pixel + np.where(wrong[:, None], 3.0 + rng.exponential(30.0, data.pixel.shape), 0)
+    fit = fitted(cell.drawn, replace(data, pixel=pixel), PixelOptions())
+    assert {point.row for point in fit.set_aside} == set(data.line[wrong].tolist())
+    assert arm_error(cell, fit.robot) < GIVEN_MM
+    assert fit.with_them is not None
+    assert fit.with_them.rms_mm > 5.0 * fit.accuracy["holdout"].rms_mm
+
+
+def test_an_image_with_other_joints_is_named_whole(cell: Cell) -> None:
+    data = data_of(cell)
+    q = data.at.q.copy()
+    q[7] += 0.1
+    fit = fitted(cell.drawn, replace(data, at=replace(data.at, q=q)), PixelOptions())
+    assert any("whole images stand out" in n and "pose P7 of" in n for n in fit.notices)
+    assert arm_error(cell, fit.robot) < GIVEN_MM
+
+
+# ---- slips -----------------------------------------------------------------------------------
+
+
+def wrong_lens(data: PixelData, factor: float) -> PixelData:
+    """The data with another focal length in the camera's file."""
+    camera = data.cameras[0]
+    lens = camera.intrinsic * np.r_[factor, factor, np.ones(14)]
+    return replace(data, cameras=(replace(camera, intrinsic=lens),))
+
+
+def test_v_from_below_is_named(ground: Cell) -> None:
+    data = data_of(ground)
+    height = data.cameras[0].size[1] - 1.0
+    flipped = np.stack([data.pixel[:, 0], height - data.pixel[:, 1]], axis=1)
+    with pytest.raises(mc.DataError, match=r"v_px counts from the bottom of the image"):
+        fitted(ground.drawn, replace(data, pixel=flipped), PixelOptions())
+
+
+def test_a_board_in_metres_is_named(ground: Cell) -> None:
+    data = data_of(ground)
+    with pytest.raises(mc.DataError, match=r"the board's places look 1000 times too large"):
+        fitted(ground.drawn, replace(data, board=1e3 * data.board), PixelOptions())
+
+
+@pytest.mark.parametrize("size", [24.0 / 25.0, pytest.param(30.0 / 25.0, marks=pytest.mark.slow)])
+def test_a_board_of_another_size_is_named(ground: Cell, size: float) -> None:
+    data = data_of(ground)
+    fit = fitted(ground.drawn, replace(data, board=size * data.board), PixelOptions())
+    assert fit.status is Status.FAILED
+    assert "larger than its file" in fit.reason or "smaller than its file" in fit.reason
+    told = float(fit.reason.split("is ")[1].split(" %")[0]) / 100.0
+    sign = 1.0 if "larger than its file" in fit.reason else -1.0
+    assert_allclose(1.0 + sign * told, 1.0 / size, rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    "held", [pytest.param(False, marks=pytest.mark.slow), True], ids=["freed", "held"]
+)
+def test_the_file_of_another_camera_is_named(ground: Cell, held: bool) -> None:
+    data = wrong_lens(data_of(ground), 1.2)
+    fit = fitted(ground.drawn, data, PixelOptions(fix_camera=held))
+    assert fit.status is Status.FAILED
+    assert "cam0.yaml: the pixels of cam0 fit fx 2500" in fit.reason
+
+
+# ---- what may be claimed ---------------------------------------------------------------------
+
+
+def test_a_drawing_that_is_known_better_is_kept(ground: Cell) -> None:
+    drawn = replace(ground.drawn, drawn_within=(1e-6, 1e-6))
+    fit = fitted(drawn, data_of(ground), PixelOptions())
+    assert fit.status is Status.NO_BETTER
+    assert fit.robot is drawn
+    assert "the drawing is known better" in fit.reason
+    assert_allclose(
+        fit.calibrated.mdh, fitted(ground.drawn, data_of(ground), PixelOptions()).robot.mdh
+    )
+
+
+def test_a_change_that_noise_makes_up_is_kept_back(ground: Cell) -> None:
+    still = make_cell(
+        np.random.default_rng(5), points=board_points(SMALL, WIDE), poses=30, off=(0.0, 0.0),
+        on_flange=ground.on_flange,
+    )  # fmt: skip
+    fit = fitted(still.drawn, data_of(still), PixelOptions())
+    assert fit.status is Status.NO_BETTER
+    assert arm_error(still, fit.robot) < 1e-6 < arm_error(still, fit.calibrated)
+
+
+def test_claims_compare_sigma_drawing_and_change() -> None:
+    assert Claim(0.1, 1.0, 1.0).is_better
+    assert not Claim(1.1, 1.0, 5.0).is_better
+    assert not Claim(0.1, 1.0, 0.15).is_better
+    assert "the calibrated arm is better" in Claim(1e-4, 1e-3, 1e-3).sentence()
+    assert "keep the drawn arm" in Claim(1e-4, 1e-3, 1e-4).sentence()
+
+
+def test_a_result_comes_back_from_its_file(ground: Cell) -> None:
+    fit = fitted(replace(ground.drawn, drawn_within=(1e-6, 1e-6)), data_of(ground), PixelOptions())
+    again = PixelCalibration.from_dict(fit.to_dict())
+    assert again.status is Status.NO_BETTER
+    assert again.pixels == fit.pixels
+    assert_allclose(again.claim.sigma, fit.claim.sigma, rtol=1e-12)
+    assert_allclose(again.calibrated.mdh, fit.calibrated.mdh, rtol=0, atol=1e-15)
+    assert again.headline() == fit.headline()
+
+
+def test_doubts_of_lenses_are_read() -> None:
+    assert doubts_of("") == {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
+    assert doubts_of("f 0.05%, c 1px, k 0.01")["f"] == pytest.approx(5e-4)
+    for wrong in ("f 0.1", "f 0.1px", "g 1%", "c -1px", "f 0%", "f 1% c 1px"):
+        with pytest.raises(mc.OptionError, match="camera_prior="):
+            doubts_of(wrong)
