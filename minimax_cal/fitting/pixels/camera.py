@@ -17,7 +17,6 @@ import numpy as np
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_text
-from minimax_cal.robots.yaml_text import parsed
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # those that can be fitted
 HELD = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")  # of the rational and the thin prism model
@@ -142,6 +141,8 @@ def undistorted(intrinsic: Array, pixel: Array) -> Array:
 
 def read_camera(name: str, path: Path | str) -> Camera:
     """A camera from a YAML file of OpenCV (FileStorage) or ROS (camera_info).  Raises DataError."""
+    from minimax_cal.robots.yaml_text import parsed  # few calibrations read one
+
     text = read_text(path, kind=DataError)
     if text.lstrip().startswith("<"):
         raise DataError(f"{path}: is XML; save the camera as YAML, with K and D")
