@@ -22,6 +22,7 @@ class Run:
     unit: TORQUE or CURRENT.
     payload: mass at the flange, where it was reported [kg].
     temperature: (m, n), or (m,) of the whole arm [C].
+    command: (m, n) joint values that were commanded, where all were logged [rad, m].
     notices: what the reader should know about the log.
     """
 
@@ -36,6 +37,7 @@ class Run:
     payload: float | None = None
     temperature: Array | None = None
     notices: tuple[str, ...] = ()
+    command: Array | None = None
 
     @property
     def joints(self) -> int:

@@ -11,6 +11,8 @@ from minimax_cal.dynamics.run import CURRENT, TORQUE, Run
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 
+TURN = 2.0 * np.pi
+
 
 @dataclass(frozen=True, eq=False)
 class Draft:
@@ -89,7 +91,15 @@ class Draft:
             payload=float(payload[0]) if len(payload) else None,
             temperature=warmth if warmth is not None and np.isfinite(warmth).all() else None,
             notices=self.notices,
+            command=commanded(values.get("q_cmd"), self.q),
         )
+
+
+def commanded(values: Array | None, q: Array) -> Array | None:
+    """Commanded joint values (m, n) without the whole turns by which they differ from q (m, n)."""
+    if values is None or values.shape != q.shape or not np.isfinite(values).all():
+        return None
+    return np.asarray(values + TURN * np.round((q - values) / TURN))
 
 
 def drafts_of(log: Log, name: str) -> list[Draft]:

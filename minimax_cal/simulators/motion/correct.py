@@ -1,0 +1,287 @@
+"""Which elements a model is corrected by: each has to make held-out motion better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, MotionEffect, best_worth
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.stages import Progress
+from minimax_cal.simulators.motion.fit import (
+    ARMATURE,
+    CURVE,
+    DELAY,
+    FRICTION,
+    GAIN,
+    MASSES,
+    SPRINGS,
+    Asked,
+    Study,
+    fit_numbers,
+)
+from minimax_cal.simulators.motion.judge import Judge, Missed
+from minimax_cal.simulators.motion.module import HELD, installed, module_text
+from minimax_cal.simulators.motion.numbers import Contact, Numbers, has_powers
+from minimax_cal.simulators.motion.opened import Opened
+from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
+from minimax_cal.simulators.motion.written import unwritten, write_numbers
+
+ATTRIBUTES = {  # of the elements, in the order in which they are shown
+    FRICTION: "frictionloss, damping",
+    MASSES: "inertial",
+    ARMATURE: "armature",
+    CURVE: "damping of v, v|v|, v^3",
+    SPRINGS: "stiffness, springref",
+    GAIN: "gear, gain",
+    DELAY: "delay",
+}
+CONTACTS = (None, Contact((0.004, 1.0), (0.999, 0.9999, 0.001)))  # as given, and friction at once
+STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
+MODULE = 0.01  # the same, for a module beside the file
+SHOWN = 1e-3  # relative change of a joint's RMS that is listed
+LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
+SPRUNG, GEARED = ("cable",), ("drive_gain",)
+NOT_HELD = {
+    "torque_offset": "the torque is read with an offset, which is none of the arm's",
+    "warm_up": "changes with warmth; the model is the arm as it is on average",
+    "payload": "changes between the runs; the model carries one load",
+    "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
+    "encoder_zero": "torques never determine joint zeros; calibrate the arm",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A corrected model.  missed: on held-out motion.  module: text beside it, or empty."""
+
+    asked: Asked
+    numbers: Numbers
+    opened: Opened
+    missed: Missed
+    module: str = ""
+
+    @property
+    def score(self) -> float:
+        """Mean log RMS of the joints while they move."""
+        return mean_log(self.missed.moving)
+
+    @property
+    def whole_score(self) -> float:
+        """The same of all rows, reversals and rest with them."""
+        return mean_log(self.missed.whole)
+
+
+def mean_log(values: Array) -> float:
+    """Mean logarithm, in which a joint counts as any other."""
+    return float(np.log(np.maximum(values, 1e-300)).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Where candidates are fitted and judged; each once."""
+
+    judge: Judge
+    opened: Opened
+    study: Study
+    made: dict[tuple[Asked, Contact | None], Candidate] = field(default_factory=dict)
+
+    def candidate(self, asked: Asked, contact: Contact | None) -> Candidate:
+        """The model with what is asked for, fitted to the runs to learn from."""
+        key = asked, contact
+        if key not in self.made:
+            numbers = fit_numbers(self.study, asked, contact)
+            opened = self.written(numbers)
+            text = self.module(opened, numbers) if asked.laws else ""
+            with installed(text, opened.chain):
+                missed = self.judge.torque(opened.chain, numbers)
+            self.made[key] = Candidate(asked, numbers, opened, missed, text)
+        return self.made[key]
+
+    def written(self, numbers: Numbers) -> Opened:
+        """The model with numbers in it."""
+        document = self.opened.given.document.copy()
+        write_numbers(document, self.opened.chain, self.study.given, numbers)
+        return self.opened.again(document)
+
+    def module(self, opened: Opened, numbers: Numbers) -> str:
+        """The text of the module for laws that no element holds."""
+        arm = self.judge.arm
+        return module_text(opened.chain, numbers, arm.gain, arm.ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """plain: with elements of the file alone.  full: with a module too, or the same.
+
+    rungs: after the first.  notices: on links that could not be written.
+    """
+
+    plain: Candidate
+    full: Candidate
+    rungs: tuple[MotionRung, ...]
+    elements: tuple[WrittenElement, ...]
+    left_out: tuple[str, ...]
+    notices: tuple[str, ...]
+
+
+def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, ...]]:
+    """Everything that elements may hold, and the laws that none holds."""
+    terms, model = found.models[-1].terms, bench.opened.chain.model
+    link = next((int(e.place[1:]) - 1 for e in found.effects
+                 if e.effect in ("payload", "link_inertia") and e.worth), -1)  # fmt: skip
+    late = found.models[-1].delay + sum(
+        float(v[0]) for t, v in zip(terms, found.models[-1].value, strict=True)
+        if t.effect == "delay")  # fmt: skip
+    curved = joints(terms, LEVELS) if has_powers(model) else ()
+    elements = {FRICTION, MASSES, ARMATURE}
+    for name, some in ((CURVE, curved), (SPRINGS, joints(terms, SPRUNG)),
+                       (GAIN, joints(terms, GEARED)), (DELAY, (0,) if late else ())):  # fmt: skip
+        elements |= {name} if some else set()
+    asked = Asked(frozenset(elements), link, curved, joints(terms, SPRUNG), joints(terms, GEARED),
+                  late=late)  # fmt: skip
+    return asked, tuple(term for term in terms if term.effect in HELD)
+
+
+def joints(terms: Sequence[Term], effects: Sequence[str]) -> tuple[int, ...]:
+    """Joints at which some effects are."""
+    return tuple(sorted({term.joint for term in terms if term.effect in effects}))
+
+
+def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Corrected:
+    """The model with every element that makes held-out motion better, and the ladder to it."""
+    whole, laws = asked_of(found, bench)
+    progress("fitting the elements of the model")
+    full = without_idle(bench, first_choice(bench, whole, laws))
+    plain = without_idle(bench, by_elements(bench, full, whole))
+    if not full.asked.laws or full.score > plain.score - MODULE:
+        full = plain
+    rungs = tuple(ladder(bench, plain, full, progress))
+    names = unwritten(plain.opened.chain, plain.numbers.bodies, plain.opened.chain.names)
+    notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
+                    'the compiler inertiafromgeom="auto"' for name in names)  # fmt: skip
+    elements = (*worths(bench, plain), *law_worths(bench, full))
+    left = tuple(left_out(found))
+    return Corrected(plain, full, rungs, elements, left, notices)
+
+
+def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
+    """All elements and laws: with the masses of all links or of the one that changed.
+
+    Friction sets in as softly as the model has it, unless it fits better where it does at once.
+    """
+    if any(term.law.family == SPEED_CURVE for term in laws):
+        whole = replace(whole, elements=whole.elements - {CURVE})  # the laws say it better
+    whole = replace(whole, laws=laws)
+    soft, hard = CONTACTS
+    best = bench.candidate(replace(whole, link=-1), soft)
+    if whole.link >= 0:
+        one = bench.candidate(whole, soft)
+        best = one if one.score < best.score + STAYS else best
+    other = bench.candidate(best.asked, hard)
+    return other if other.whole_score < best.whole_score - STAYS else best
+
+
+def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
+    """Elements alone, with the masses that belong to the laws that none holds."""
+    if not full.asked.laws:
+        return full
+    elements = full.asked.elements | (whole.elements & {CURVE, FRICTION})
+    asked = replace(full.asked, elements=elements, laws=(), behind=full.asked.laws)
+    return bench.candidate(asked, full.numbers.contact)
+
+
+def without_idle(bench: Bench, best: Candidate) -> Candidate:
+    """Without elements and laws that do not make held-out motion better."""
+    contact = best.numbers.contact
+    fewer: list[Callable[[Asked], Asked]] = [
+        partial(without_law, effect=effect) for effect in effects_of(best.asked.laws)
+    ]
+    fewer += [partial(Asked.without, element=name) for name in reversed(ATTRIBUTES)
+              if name in best.asked.elements]  # fmt: skip
+    for less in fewer:
+        bare = bench.candidate(less(best.asked), contact)
+        best = bare if bare.score < best.score + STAYS else best
+    return best
+
+
+def without_law(asked: Asked, effect: str) -> Asked:
+    """All but the laws of one effect."""
+    return replace(asked, laws=tuple(term for term in asked.laws if term.effect != effect))
+
+
+def effects_of(laws: Sequence[Term]) -> tuple[str, ...]:
+    """The effects of some laws, each once."""
+    return tuple(dict.fromkeys(term.effect for term in laws))
+
+
+def ladder(
+    bench: Bench, plain: Candidate, full: Candidate, progress: Progress
+) -> Iterator[MotionRung]:
+    """A rung for each element, fitted with those before it, and for each effect of the module."""
+    contact, taken = plain.numbers.contact, set[str]()
+    for name in ATTRIBUTES:
+        if name in plain.asked.elements:
+            taken.add(name)
+            asked = replace(plain.asked, elements=frozenset(taken))
+            yield rung(bench, bench.candidate(asked, contact), f"+ {name}", progress)
+    some: tuple[Term, ...] = ()
+    for effect in effects_of(full.asked.laws):
+        some += tuple(term for term in full.asked.laws if term.effect == effect)
+        one = bench.candidate(replace(full.asked, laws=some), contact)
+        yield rung(bench, one, f"+ {WORDS[effect]} (module)", progress)
+
+
+def rung(bench: Bench, one: Candidate, name: str, progress: Progress) -> MotionRung:
+    """How far a candidate misses."""
+    progress(f"driving the model: {name}")
+    return bench.judge.rung(name, one.opened.chain, one.numbers, one.module, one.missed)
+
+
+def worth_of(without: Array, with_it: Array) -> dict[str, tuple[float, float]]:
+    """RMS torque without and with something, of the joints where it changes."""
+    pairs = zip(without, with_it, strict=True)
+    every = {f"J{j + 1}": (float(a), float(b)) for j, (a, b) in enumerate(pairs)}
+    return {key: (a, b) for key, (a, b) in every.items() if abs(a - b) > SHOWN * b}
+
+
+def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
+    """What each element of the file is worth."""
+    for name, attributes in ATTRIBUTES.items():
+        if name in plain.asked.elements:
+            bare = bench.candidate(plain.asked.without(name), plain.numbers.contact)
+            yield WrittenElement(
+                name, "file", attributes, worth_of(bare.missed.moving, plain.missed.moving)
+            )
+
+
+def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
+    """What each effect of the module is worth."""
+    for effect in effects_of(full.asked.laws):
+        bare = bench.candidate(without_law(full.asked, effect), full.numbers.contact)
+        where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
+        worth = worth_of(bare.missed.moving, full.missed.moving)
+        yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)
+
+
+def left_out(found: MotionDiagnosis) -> Iterator[str]:
+    """What neither file nor module holds, and what that costs."""
+    for one in found.effects:
+        if one.effect in NOT_HELD and not is_body(one):
+            joint, (without, with_it) = best_worth(one)
+            yield (f"{one.words}: {NOT_HELD[one.effect]} (costs {joint} "
+                   f"{without:.3g} in place of {with_it:.3g} {found.unit})")  # fmt: skip
+    for rest in found.unexplained:
+        size = f"{rest.size:.3g} {found.unit}"
+        yield f"{size} at {rest.place} follow the {rest.follows} and have no name"
+
+
+def is_body(one: MotionEffect) -> bool:
+    """Whether an effect is a link whose mass is not as given, which the model holds."""
+    return any(p.name == "mass" for p in one.parameters) and math.isnan(one.frequency)

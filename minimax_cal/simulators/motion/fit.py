@@ -1,0 +1,408 @@
+"""The numbers of a simulator's elements from logs: all of them in one fit, the masses physical.
+
+Masses, armature, friction and what else is asked for are fitted together, on the rows and with the
+noise of the motion diagnosis.  What torques do not tell stays near the model: each body by a prior
+in its log-Cholesky coordinates, each armature by one of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.regressor import PER_LINK
+from minimax_cal.dynamics.rows import Logs, Whitening, whitening
+from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.search import Columns, generous
+from minimax_cal.ground.arrays import Array
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.motion.bodies import Bodies
+from minimax_cal.simulators.motion.numbers import POWERS, Contact, Numbers, given_numbers
+
+PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
+PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
+ROTOR = 0.5  # of the largest inertia about a joint: standard deviation of an unknown armature
+LEVELS_OFF = (0.5, 0.7, 1.0, 1.4)  # of a joint's largest speed, where damping levels off
+ROUNDS = 3  # of fits, each with the load and the friction of the one before
+STEPS = 60  # of a fit, and trials of a step
+FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9  # of the normal matrix with a unit diagonal
+CLOSE = 1e-7  # relative fall of the squares that ends a fit
+LEAST_FRICTION = 1e-6  # of a joint's largest torque: a smaller one has no say
+DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction")  # with its sense
+
+FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"
+CURVE, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is fitted; the rest stays as the model has it.
+
+    elements: of those above.  link: the only one whose masses change, -1 for all.
+    behind: laws with which masses and armature are fitted first, and kept.
+    curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
+    gain is off.  laws: that no element holds.
+    """
+
+    elements: frozenset[str]
+    link: int = -1
+    curved: tuple[int, ...] = ()
+    sprung: tuple[int, ...] = ()
+    geared: tuple[int, ...] = ()
+    laws: tuple[Term, ...] = ()
+    behind: tuple[Term, ...] = ()
+    late: float = 0.0
+
+    def without(self, element: str) -> Asked:
+        """All but one element."""
+        return replace(self, elements=self.elements - {element})
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A number of one joint.  rows: (M,) torque of the log per unit.  low: its least value.
+
+    mean, sd: of its prior, sd infinite for none.
+    """
+
+    kind: str
+    joint: int
+    rows: Array
+    low: float = 0.0
+    mean: float = 0.0
+    sd: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Logs to learn from, and the arm of a model.
+
+    scene: of these logs.  inertia: (n,) largest about each joint [kg m^2].  links: (N, 10 n)
+    whitened rows of the links' parameters.  prior: of the bodies.
+    """
+
+    chain: Chain
+    bodies: Bodies
+    given: Numbers
+    scene: Scene
+    white: Whitening
+    links: Array
+    inertia: Array
+    prior: float
+
+    @staticmethod
+    def of(chain: Chain, arm: Arm, logs: Logs, terms: tuple[Term, ...], inertia: Array,
+           *, assumed: bool) -> Study:  # fmt: skip
+        """Of the logs to learn from.  terms: the laws of a diagnosis."""
+        bodies = Bodies.of(chain)
+        given = given_numbers(chain, bodies)
+        scene = Scene.of(arm, logs)
+        scene = scene.with_body(of_all(bodies.links(given.bodies)), scene.friction)
+        white = whitening(logs, generous(Columns(scene), terms))
+        rows = np.moveaxis(logs.filtered(scene.regressor), 1, 0)
+        return Study(chain, bodies, given, scene, white, white.white(rows[white.kept]), inertia,
+                     PRIOR_ASSUMED if assumed else PRIOR)  # fmt: skip
+
+    def error(self, late: float) -> Array:
+        """(N,) whitened torques less those of a known payload; so much earlier [s]."""
+        logs = self.scene.logs.earlier(late) if late else self.scene.logs
+        known = logs.filtered(self.scene.known_torque)
+        return np.asarray(self.white.white((logs.y - known).T[self.white.kept]))
+
+    def with_masses(self, found: Numbers) -> Study:
+        """The same logs, for a model that has masses and armature already."""
+        bodies = replace(self.bodies, drawn=found.bodies)
+        given = self.given.put(bodies=found.bodies, armature=found.armature)
+        scene = self.scene.with_body(of_all(bodies.links(found.bodies)), self.scene.friction)
+        return replace(self, bodies=bodies, given=given, scene=scene)
+
+
+def of_all(links: Array) -> Array:
+    """(n, 10 n) parameters that all joints share, of links (n, 10)."""
+    return np.broadcast_to(links.ravel(), (len(links), links.size))
+
+
+def fit_numbers(study: Study, asked: Asked, contact: Contact | None = None) -> Numbers:
+    """The numbers that the logs show.  contact: of the friction, None as the model has it."""
+    if asked.behind:
+        whole = replace(asked, laws=asked.behind, behind=())
+        study = study.with_masses(fit_numbers(study, whole, contact))
+        asked = replace(asked, behind=(), elements=asked.elements - {MASSES, ARMATURE})
+    scene, numbers = study.scene, study.given.put(contact=contact, fastest=study.scene.arm.fastest)
+    late = asked.late if DELAY in asked.elements else 0.0
+    error = study.error(late)
+    for _ in range(ROUNDS):
+        columns = list(columns_of(study, scene, asked))
+        numbers = solved(study, scene, asked, columns, error, numbers.put(late=late))
+        scene = with_numbers(study, scene, numbers)
+    return numbers
+
+
+def columns_of(study: Study, scene: Scene, asked: Asked) -> Iterator[Column]:
+    """The numbers that are linear, each of one joint."""
+    motion, unit, given = scene.logs.motion, scene.divisor, study.given
+    for j in range(given.joints):
+        qd, qdd = motion.qd[:, j], motion.qdd[:, j]
+        if FRICTION in asked.elements:
+            yield Column("friction", j, scene.sense[:, j] / unit[j])
+            yield Column("damping", j, qd / unit[j])
+        if CURVE in asked.elements and j in asked.curved:
+            for share in LEVELS_OFF:
+                powers = levelling(share * scene.arm.fastest[j])
+                yield Column(f"curve {share}", j, speeds(qd) @ powers / unit[j])
+        if ARMATURE in asked.elements:
+            doubt = max(given.armature[j], ROTOR * study.inertia[j])
+            yield Column("armature", j, qdd / unit[j], mean=given.armature[j], sd=doubt)
+        if SPRINGS in asked.elements and j in asked.sprung:
+            for power in range(POWERS):
+                yield Column(f"spring {power}", j, motion.q[:, j] ** power / unit[j], -np.inf)
+        if GAIN in asked.elements and j in asked.geared:
+            yield Column("gain", j, scene.load[:, j], -np.inf)
+    for number, term in enumerate(asked.laws):
+        rows = term.columns(scene)
+        low = 0.0 if term.law.nonnegative else -np.inf
+        for k in range(rows.shape[1]):
+            yield Column(f"law {number} {k}", term.joint, rows[:, k], low)
+
+
+def speeds(qd: Array) -> Array:
+    """(M, 3) powers of a speed as MuJoCo's damping takes them."""
+    return np.stack([qd, qd * np.abs(qd), qd**3], axis=-1)
+
+
+def levelling(speed: float) -> Array:
+    """(3,) damping whose slope falls to 0 at a speed, and is negative nowhere."""
+    return np.array([1.0, -1.0 / speed, 1.0 / (3.0 * speed**2)])
+
+
+def standing(study: Study, asked: Asked) -> Array:
+    """(M, n) torque of what the model has and is not fitted [N m]."""
+    given, motion = study.given, study.scene.logs.motion
+    out = np.zeros_like(motion.q)
+    if FRICTION not in asked.elements:
+        out += given.friction * study.scene.sense
+        out += np.einsum("mjp,jp->mj", speeds(motion.qd), given.damping)
+    if ARMATURE not in asked.elements:
+        out += given.armature * motion.qdd
+    x = motion.q - given.rest
+    springs = sum(given.stiffness[:, p] * x ** (p + 1) for p in range(POWERS))
+    free = [j for j in range(given.joints) if SPRINGS in asked.elements and j in asked.sprung]
+    springs = np.array(springs)
+    springs[:, free] = 0.0
+    return np.asarray(out + springs)
+
+
+def solved(
+    study: Study,
+    scene: Scene,
+    asked: Asked,
+    columns: list[Column],
+    error: Array,
+    before: Numbers,
+) -> Numbers:
+    """One fit, with the load and the friction of the scene."""
+    logs, white = scene.logs, study.white
+    kept = white.joint
+    rows = logs.filtered(np.array([column.rows for column in columns]).T.reshape(
+        len(logs.since), len(columns)))  # fmt: skip
+    matrix = np.zeros((len(kept), len(columns)))
+    for k, column in enumerate(columns):
+        own = white.kept[column.joint]
+        matrix[kept == column.joint, k] = white.white_joint(column.joint, rows[own, k])
+    fixed = logs.filtered(standing(study, asked) / scene.divisor)
+    right = error - white.white(fixed.T[white.kept])
+    triangle = np.asarray(np.linalg.qr(np.hstack([study.links, matrix, right[:, None]]), mode="r"))
+    split = study.links.shape[1]
+    links, linear, right = triangle[:, :split], triangle[:, split:-1], triangle[:, -1]
+    bodies, value = joint_fit(study, asked, columns, (links, linear, right))
+    return numbers_of(study, asked, columns, bodies, value, before)
+
+
+def joint_fit(
+    study: Study, asked: Asked, columns: list[Column], rows: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    """Bodies (n, 4, 4) and linear numbers (k,) that explain condensed rows best."""
+    links, linear, right = rows
+    n, k = study.bodies.count, len(columns)
+    free = np.zeros((n, PER_LINK), dtype=bool)
+    if MASSES in asked.elements:
+        free[:] = np.arange(n)[:, None] == asked.link if asked.link >= 0 else True
+    mean, sd, low = (np.array([getattr(c, name) for c in columns]).reshape(k)
+                     for name in ("mean", "sd", "low"))  # fmt: skip
+    count = int(free.sum())
+
+    least = np.concatenate([np.full(count, -np.inf), low])
+    weight = np.concatenate([np.full(count, 1.0 / study.prior), 1.0 / sd])
+    middle = np.concatenate([np.zeros(count), mean])
+
+    def coordinates(x: Array) -> Array:
+        out = np.zeros((n, PER_LINK))
+        out[free] = x[:count]
+        return out
+
+    def residual(x: Array) -> Array:
+        bodies = study.bodies.at(coordinates(x))
+        left = links @ study.bodies.links(bodies).ravel() + linear @ x[count:] - right
+        return np.concatenate([left, (x - middle) * weight])
+
+    def jacobian(x: Array) -> Array:
+        slopes = study.bodies.slopes(coordinates(x))
+        by_body = np.einsum("rlp,lkp->rlk", links.reshape(len(links), n, PER_LINK), slopes)
+        top = np.hstack([by_body.reshape(len(links), -1)[:, free.ravel()], linear])
+        return np.vstack([top, np.diag(weight)])
+
+    x = least_within(residual, jacobian, np.maximum(middle, least), least)
+    return study.bodies.at(coordinates(x)) if count else study.bodies.drawn, x[count:]
+
+
+def least_within(
+    residual: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array],
+    x: Array,
+    least: Array,
+) -> Array:
+    """(p,) where the squares are least, none below its bound [Levenberg-Marquardt, projected].
+
+    x: (p,) to begin with.  least: (p,) bounds, -inf where there is none.
+    """
+    damping, left = FIRST_DAMPING, residual(x)
+    for _ in range(STEPS):
+        slope = jacobian(x)
+        pull, gram = slope.T @ left, slope.T @ slope
+        for _ in range(STEPS):
+            held = (x <= least) & (pull > 0.0)
+            new = x + damped_step(gram, pull, damping, ~held)
+            new = np.maximum(new, least)
+            after = residual(new)
+            gained = float(left @ left - after @ after)
+            if gained >= 0.0:
+                break
+            damping *= 10.0
+        if gained < 0.0:
+            return x
+        x, left, damping = new, after, max(0.1 * damping, LEAST_DAMPING)
+        if gained <= CLOSE * float(left @ left):
+            break
+    return x
+
+
+def damped_step(gram: Array, pull: Array, damping: float, free: Array) -> Array:
+    """(p,) step of the free ones; 0 of the others."""
+    out = np.zeros(len(pull))
+    if free.any():
+        part = gram[np.ix_(free, free)]
+        scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
+        unit = part / np.outer(scale, scale)
+        unit[np.diag_indices_from(unit)] += damping
+        out[free] = -np.linalg.solve(unit, pull[free] / scale) / scale
+    return out
+
+
+def numbers_of(
+    study: Study,
+    asked: Asked,
+    columns: list[Column],
+    bodies: Array,
+    value: Array,
+    before: Numbers,
+) -> Numbers:
+    """What was fitted, and the model's own for the rest; all at the joints."""
+    given, n = study.given, study.given.joints
+    friction, damping = given.friction.copy(), given.damping.copy()
+    armature, gain = given.armature.copy(), np.ones(n)
+    spring = np.zeros((n, POWERS))
+    if FRICTION in asked.elements:
+        friction[:], damping[:] = 0.0, 0.0
+    laws: list[list[float]] = [[] for _ in asked.laws]
+    for column, one in zip(columns, value, strict=True):
+        kind, j = column.kind, column.joint
+        match kind.split():
+            case ["friction"]:
+                friction[j] = one
+            case ["damping"]:
+                damping[j, 0] += one
+            case ["curve", share]:
+                damping[j] += one * levelling(float(share) * before.fastest[j])
+            case ["armature"]:
+                armature[j] = one
+            case ["spring", power]:
+                spring[j, int(power)] = one
+            case ["gain"]:
+                gain[j] += one
+            case ["law", number, _]:
+                laws[int(number)].append(float(one))
+    stiffness, rest = given.stiffness.copy(), given.rest.copy()
+    for j in asked.sprung if SPRINGS in asked.elements else ():
+        stiffness[j], rest[j] = spring_of(spring[j] / gain[j])
+    per = gain[:, None]
+    return before.put(
+        bodies=bodies,
+        friction=friction / gain,
+        damping=damping / per,
+        armature=armature / gain,
+        stiffness=stiffness,
+        rest=rest,
+        gain=gain,
+        laws=asked.laws,
+        value=tuple(np.array(one) for one in laws),
+    )
+
+
+def spring_of(torque: Array) -> tuple[Array, float]:
+    """Stiffness (3,) of x, x^2, x^3, and where x is 0, of a torque (3,) of 1, q, q^2.
+
+    Of the two angles without torque the one nearer 0; without any, that of least torque.
+    """
+    offset, slope, bend = torque
+    if abs(bend) < 1e-12:
+        rest = -offset / slope if abs(slope) > 1e-12 else 0.0
+        return np.array([slope, 0.0, 0.0]), float(rest)
+    inside = slope**2 - 4.0 * bend * offset
+    roots = np.array([-slope + s * np.sqrt(max(inside, 0.0)) for s in (-1.0, 1.0)]) / (2.0 * bend)
+    rest = float(roots[np.argmin(np.abs(roots))])
+    return np.array([slope + 2.0 * bend * rest, bend, 0.0]), rest
+
+
+def with_numbers(study: Study, scene: Scene, numbers: Numbers) -> Scene:
+    """The scene with the load and the friction of some numbers, friction as MuJoCo has it."""
+    links = study.bodies.links(numbers.bodies)
+    out = scene.with_body(of_all(links), scene.friction)
+    vars(out)["sense"] = sense_of(study, out, numbers)
+    return out
+
+
+def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
+    """(M, n) share of its largest that MuJoCo's friction has at every sample.
+
+    Friction is a soft constraint there: force = D (qdd + b qd) within its largest
+    [MuJoCo, Computation: constraint solver].
+    """
+    motion = scene.logs.motion
+    stiffness, rate = softness(study.chain, numbers.contact)
+    least = LEAST_FRICTION * np.abs(scene.logs.torque).max(axis=0) * scene.divisor
+    whole = np.maximum(numbers.friction, least + 1e-12) + np.zeros_like(motion.q)
+    sliding = scene.with_body(scene.rigid, scene.friction)
+    vars(sliding)["sense"] = np.ones_like(motion.q)
+    for term, value in zip(numbers.laws, numbers.value, strict=True):
+        if term.effect in DRY and len(value):
+            amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
+            whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
+    return np.asarray(np.clip(stiffness * (motion.qdd + rate * motion.qd) / whole, -1.0, 1.0))
+
+
+def softness(chain: Chain, contact: Contact | None) -> tuple[Array, Array]:
+    """(n,) D [kg m^2] and b [1/s] of the friction of each joint."""
+    model = chain.model
+    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
+    reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
+    if contact is not None:
+        reference[:], impedance[:, :3] = contact.reference, contact.impedance
+    start, end = np.clip(impedance[:, :2].T, 1e-4, 0.9999)
+    weight = np.maximum(np.array(model.dof_invweight0[dofs]), 1e-15)
+    standard = reference[:, 0] > 0.0
+    time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
+    rate = np.where(standard, 2.0 / (end * time), -reference[:, 1] / end)
+    return start / (1.0 - start) / weight, rate

@@ -1,0 +1,171 @@
+"""The gap between a simulator's model and logs of the arm: measured, named, closed, measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from minimax_cal.dynamics.diagnose import diagnose_motion
+from minimax_cal.dynamics.given import Payload, joint_names, runs_of
+from minimax_cal.dynamics.logs import read_runs
+from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
+from minimax_cal.dynamics.run import CURRENT, Run
+from minimax_cal.fitting.fit import Fit, load_fit
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import check_writable, write_whole
+from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.robots.gravity import weighed
+from minimax_cal.simulators.chain import mujoco
+from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.motion.correct import Bench, correct
+from minimax_cal.simulators.motion.fit import Study
+from minimax_cal.simulators.motion.judge import Judge
+from minimax_cal.simulators.motion.module import ENDING
+from minimax_cal.simulators.motion.opened import MODELS, Opened, calibrated, open_model
+from minimax_cal.simulators.motion.result import MotionGap
+
+
+def motion_gap(
+    model: Path | str,
+    logs: Sequence[Run | str | Path] | str | Path,
+    *,
+    fit: Fit | Path | str | None = None,
+    diagnosis: MotionDiagnosis | Path | str | None = None,
+    write: Path | str | None = None,
+    tip: str = "",
+    holdout: float = 0.2,
+    holdout_run: str | Sequence[str] | None = None,
+    payload: Payload | None = None,
+    drive_gain: Sequence[float] | None = None,
+    ratio: float | Sequence[float] | None = None,
+    gains: tuple[Sequence[float], Sequence[float]] | None = None,
+    driven: bool = True,
+    progress: Progress = silent,
+) -> MotionGap:
+    """Say how a simulated arm moves beside the real one, and correct what makes the difference.
+
+    Parameters
+    ----------
+    model
+        An MJCF, or a robot file or URDF, of which a new MJCF is made.
+    logs
+        Files or runs; each is a trajectory.
+    fit
+        A static calibration of the same arm, which goes into the same file.
+    diagnosis
+        Of the motion, where it is known already.
+    write
+        Where the corrected model goes; what no element holds goes into a module beside it.
+    tip
+        Last body of the arm, where the model has several.
+    holdout, holdout_run
+        Share of the runs, or their names, that judge and that no fit sees; of a single run its end.
+    payload, drive_gain, ratio
+        As of `diagnose_motion`.
+    gains
+        Stiffness [N m/rad] and damper [N m s/rad] of the drives, of all joints or of each.
+    driven
+        Whether drives move the arm along the held-out runs as well.
+    progress
+        Called with a word on each stage.
+
+    Returns
+    -------
+    MotionGap
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> print(mc.motion_gap("arm.xml", ["run1.csv", "run2.csv"], write="corrected.xml").summary())
+    """
+    began = time.perf_counter()
+    if write is not None:
+        check_writable(write, MODELS)
+    mujoco()
+    progress("reading the model and the logs")
+    listed = [logs] if isinstance(logs, str | Path) else list(logs)
+    paths = [one for one in listed if not isinstance(one, Run)]
+    read = read_runs(paths, joint_names(model)) if paths else ()
+    runs = [*read, *(one for one in listed if isinstance(one, Run))]
+    opened = open_model(model, runs[0].joints if runs else 0, tip)
+    runs_of(model, opened.chain.robot, runs)
+    with threadpool_limits(limits=1, user_api="blas"):
+        judge = Judge.of(opened, runs, (holdout, holdout_run), payload, drive_gain, ratio)
+        judge = judge.driving(opened, gains) if driven else judge
+        first, notices = [judge.rung("as given", opened.chain)], tuple[str, ...]()
+        if fit is not None:
+            opened, notices = calibrated(opened, fit if isinstance(fit, Fit) else load_fit(fit))
+            judge = judge.of_model(opened)
+            first.append(judge.rung("calibrated geometry", opened.chain))
+        found = told_or_found(judge, opened, diagnosis, payload, progress)
+        judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
+                                           soft=found.arm.soft))  # fmt: skip
+        bench = bench_of(judge, opened, found)
+        made = correct(bench, found, progress)
+    path = None if write is None else Path(write)
+    beside = path.with_name(path.stem + ENDING) if path and made.full.module else None
+    if path is not None:
+        write_whole(path, made.plain.opened.content(path))
+    if beside is not None:
+        write_whole(beside, made.full.module)
+    said = (*(text for run in runs for text in run.notices), *notices, *made.notices)
+    return MotionGap(
+        model=str(model),
+        robot=opened.chain.robot.name,
+        unit=judge.held.unit,
+        rungs=(*first, *made.rungs),
+        elements=made.elements,
+        left_out=made.left_out,
+        drives=judge.drives,
+        held_out=judge.held.names,
+        notices=tuple(dict.fromkeys(said)),
+        written="" if path is None else str(path),
+        module="" if beside is None else str(beside),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def told_or_found(
+    judge: Judge,
+    opened: Opened,
+    given: MotionDiagnosis | Path | str | None,
+    payload: Payload | None,
+    progress: Progress,
+) -> MotionDiagnosis:
+    """The diagnosis that is given, or a new one whose search sees no run that judges.
+
+    Raises OptionError for one of another arm or unit.
+    """
+    if given is None:
+        gain = judge.arm.gain.tolist() if judge.held.unit == CURRENT else None
+        ratio = judge.arm.ratio.tolist() if np.isfinite(judge.arm.ratio).any() else None
+        return diagnose_motion(
+            judge.arm.robot,
+            [*judge.learning_runs, *judge.runs],
+            holdout_run=judge.held.names,
+            payload=payload,
+            drive_gain=gain,
+            ratio=ratio,
+            progress=progress,
+        )
+    found = given if isinstance(given, MotionDiagnosis) else load_motion(given)
+    if found.unit != judge.held.unit or found.arm.robot.joints != opened.chain.robot.joints:
+        raise OptionError("diagnosis: is of another arm or another unit; leave it, to make one")
+    return found
+
+
+def bench_of(judge: Judge, opened: Opened, found: MotionDiagnosis) -> Bench:
+    """Where corrections of a model are fitted and judged."""
+    assumed = opened.given.assumed or not weighed(opened.chain.robot).all()
+    study = Study.of(opened.chain, judge.arm, judge.learning, found.models[-1].terms,
+                     largest_inertia(opened.chain), assumed=bool(assumed))  # fmt: skip
+    return Bench(judge, opened, study)

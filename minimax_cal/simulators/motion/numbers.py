@@ -1,0 +1,94 @@
+"""What a simulator's elements hold of an arm in motion: masses, friction, armature, springs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.dynamics.laws import Term
+from minimax_cal.ground.arrays import Array
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.motion.bodies import Bodies
+
+POWERS = 3  # of the speed in MuJoCo's damping: v, v |v|, v^3; of the angle in its springs
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """How fast MuJoCo's friction sets in: attributes of a joint.
+
+    reference: (2,) solreffriction.  impedance: (3,) solimpfriction, the first of its numbers.
+    """
+
+    reference: tuple[float, float]
+    impedance: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """Of n joints, all in SI and at the joints.
+
+    bodies: (n, 4, 4) pseudo-inertias of the joints' bodies in their own frames.
+    armature: (n,) [kg m^2].  friction: (n,) [N m].  damping: (n, 3) of v, v |v|, v^3.
+    stiffness: (n, 3) of x, x^2, x^3, x from rest: (n,) [rad].
+    gain: (n,) torque of the log per torque of the joint.  late: by which torques are logged after
+    the motion [s].  contact: of the friction, None as the model has it.
+    laws, value: what no element holds, in the unit of the log; fastest, soft: (n,) speeds by which
+    these count.
+    """
+
+    bodies: Array
+    armature: Array
+    friction: Array
+    damping: Array
+    stiffness: Array
+    rest: Array
+    gain: Array
+    late: float = 0.0
+    contact: Contact | None = None
+    laws: tuple[Term, ...] = ()
+    value: tuple[Array, ...] = ()
+    fastest: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def joints(self) -> int:
+        """How many there are."""
+        return len(self.armature)
+
+    def put(self, **changes: Any) -> Numbers:
+        """With other fields."""
+        return replace(self, **changes)
+
+
+def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
+    """Those of a model."""
+    model = chain.model
+    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
+    joints = list(chain.joints)
+    places = [int(model.jnt_qposadr[j]) for j in joints]
+    damping = np.column_stack([model.dof_damping[dofs], of_powers(model, "dof_dampingpoly", dofs)])
+    spring = np.column_stack(
+        [model.jnt_stiffness[joints], of_powers(model, "jnt_stiffnesspoly", joints)]
+    )
+    return Numbers(
+        bodies=bodies.drawn,
+        armature=np.array(model.dof_armature[dofs]),
+        friction=np.array(model.dof_frictionloss[dofs]),
+        damping=damping,
+        stiffness=spring,
+        rest=np.array(model.qpos_spring[places]),
+        gain=np.ones(len(dofs)),
+    )
+
+
+def of_powers(model: Any, name: str, places: list[int]) -> Array:
+    """(n, 2) of the higher powers, 0 in a MuJoCo that has none."""
+    found = getattr(model, name, None)
+    return np.zeros((len(places), POWERS - 1)) if found is None else np.array(found[places])
+
+
+def has_powers(model: Any) -> bool:
+    """Whether this MuJoCo has polynomials of the speed."""
+    return hasattr(model, "dof_dampingpoly")

@@ -1,0 +1,101 @@
+"""A model to be corrected by logs: a given MJCF, or a new one of a robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from minimax_cal.fitting.fit import Fit
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
+from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.urdf import is_urdf
+from minimax_cal.simulators.arm import arm_of, assumed
+from minimax_cal.simulators.chain import Chain, chain_of, mujoco
+from minimax_cal.simulators.document import Document
+from minimax_cal.simulators.given import (
+    Given,
+    content_for,
+    corrected,
+    read_model,
+    told_masses,
+)
+from minimax_cal.simulators.mjcf import new_tree
+from minimax_cal.simulators.motion.written import new_model, weigh_drawn
+
+MODELS = (".xml", ".mjcf")
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A model and its arm.  given: its file.  new: whether it is made of a robot file or URDF."""
+
+    given: Given
+    chain: Chain
+    new: bool
+
+    def again(self, document: Document) -> Opened:
+        """The same arm in a changed tree."""
+        given = replace(self.given, document=document)
+        model = given.compiled()
+        return replace(self, given=given, chain=self.chain_in(model))
+
+    def chain_in(self, model: Any) -> Chain:
+        """The same joints in another compiled model."""
+        joints = tuple(int(model.joint(name).id) for name in self.chain.names)
+        return replace(self.chain, model=model, joints=joints)
+
+    def content(self, path: Path | None) -> bytes:
+        """The file, to be written at a path."""
+        return content_for(self.given.document, self.given.folder, path)
+
+
+def is_mjcf(model: Path | str) -> bool:
+    """Whether a model is a simulator's own."""
+    path = Path(model)
+    return path.suffix.lower() in MODELS and not is_urdf(path)
+
+
+def open_model(model: Path | str, joints: int, tip: str = "") -> Opened:
+    """The arm of so many joints in a model's file; of a robot file or URDF a new model.
+
+    Raises CalibrationError.
+    """
+    mujoco()
+    if is_mjcf(model):
+        given = read_model(model)
+        chain = chain_of(given.compiled(), joints, given.source, tip, unknown=given.assumed)
+        return Opened(given, chain, new=False)
+    robot = load_robot(model)
+    if robot.joints != joints:
+        raise OptionError(f"{model}: has {robot.joints} joints, the logs have {joints}")
+    given = Given(str(model), new_model(robot), Path())
+    chain = chain_of(given.compiled(), joints, given.source)
+    return Opened(given, chain, new=True)
+
+
+def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
+    """The model with the arm of a static calibration in it, and notices."""
+    names = fit.cell.target_names
+    if opened.new:
+        arm = arm_of(fit.cell, fit.train.q, masses_of(fit.cell.robot, LEAST_MASS))
+        document = Document(new_tree(arm, names))
+        weigh_drawn(document.root, fit.cell.robot)
+        given = replace(opened.given, document=document)
+        chain = chain_of(given.compiled(), fit.cell.robot.joints, given.source)
+        return Opened(given, chain, new=True), ()
+    nominal = fit.before.robot
+    own = None if assumed(opened.chain.robot) else told_masses(opened.chain, nominal)
+    arm = arm_of(fit.cell, fit.train.q, own)
+    document, notices = corrected(opened.given, opened.chain, nominal, arm, names)
+    given = replace(opened.given, document=document)
+    chain = chain_of(given.compiled(), opened.chain.robot.joints, given.source)
+    return Opened(given, chain, new=False), notices
+
+
+def in_its_gravity(chain: Chain) -> Robot:
+    """The robot of a model, its vertical as long as the model's gravity over that of the earth."""
+    if chain.gravity == 0.0:
+        raise OptionError("the model has no gravity; give it <option gravity=...>, as the arm has")
+    return replace(chain.robot, up=chain.robot.up * chain.gravity / G)

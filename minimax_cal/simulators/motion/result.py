@@ -1,0 +1,176 @@
+"""How far a simulated arm is from the real one along trajectories, rung by rung."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from minimax_cal.ground.files import json_text, write_whole
+from minimax_cal.ground.records import Number, Part, Recorded, checked
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.cell import saved_content
+from minimax_cal.simulators.result import KIND
+
+
+@dataclass(frozen=True)
+class MotionRung:
+    """How far a model misses on held-out runs, by joint.
+
+    torque_rms_Nm: of the torque that the measured motion takes [N m, slides N].
+    torque_rms: the same in the unit of the log; torque_rms_moving: of rows neither at rest nor just
+    after a reversal.  tracking_rms_mrad: of where its drives bring it
+    [mrad, slides mm], empty where it was not driven.
+    """
+
+    name: str
+    torque_rms_Nm: tuple[float, ...]
+    torque_rms: tuple[float, ...]
+    torque_rms_moving: tuple[float, ...]
+    tracking_rms_mrad: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class WrittenElement:
+    """Numbers of a model that were corrected.
+
+    held_by: `file`, or `module` where no element of MuJoCo holds it.  worth: of each joint that it
+    changes, the held-out RMS torque of moving rows without and with it, in the unit of the log.
+    """
+
+    name: str
+    held_by: str
+    attributes: str
+    worth: Mapping[str, tuple[float, float]]
+
+    @property
+    def words(self) -> str:
+        """For people: where it counts most."""
+        if not self.worth:
+            return f"{self.name} ({self.attributes})"
+        joint, (before, after) = max(self.worth.items(), key=lambda one: one[1][0] / one[1][1])
+        return f"{self.name} ({self.attributes}): {joint} {before:.3g} to {after:.3g} held out"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MotionGap:
+    """The gap between a simulator's model and logs of the arm, measured in the simulator.
+
+    rungs: as given, then with each element.  elements: what was corrected, with its worth.
+    left_out: what is in neither file nor module, and what that costs.  drives: what moved the arm.
+    held_out: runs that no fit saw, or quarters of one.  written, module: paths, empty if none.
+    """
+
+    model: str
+    robot: str
+    unit: str
+    rungs: tuple[MotionRung, ...]
+    elements: tuple[WrittenElement, ...]
+    left_out: tuple[str, ...]
+    drives: str
+    held_out: tuple[str, ...]
+    notices: tuple[str, ...]
+    written: str
+    module: str
+    seconds: float
+
+    def __repr__(self) -> str:
+        return f"<MotionGap of {self.model}: {self.headline()}>"
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        return f"<p>{escape(self.headline())}</p>\n{self.table().html()}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, and more; `from_dict` reads it back."""
+        listed = [vars(rung) for rung in self.rungs]
+        fields = vars(self) | {
+            "rungs": [{k: list(v) if isinstance(v, tuple) else v for k, v in rung.items()}
+                      for rung in listed],
+            "elements": [vars(e) | {"worth": {k: list(v) for k, v in e.worth.items()}}
+                         for e in self.elements],
+        }  # fmt: skip
+        plain = {k: list(v) if isinstance(v, tuple) else v for k, v in fields.items()}
+        return {"schema": 1, "kind": KIND, "along": "trajectories", **plain}
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any], source: str = "gap") -> MotionGap:
+        """From `to_dict`.  Raises CalibrationError."""
+        part = checked(MotionGapPart, content, source)
+        names = MotionGap.__dataclass_fields__
+        return MotionGap(**{name: getattr(part, name) for name in names})
+
+    def json(self) -> str:
+        """`to_dict` as text."""
+        return json_text(self.to_dict())
+
+    def save(self, path: Path | str) -> None:
+        """Write the JSON; never a half-written file."""
+        write_whole(path, self.json())
+
+    def headline(self) -> str:
+        """The result in a sentence or two."""
+        first, last = self.rungs[0], self.rungs[-1]
+        share = np.array(last.torque_rms_moving) / np.maximum(first.torque_rms_moving, 1e-300)
+        worst = int(np.argmax(share))
+        said = (
+            "Torque that the model gets wrong on held-out motion falls to "
+            f"{100.0 * np.median(share):.2g} % (median of the joints; worst J{worst + 1}, "
+            f"{100.0 * share[worst]:.2g} %)"
+        )
+        if first.tracking_rms_mrad:
+            ends = [float(np.linalg.norm(r.tracking_rms_mrad)) for r in (first, last)]
+            said += (
+                f", the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
+            )
+        return f"{said}."
+
+    def table(self) -> Table:
+        """RMS torque of each joint, rung by rung."""
+        title = f"RMS torque [{self.unit}] while moving, held out ({', '.join(self.held_out)})"
+        return by_joint(title, [(rung.name, rung.torque_rms_moving) for rung in self.rungs])
+
+    def tracking_table(self) -> Table:
+        """RMS joint error under the drives, rung by rung."""
+        title = f"RMS joint error [mrad] under {self.drives}"
+        return by_joint(title, [(rung.name, rung.tracking_rms_mrad) for rung in self.rungs])
+
+    def summary(self, width: int = 110) -> str:
+        """The result as plain text."""
+        return f"{self.headline()}\n\n{self.table().text(width)}"
+
+
+def by_joint(title: str, rows: list[tuple[str, tuple[float, ...]]]) -> Table:
+    """A table of a number for each joint."""
+    joints = [f"J{j + 1}" for j in range(len(rows[0][1]))]
+    cells: tuple[tuple[Cell, ...], ...] = tuple((name, *values) for name, values in rows)
+    return Table(title, ("model", *joints), cells, ("", *[".3g"] * len(joints)))
+
+
+class MotionGapPart(Part):
+    """The file of `minimax-cal gap MODEL LOG... -o`."""
+
+    kind: Literal["simulator_gap"]
+    along: Literal["trajectories"]
+    model: str
+    robot: str
+    unit: str
+    rungs: tuple[Recorded[MotionRung], ...] = Field(min_length=1)
+    elements: tuple[Recorded[WrittenElement], ...] = ()
+    left_out: tuple[str, ...] = ()
+    drives: str = ""
+    held_out: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+    written: str = ""
+    module: str = ""
+    seconds: Number = 0.0
+
+
+def load_motion_gap(path: Path | str) -> MotionGap:
+    """What `gap MODEL LOG... -o` or `MotionGap.save` wrote.  Raises CalibrationError."""
+    return MotionGap.from_dict(saved_content(path), str(path))

@@ -1,0 +1,166 @@
+"""Numbers of an arm in motion, written into a model: its text stays but for what changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from minimax_cal.dynamics.regressor import inertial_parameters
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import RobotError
+from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
+from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.transforms import tail
+from minimax_cal.simulators.arm import stiff
+from minimax_cal.simulators.chain import Chain
+from minimax_cal.simulators.document import Document
+from minimax_cal.simulators.elements import known, numbers, section
+from minimax_cal.simulators.mjcf import new_tree
+from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
+from minimax_cal.simulators.motion.numbers import Numbers
+
+SAME = 1e-12  # relative change of a number that is none
+TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+HISTORY = 2  # samples of a delayed signal beyond those of the delay
+SHORTEST = 0.5  # of a timestep: a shorter delay is none
+
+
+def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbers) -> None:
+    """Change a model's elements to what was found, where that differs from what it has."""
+    joints, holders = elements_of(document.root, chain)
+    for i, (joint, body) in enumerate(zip(joints, holders, strict=True)):
+        if differs(found.bodies[i], given.bodies[i]):
+            weigh(body, found.bodies[i])
+        put(joint, "armature", found.armature[i], given.armature[i])
+        put(joint, "frictionloss", found.friction[i], given.friction[i])
+        put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
+        put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
+        if differs(found.stiffness[i], given.stiffness[i]):
+            rest = found.rest[i]
+            turns = chain.model.jnt_type[chain.joints[i]] != 2 and degrees(document.root)
+            joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
+        if found.contact is not None and found.friction[i] > 0.0:
+            joint.set("solreffriction", numbers(found.contact.reference))
+            joint.set("solimpfriction", numbers(found.contact.impedance))
+    write_gains(document.root, chain, found)
+    write_delay(document.root, chain, found)
+
+
+def elements_of(root: ET.Element, chain: Chain) -> tuple[list[ET.Element], list[ET.Element]]:
+    """The elements of an arm's joints, and of the bodies that carry them.  Raises RobotError."""
+    parents = {child: parent for parent in root.iter() for child in parent}
+    world = [e for part in root.iter("worldbody") for e in part.iter("joint")]
+    named = {e.get("name"): e for e in world if e.get("name")}
+    for name in chain.names:
+        if name not in named:
+            raise RobotError(
+                f"joint {name or 'without a name'}: give each joint a name and a body of its own"
+            )
+    joints = [named[name] for name in chain.names]
+    return joints, [parents[joint] for joint in joints]
+
+
+def degrees(root: ET.Element) -> bool:
+    """Whether a file counts angles in degrees."""
+    said = [c.get("angle") for c in root.iter("compiler") if c.get("angle")]
+    return (said[-1] if said else "degree") == "degree"
+
+
+def differs(found: Array, given: Array) -> bool:
+    """Whether a number changes."""
+    return not np.allclose(found, given, rtol=SAME, atol=0.0)
+
+
+def powers(values: Array) -> Array:
+    """Numbers without zeros at their end, one at least."""
+    last = int(np.flatnonzero(values)[-1]) + 1 if values.any() else 1
+    return values[:last]
+
+
+def put(joint: ET.Element, name: str, found: Array | float, given: Array | float) -> None:
+    """Set an attribute, where its number changes."""
+    new, old = np.atleast_1d(found), np.atleast_1d(given)
+    if new.shape != old.shape or differs(new, old):
+        joint.set(name, numbers(new))
+
+
+def weigh(body: ET.Element, pseudo: Array) -> None:
+    """Give a body its mass and inertia."""
+    values = inertial(pseudo)
+    element = known(body, "inertial")
+    for name in (*TURNS, "fullinertia"):
+        element.attrib.pop(name, None)
+    for name, value in values.items():
+        element.set(name, numbers(value))
+    if list(body).index(element) and body.find("joint") is not None:
+        body.remove(element)
+        body.insert(0, element)
+
+
+def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Let actuators of a joint put out what its drive does, of what is commanded."""
+    for name, gain in zip(chain.names, found.gain, strict=True):
+        if gain == 1.0:
+            continue
+        for actuator in actuators_of(root, name):
+            for key in ("kp", "kv", "gainprm", "biasprm"):
+                if actuator.get(key):
+                    values = np.array([float(v) for v in str(actuator.get(key)).split()])
+                    actuator.set(key, numbers(values / gain))
+            if actuator.tag == "motor":
+                old = [float(v) for v in str(actuator.get("gear", "1")).split()]
+                actuator.set("gear", numbers([old[0] / gain, *old[1:]]))
+
+
+def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
+    """The actuators of a joint."""
+    every = [e for part in root.iter("actuator") for e in part]
+    return [e for e in every if e.get("joint") == joint]
+
+
+def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """A command that acts late, or a torque that is read late."""
+    step = float(chain.model.opt.timestep)
+    if abs(found.late) < SHORTEST * step:
+        return
+    late = abs(found.late)
+    history = str(int(np.ceil(late / step)) + HISTORY)
+    if found.late < 0.0:
+        for name in chain.names:
+            for actuator in actuators_of(root, name):
+                actuator.set("delay", numbers([late]))
+                actuator.set("nsample", history)
+                actuator.set("interp", "linear")
+        return
+    sensors = section(root, "sensor")
+    for name in chain.names:
+        known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, delay=[late],
+              nsample=history, interp="linear")  # fmt: skip
+
+
+def new_model(robot: Robot) -> Document:
+    """A new file of a robot: its masses as drawn, position servos that hold it."""
+    root = new_tree(stiff(robot, masses_of(robot, LEAST_MASS)), ())
+    weigh_drawn(root, robot)
+    return Document(root)
+
+
+def weigh_drawn(root: ET.Element, robot: Robot) -> None:
+    """Give the links of a new file the inertias of a robot, where it tells them."""
+    bodies = {str(body.get("name")): body for body in root.iter("body")}
+    drawn = inertial_parameters(robot)
+    for i in np.flatnonzero(weighed(robot)):
+        place = tail(robot.mdh[i])  # of the link's frame in that of its joint, the body's
+        moved = place @ pseudo_inertia(drawn[i]) @ place.T
+        if drawn[i, 0] > LEAST_MASS and np.linalg.eigvalsh(moved)[0] > 0.0:
+            weigh(bodies[f"link{i + 1}"], moved)
+
+
+def unwritten(chain: Chain, wanted: Array, names: Sequence[str]) -> list[str]:
+    """Links whose masses MuJoCo did not take from the file.  wanted: (n, 4, 4)."""
+    got = Bodies.of(chain).drawn
+    off = np.abs(parameters_of(got) - parameters_of(wanted)).max(axis=1)
+    size = np.abs(parameters_of(wanted)).max(axis=1)
+    return [names[int(i)] for i in np.flatnonzero(off > 1e-6 * size)]
