@@ -25,7 +25,7 @@ from minimax_cal.simulators.motion.written import new_model
 
 ARMS = ("ur10", "ur5e", "irb2600", "scara_600")
 STEP = 0.001  # of the real arm [s]
-LOG_HZ = 250.0
+LOG_HZ, CYCLE = 250.0, 0.002  # of the log [Hz], of the controller [s]
 FREQUENCY = 2.0 * np.pi * 4.0  # of the controller [1/s]
 HUB = 1.5  # mass of each joint's motor [kg]
 NOISE_Q, NOISE_TORQUE = 2e-6, 2e-3  # of the log [rad, m]; of the largest torque
@@ -56,8 +56,8 @@ class DrivenArm:
     robot: Robot
     xml: bytes
     withheld: Withheld
-    inertia: Array
     seed: int
+    step: float = STEP
 
     @cached_property
     def known(self) -> Any:
@@ -68,7 +68,7 @@ class DrivenArm:
         """The real arm, compiled, without friction of the load."""
         mj, lacks = mujoco(), self.withheld
         spec = mj.MjSpec.from_string(self.xml.decode())
-        spec.option.timestep = STEP
+        spec.option.timestep = self.step
         model = spec.compile()
         model.dof_frictionloss[:] = lacks.friction
         model.dof_damping[:] = lacks.damping
@@ -160,11 +160,14 @@ def drawn_arm(name: str, seed: int, effects: tuple[str, ...]) -> DrivenArm:
         payload=float(rng.uniform(0.5, 3.0)) if "payload" in effects else 0.0,
         delay=float(rng.uniform(0.003, 0.008)) if "delay" in effects else 0.0,
     )
-    return DrivenArm(robot, xml, lacks, inertia, seed)
+    return DrivenArm(robot, xml, lacks, seed)
 
 
-def commands(arm: DrivenArm, number: int, seconds: float, speed: float) -> Callable[[float], Array]:
-    """(3, n) commanded joint values and two derivatives at a time: a run's Fourier series.
+Motion = Callable[[Array], Array]
+
+
+def commands(arm: DrivenArm, number: int, speed: float) -> Motion:
+    """(3, m, n) commanded joint values and two derivatives at times (m,): a run's Fourier series.
 
     speed: of the run, over the usual.
     """
@@ -174,10 +177,10 @@ def commands(arm: DrivenArm, number: int, seconds: float, speed: float) -> Calla
     reach = np.where(slides, REACH[True], REACH[False])
     waves = rng.normal(size=(2, WAVES, n)) / np.arange(1, WAVES + 1)[:, None] * reach * 0.6
     middle = rng.uniform(-0.8, 0.8, n) * reach
-    del seconds
 
-    def at(time: float) -> Array:
-        s, c = np.sin(rate * time), np.cos(rate * time)
+    def at(time: Array) -> Array:
+        turn = np.outer(time, rate)
+        s, c = np.sin(turn), np.cos(turn)
         q = middle + s @ waves[0] + c @ waves[1]
         qd = (rate * c) @ waves[0] - (rate * s) @ waves[1]
         qdd = -(rate**2 * s) @ waves[0] - (rate**2 * c) @ waves[1]
@@ -196,25 +199,21 @@ class Course:
 
 
 def drive_along(
-    arm: DrivenArm,
-    model: Any,
-    at: Callable[[float], Array],
-    seconds: float,
-    withheld: Withheld | None = None,
+    arm: DrivenArm, model: Any, at: Motion, seconds: float, withheld: Withheld | None = None
 ) -> Course:
     """Where the controller brings a model.  withheld: what a real arm has besides its numbers."""
     mj, known = mujoco(), arm.known
     told, data = mj.MjData(known), mj.MjData(model)
     n, step = arm.robot.joints, float(model.opt.timestep)
-    start = at(0.0)
-    data.qpos[:n], data.qvel[:n] = start[0], start[1]
-    every, count = round(1.0 / LOG_HZ / step), round(seconds / step)
+    wanted = at(step * np.arange(round(seconds / step)))
+    data.qpos[:n], data.qvel[:n] = wanted[0, 0], wanted[1, 0]
+    every, cycle = round(1.0 / LOG_HZ / step), round(CYCLE / step)
     late = 0 if withheld is None else round(withheld.delay / step)
     torque, load, rows = np.zeros(n), np.zeros(n), []
     waiting: list[Array] = []
-    for k in range(count):
-        if k % round(0.002 / step) == 0:
-            q, qd, qdd = at(k * step)
+    for k in range(wanted.shape[1]):
+        if k % cycle == 0:
+            q, qd, qdd = wanted[:, k]
             off, slow = q - data.qpos[:n], qd - data.qvel[:n]
             told.qpos[:n], told.qvel[:n] = data.qpos[:n], data.qvel[:n]
             told.qacc[:n] = qdd + FREQUENCY**2 * off + 2.0 * FREQUENCY * slow
@@ -236,7 +235,7 @@ def logged(arm: DrivenArm, numbers: int, seconds: float) -> list[Run]:
     """Logs of the real arm: the first run is slow."""
     rng, model, out = np.random.default_rng([arm.seed, 99]), arm.real(), []
     for number in range(numbers):
-        at = commands(arm, number, seconds, 0.3 if number == 0 else 0.8 + 0.2 * number)
+        at = commands(arm, number, 0.3 if number == 0 else 0.8 + 0.2 * number)
         course = drive_along(arm, model, at, seconds, arm.withheld)
         q = course.q + NOISE_Q * rng.normal(size=course.q.shape)
         size = NOISE_TORQUE * np.abs(course.torque).max(axis=0)

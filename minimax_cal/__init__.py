@@ -56,6 +56,8 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.robots.robot import Robot, builtin_robots, load_robot
     from minimax_cal.simulators.commands import load_commands
     from minimax_cal.simulators.ladder import simulator_gap
+    from minimax_cal.simulators.motion.ladder import motion_gap
+    from minimax_cal.simulators.motion.result import MotionGap
     from minimax_cal.simulators.result import SimulatorGap
     from minimax_cal.solvers.minimize import minimize_max
 
@@ -73,6 +75,7 @@ __all__ = [
     "Fit",
     "Measurements",
     "MotionDiagnosis",
+    "MotionGap",
     "OptionError",
     "Options",
     "Robot",
@@ -107,6 +110,7 @@ __all__ = [
     "load_robot",
     "measurements",
     "minimize_max",
+    "motion_gap",
     "plan",
     "plan_motion",
     "read_campaigns",
@@ -177,6 +181,8 @@ MODULES = {  # name: where it is defined
     "SimulatorGap": "simulators.result",
     "load_commands": "simulators.commands",
     "simulator_gap": "simulators.ladder",
+    "MotionGap": "simulators.motion.result",
+    "motion_gap": "simulators.motion.ladder",
     "fleet": "reporting.fleet.overview",
     "report": "reporting.report",
 }

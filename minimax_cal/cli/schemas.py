@@ -17,6 +17,11 @@ KINDS = {  # name: (module, class that reads such a file, title)
     "pixels": ("fitting.pixels.result", "PixelPart", "Result of minimax-cal calibrate by cameras"),
     "diagnosis": ("diagnosing.result_file", "DiagnosisPart", "Result of minimax-cal diagnose"),
     "simulator_gap": ("simulators.result", "GapPart", "Result of minimax-cal gap"),
+    "motion_gap": (
+        "simulators.motion.result",
+        "MotionGapPart",
+        "Result of minimax-cal gap, of logs",
+    ),
 }
 
 

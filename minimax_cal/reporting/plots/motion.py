@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, plain_ticks, save
+from minimax_cal.simulators.motion.result import MotionGap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,3 +79,36 @@ def draw_budget(axes: Axes, found: MotionDiagnosis, j: int) -> None:
     axes.set_ylim(len(left) - 0.5, -0.5)
     axes.tick_params(axis="x", labelsize="x-small")
     axes.grid(visible=True, axis="x", alpha=0.3)
+
+
+# ---- the model in a simulator ------------------------------------------------------------------
+
+
+def save_motion_gap(gap: MotionGap, path: Path | str) -> None:
+    """Draw how far a model moves as the arm does.  path: its suffix is the format."""
+    save(motion_gap_figure(gap), Path(path))
+
+
+def motion_gap_figure(gap: MotionGap) -> Figure:
+    """Torque and joint error of every joint, from the model as given to the corrected one."""
+    names = [textwrap.shorten(rung.name, 40, placeholder="...") for rung in gap.rungs]
+    parts = [(f"torque [{gap.unit}], moving, held out", [r.torque_rms_moving for r in gap.rungs])]
+    if gap.rungs[0].tracking_rms_mrad:
+        parts.append(("joint error [mrad], driven", [r.tracking_rms_mrad for r in gap.rungs]))
+    figure = new_figure(5.5 * len(parts), 2.0 + 0.4 * len(names))
+    cells = figure.subplots(1, len(parts), squeeze=False, sharey=True)[0]
+    at = np.arange(len(names))
+    for axes, (title, rows) in zip(cells, parts, strict=True):
+        values = np.array(rows)
+        for j, column in enumerate(values.T):
+            axes.plot(column, at, "o-", ms=4, lw=1.0, label=f"J{j + 1}")
+        if (positive := values[values > 0.0]).size:
+            axes.set_xscale("log")
+            plain_ticks(axes.xaxis, positive)
+        axes.set_title(title, fontsize="small")
+        axes.grid(visible=True, axis="x", alpha=0.3)
+    cells[0].set_yticks(at, names, fontsize="small")
+    cells[0].set_ylim(len(names) - 0.5, -0.5)
+    cells[-1].legend(frameon=False, fontsize="small")
+    figure.suptitle(textwrap.fill(gap.headline(), 100), fontweight="bold", fontsize="medium")
+    return figure

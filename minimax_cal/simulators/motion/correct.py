@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from minimax_cal.dynamics.diagnose import MATTERS
 from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, MotionEffect, best_worth
@@ -31,7 +32,7 @@ from minimax_cal.simulators.motion.module import HELD, installed, module_text
 from minimax_cal.simulators.motion.numbers import Contact, Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
-from minimax_cal.simulators.motion.written import unwritten, write_numbers
+from minimax_cal.simulators.motion.written import stiffen, unwritten, write_numbers
 
 ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",
@@ -108,6 +109,8 @@ class Bench:
         """The model with numbers in it."""
         document = self.opened.given.document.copy()
         write_numbers(document, self.opened.chain, self.study.given, numbers)
+        if self.opened.new:
+            stiffen(document.root, self.opened.chain, numbers)
         return self.opened.again(document)
 
     def module(self, opened: Opened, numbers: Numbers) -> str:
@@ -277,7 +280,7 @@ def left_out(found: MotionDiagnosis) -> Iterator[str]:
             joint, (without, with_it) = best_worth(one)
             yield (f"{one.words}: {NOT_HELD[one.effect]} (costs {joint} "
                    f"{without:.3g} in place of {with_it:.3g} {found.unit})")  # fmt: skip
-    for rest in found.unexplained:
+    for rest in (one for one in found.unexplained if one.share > MATTERS):
         size = f"{rest.size:.3g} {found.unit}"
         yield f"{size} at {rest.place} follow the {rest.follows} and have no name"
 

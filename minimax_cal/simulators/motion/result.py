@@ -48,13 +48,13 @@ class WrittenElement:
     attributes: str
     worth: Mapping[str, tuple[float, float]]
 
-    @property
-    def words(self) -> str:
-        """For people: where it counts most."""
+    def words(self, unit: str) -> str:
+        """For people: where it counts most [unit]."""
         if not self.worth:
             return f"{self.name} ({self.attributes})"
         joint, (before, after) = max(self.worth.items(), key=lambda one: one[1][0] / one[1][1])
-        return f"{self.name} ({self.attributes}): {joint} {before:.3g} to {after:.3g} held out"
+        size = f"{joint} {before:.3g} to {after:.3g} {unit}"
+        return f"{self.name} ({self.attributes}): {size} held out"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,6 +129,17 @@ class MotionGap:
                 f", the joint error under {self.drives} from {ends[0]:.3g} to {ends[1]:.3g} mrad"
             )
         return f"{said}."
+
+    def sentences(self) -> tuple[str, ...]:
+        """What was corrected and its worth, what the file alone lacks, and what nothing holds."""
+        said = {"file": "corrected", "module": "not in the file, in its module:"}
+        each = (f"{said[one.held_by]} {one.words(self.unit)}" for one in self.elements)
+        return (*each, *(f"not in the model: {text}" for text in self.left_out))
+
+    def short(self) -> dict[str, Any]:
+        """What another result says of the file that was written."""
+        full = self.to_dict()
+        return {name: full[name] for name in ("written", "module", "elements", "left_out")}
 
     def table(self) -> Table:
         """RMS torque of each joint, rung by rung."""

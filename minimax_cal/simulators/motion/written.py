@@ -16,13 +16,15 @@ from minimax_cal.robots.transforms import tail
 from minimax_cal.simulators.arm import stiff
 from minimax_cal.simulators.chain import Chain
 from minimax_cal.simulators.document import Document
-from minimax_cal.simulators.elements import known, numbers, section
+from minimax_cal.simulators.elements import known, numbers, section, tune
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
 from minimax_cal.simulators.motion.numbers import Numbers
+from minimax_cal.simulators.servos import STEPS, carried
 
 SAME = 1e-12  # relative change of a number that is none
 TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
 HISTORY = 2  # samples of a delayed signal beyond those of the delay
 SHORTEST = 0.5  # of a timestep: a shorter delay is none
 
@@ -138,6 +140,24 @@ def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
     for name in chain.names:
         known(sensors, "jointactuatorfrc", f"{name}_torque", joint=name, delay=[late],
               nsample=history, interp="linear")  # fmt: skip
+
+
+def stiffen(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Let position servos of a new file hold the arm where it is commanded, for all its friction.
+
+    A servo of gain k stops within friction / k of its command.
+    """
+    mass, com = masses_of(chain.robot, LEAST_MASS)
+    _, reach, _ = carried(stiff(chain.robot, (mass, com)))
+    needed = found.friction * np.where(chain.robot.prismatic, 1.0, reach) / STOPS
+    for i, name in enumerate(chain.names):
+        for servo in actuators_of(root, name):
+            if servo.tag != "position" or needed[i] <= float(servo.get("kp", "0")):
+                continue
+            inertia = float(servo.get("kv", "0")) ** 2 / (4.0 * float(servo.get("kp", "1")))
+            damper = 2.0 * np.sqrt(needed[i] * inertia)
+            step = float(chain.model.opt.timestep)
+            tune(servo, needed[i], max(damper, STEPS * step * needed[i]))
 
 
 def new_model(robot: Robot) -> Document:

@@ -1,0 +1,230 @@
+"""A model corrected by logs: it has the real arm's numbers, and moves as the arm does."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import minimax_cal as mc
+from minimax_cal.dynamics.logs import runs_text
+from minimax_cal.dynamics.regressor import link_parameters
+from tests.conftest import run
+from tests.dynamics.motions import three_joints
+from tests.problems_mjcf import drive_alone
+
+mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
+
+from experiments.driven_arms import (  # noqa: E402
+    DrivenArm,
+    Withheld,
+    commands,
+    drive_along,
+    logged,
+    save_model,
+    with_motors,
+)
+from minimax_cal.simulators.motion import bodies  # noqa: E402
+from minimax_cal.simulators.motion.fit import least_within, levelling, speeds  # noqa: E402
+from minimax_cal.simulators.motion.module import loaded  # noqa: E402
+from minimax_cal.simulators.motion.result import load_motion_gap  # noqa: E402
+
+STEP = 0.002
+LACKS = Withheld(
+    friction=np.array([4.0, 3.0, 1.5]),
+    damping=np.array([3.0, 4.0, 1.0]),
+    armature=np.array([0.4, 0.5, 0.3]),
+    share=np.array([0.0, 0.08, 0.0]),
+    payload=1.5,
+)
+PLAIN, FULL = (0.12, 0.15), (0.02, 0.03)  # of the joint error, of the worst joint's torque
+
+
+def errors(arm: DrivenArm, model: object, real: object) -> tuple[float, np.ndarray]:
+    """Joint error [rad] and torques of the joints that differ from the real arm's, RMS."""
+    course = drive_along(arm, model, commands(arm, 77, 1.1), 5.0)
+    off, torque = course.q - real.q, course.torque - real.torque
+    return float(np.sqrt((off**2).mean())), np.sqrt((torque**2).mean(axis=0))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """An arm, its logs, and the gap that the command closes."""
+    folder = tmp_path_factory.mktemp("motion")
+    robot = three_joints()
+    xml = with_motors(robot).replace(b"<worldbody>", b"<!-- as drawn -->\n  <worldbody>", 1)
+    arm = DrivenArm(robot, xml, LACKS, 3, STEP)
+    model = save_model(arm, folder)
+    logs = []
+    for one in logged(arm, 3, 8.0):
+        path = folder / f"{one.name}.csv"
+        path.write_text(runs_text([one], np.zeros(3, dtype=bool)))
+        logs.append(path)
+    out, text = folder / "corrected.xml", folder / "gap.json"
+    figure = folder / "gap.png"
+    files = ("--write", out, "--json", "-o", text, "--figure", figure, "-q")
+    assert run("gap", model, *logs, *files) == 0
+    gap = load_motion_gap(text)
+    return SimpleNamespace(arm=arm, model=model, logs=logs, out=out, gap=gap, text=text,
+                           figure=figure)  # fmt: skip
+
+
+def test_the_file_has_the_numbers_of_the_real_arm(made: SimpleNamespace) -> None:
+    found, real = mujoco.MjModel.from_xml_path(str(made.out)), made.arm.real()
+    assert_allclose(found.dof_frictionloss[[0, 2]], LACKS.friction[[0, 2]], rtol=0.05)
+    assert_allclose(found.dof_damping[[0, 2]], LACKS.damping[[0, 2]], rtol=0.1)
+    assert_allclose(found.dof_armature[1:], real.dof_armature[1:], rtol=0.1)
+    first = [m.body_mass[-1] * m.body_ipos[-1] for m in (found, real)]
+    across = (first[0] - first[1])[:2]  # along its own axis it turns no joint of this arm
+    assert np.linalg.norm(across) < 0.03 * LACKS.payload * np.linalg.norm(real.body_ipos[-1])
+
+
+def test_it_moves_as_the_arm_does(made: SimpleNamespace) -> None:
+    """On a run that no log holds, under a controller that knows the first file."""
+    arm, before = made.arm, made.arm.known
+    real = drive_along(arm, arm.real(), commands(arm, 77, 1.1), 5.0, LACKS)
+    first = errors(arm, before, real)
+    plain = errors(arm, mujoco.MjModel.from_xml_path(str(made.out)), real)
+    assert plain[0] < PLAIN[0] * first[0]
+    assert (plain[1] < PLAIN[1] * first[1]).all()
+    model = mujoco.MjModel.from_xml_path(str(made.out))
+    module = loaded(Path(made.gap.module).read_text())
+    try:
+        module.install(model)
+        full = errors(arm, model, real)
+    finally:
+        module.remove()
+    assert full[0] < FULL[0] * first[0]
+    assert (full[1] < FULL[1] * first[1]).all()
+
+
+def test_the_ladder_says_so(made: SimpleNamespace) -> None:
+    content = json.loads(made.text.read_text())
+    assert content["kind"] == "simulator_gap"
+    first, *_, last = content["rungs"]
+    assert first["name"] == "as given"
+    for rung in content["rungs"]:
+        assert len(rung["tracking_rms_mrad"]) == len(rung["torque_rms_Nm"]) == 3
+    assert np.linalg.norm(last["tracking_rms_mrad"]) < FULL[0] * 2.0 * np.linalg.norm(
+        first["tracking_rms_mrad"]
+    )
+    gap = made.gap
+    assert gap.to_dict() == content
+    assert {e.name for e in gap.elements if e.held_by == "file"} == {
+        "friction", "masses", "armature"}  # fmt: skip
+    (beside,) = [e for e in gap.elements if e.held_by == "module"]
+    assert "load" in beside.name
+    assert "J2" in beside.attributes
+    assert all(after < before for e in gap.elements for before, after in [max(
+        e.worth.values(), key=lambda ends: ends[0] / ends[1])])  # fmt: skip
+    assert made.figure.read_bytes().startswith(b"\x89PNG")
+    assert any(text.startswith("not in the file") for text in gap.sentences())
+
+
+def test_the_text_stays_but_for_what_changes(made: SimpleNamespace) -> None:
+    before, after = (path.read_text().splitlines() for path in (made.model, made.out))
+    assert len(before) == len(after)
+    changed = [old for old, new in zip(before, after, strict=True) if old != new]
+    assert changed
+    assert all(line.lstrip().startswith(("<inertial", "<joint")) for line in changed)
+
+
+def test_an_arm_as_drawn_keeps_its_file(tmp_path: Path) -> None:
+    nothing = Withheld(*np.zeros((4, 3)))
+    arm = DrivenArm(three_joints(), with_motors(three_joints()), nothing, 5, STEP)
+    gap = mc.motion_gap(save_model(arm, tmp_path), logged(arm, 2, 8.0), driven=False,
+                        write=tmp_path / "same.xml")  # fmt: skip
+    assert gap.elements == ()
+    assert len(gap.rungs) == 1
+    assert (tmp_path / "same.xml").read_bytes() == arm.xml
+
+
+def test_torques_write_a_new_file_that_holds_still(made: SimpleNamespace, tmp_path: Path) -> None:
+    """Of a robot file: position servos, friction, and the drive test of every written model."""
+    robot, out = tmp_path / "robot.json", tmp_path / "new.xml"
+    robot.write_text(json.dumps(three_joints().to_dict()))
+    assert run("torques", robot, *made.logs, "--write", out, "-o", tmp_path / "m.json", "-q") == 0
+    content = json.loads((tmp_path / "m.json").read_text())
+    assert content["kind"] == "motion_diagnosis"
+    assert content["written"] == str(out)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert_allclose(model.dof_frictionloss[[0, 2]], LACKS.friction[[0, 2]], rtol=0.05)
+    q = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 3))
+    reached = drive_alone(out, q, ("flange",))
+    data = mujoco.MjData(model)
+    for row, site in zip(q[1:], reached.sites, strict=True):
+        data.qpos[:3] = row
+        mujoco.mj_kinematics(model, data)
+        assert 1e3 * np.linalg.norm(site[0] - data.site("flange").xpos) < 0.02
+    assert reached.speed < 2e-3
+    assert reached.limited < 0.01
+
+
+def test_currents_need_drive_gains(made: SimpleNamespace, tmp_path: Path,
+                                   capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    log = tmp_path / "currents.csv"
+    log.write_text(made.logs[0].read_text().replace("_Nm", "_A").replace("tau", "i"))
+    assert run("gap", made.model, log) == 2
+    assert "drive-gain" in capsys.readouterr().err
+
+
+def test_options_of_logs_are_none_of_poses(made: SimpleNamespace, tmp_path: Path,
+                                           capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    poses = tmp_path / "poses.csv"
+    poses.write_text("q1_rad,q2_rad,q3_rad,x_mm,y_mm,z_mm\n0,0,0,1,2,3\n")
+    assert run("gap", made.model, poses, "--payload", "1") == 2
+    assert "payload" in capsys.readouterr().err
+
+
+# ---- bodies ------------------------------------------------------------------------------------
+
+
+def test_a_pseudo_inertia_holds_what_its_parameters_do() -> None:
+    parameters = link_parameters(2.0, np.array([0.1, -0.2, 0.3]),
+                                 np.array([0.5, 0.01, 0.02, 0.6, -0.03, 0.4]))  # fmt: skip
+    pseudo = bodies.pseudo_inertia(parameters)
+    assert_allclose(bodies.parameters_of(pseudo), parameters, atol=1e-15)
+    assert_allclose(bodies.physical(pseudo), pseudo, atol=1e-15)
+    values = bodies.inertial(pseudo)
+    again = bodies.of_body(2.0, values["pos"], about_of(values))
+    assert_allclose(again, pseudo, atol=1e-14)
+
+
+def about_of(values: dict[str, np.ndarray]) -> np.ndarray:
+    """Inertia (3, 3) of attributes of an <inertial>."""
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, values["quat"])
+    turn = out.reshape(3, 3)
+    return turn @ np.diag(values["diaginertia"]) @ turn.T
+
+
+def test_slopes_are_the_derivatives_of_the_links() -> None:
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(2, 4, 4))
+    drawn = factor @ np.swapaxes(factor, 1, 2)
+    turn = np.array([np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])])
+    arm = bodies.Bodies(drawn, np.zeros((2, 4, 4)), turn)
+    at = 0.3 * rng.normal(size=(2, 10))
+    slopes = arm.slopes(at)
+    for k in range(10):
+        step = np.zeros((2, 10))
+        step[:, k] = 1e-6
+        there, back = (arm.links(arm.at(at + side * step)) for side in (1.0, -1.0))
+        assert_allclose(slopes[:, k], (there - back) / 2e-6, rtol=1e-6, atol=1e-7)
+    assert np.linalg.eigvalsh(arm.at(at)).min() > 0.0
+
+
+def test_a_bounded_fit_stops_at_its_bound() -> None:
+    matrix = np.array([[1.0, 0.5], [0.5, 1.0], [0.1, 0.1]])
+    found = least_within(
+        lambda x: matrix @ x - [1.0, -1.0, 0.0], lambda x: matrix, np.ones(2), np.zeros(2)
+    )
+    assert_allclose(found, [0.5 / 1.26, 0.0], atol=1e-6)
+
+
+def test_damping_that_levels_off_falls_nowhere() -> None:
+    v = np.linspace(0.0, 5.0, 200)
+    for speed in (0.5, 2.0):
+        assert (np.diff(speeds(v) @ levelling(speed)) >= -1e-12).all()
