@@ -49,13 +49,14 @@ MODULE = 0.01  # the same, for a module beside the file
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
 LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
 SPRUNG, GEARED = ("cable",), ("drive_gain",)
-NOT_HELD = {
+IN_FILE = frozenset({"armature", "delay", *LEVELS, *SPRUNG, *GEARED})
+WHY = {  # laws that a model does not hold
     "torque_offset": "the torque is read with an offset, which is none of the arm's",
-    "warm_up": "changes with warmth; the model is the arm as it is on average",
     "payload": "changes between the runs; the model carries one load",
     "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
     "encoder_zero": "torques never determine joint zeros; calibrate the arm",
 }
+NO_ELEMENT = "a model has no element for it"
 
 
 @dataclass(frozen=True, eq=False)
