@@ -11,7 +11,7 @@ import numpy as np
 
 from minimax_cal.dynamics.diagnose import MATTERS
 from minimax_cal.dynamics.laws import CURVE as SPEED_CURVE
-from minimax_cal.dynamics.laws import Term
+from minimax_cal.dynamics.laws import LAWS, Term
 from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, MotionEffect, best_worth
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
@@ -277,10 +277,10 @@ def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
 def left_out(found: MotionDiagnosis) -> Iterator[str]:
     """What neither file nor module holds, and what that costs."""
     for one in found.effects:
-        if one.effect in NOT_HELD and not is_body(one):
+        if one.effect in LAWS and one.effect not in IN_FILE.union(HELD) and not is_body(one):
             joint, (without, with_it) = best_worth(one)
-            yield (f"{one.words}: {NOT_HELD[one.effect]} (costs {joint} "
-                   f"{without:.3g} in place of {with_it:.3g} {found.unit})")  # fmt: skip
+            cost = f"{joint} {without:.3g} in place of {with_it:.3g} {found.unit}"
+            yield f"{one.words}: {WHY.get(one.effect, NO_ELEMENT)} (costs {cost})"
     for rest in (one for one in found.unexplained if one.share > MATTERS):
         size = f"{rest.size:.3g} {found.unit}"
         yield f"{size} at {rest.place} follow the {rest.follows} and have no name"
