@@ -54,7 +54,6 @@ WHY = {  # laws that a model does not hold
     "torque_offset": "the torque is read with an offset, which is none of the arm's",
     "payload": "changes between the runs; the model carries one load",
     "joint_flexibility": "give a static calibration (fit=), whose springs a model holds",
-    "encoder_zero": "torques never determine joint zeros; calibrate the arm",
 }
 NO_ELEMENT = "a model has no element for it"
 
