@@ -132,6 +132,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.motion_real",
         "Torques along trajectories, judged by runs that no fit saw: a real arm, a simulated one",
     ),
+    "motion_gap": (
+        "experiments.motion_gap",
+        "Does a simulator's model, corrected by logs, move as the arm does on runs it never saw",
+    ),
     "motion_blind": (
         "experiments.motion_blind",
         "Are causes of torque named rightly: sound arms, causes withheld, laws outside the library",

@@ -1,0 +1,213 @@
+"""How far a simulator's model moves as the real arm does, once logs corrected it.
+
+    python -m experiments.motion_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
+
+Simulated "real" arms in MuJoCo with friction, friction of the load, rotor inertias, a payload and a
+delay that their files do not have: after `gap --write`, model and arm follow commands that no log
+holds, under a controller that knows the first file alone.  What remains of the joint error and of
+the torque error is counted with elements of the file alone, and with the module beside it.  The
+real UR10e, where its logs are on this machine: the corrected model under the measured motion of
+runs that no fit saw.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import minimax_cal as mc
+from experiments import sweep
+from experiments.driven_arms import ARMS, DrivenArm, commands, drawn_arm, drive_along, logged
+from experiments.motion_real import DRIVE_GAIN, RATIO, REAL
+from experiments.real import SHARED, here
+from experiments.sweep import Study, study_options
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.simulators.chain import mujoco
+from minimax_cal.simulators.motion.module import loaded
+
+WITHHELD = (  # of the cases of an arm, in turn
+    ("friction", "payload"),
+    ("friction", "load"),
+    ("friction", "load", "armature", "payload"),
+    ("friction", "armature"),
+    ("friction", "load", "armature", "payload", "delay"),
+)
+RUNS, SECONDS = 4, 10.0  # of the logs
+UNSEEN, UNSEEN_SPEED, UNSEEN_SECONDS = 77, 1.1, 8.0  # the run that judges
+
+
+@dataclass(frozen=True)
+class Case:
+    """A simulated arm and what its file lacks."""
+
+    arm: str
+    withheld: tuple[str, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Closed:
+    """What remains on the unseen run, over what was: of the joint error, and of each torque.
+
+    before, plain, full: joint error [mrad] of the file as given, corrected, with its module.
+    torque_*: (n,) of what the file as given had.
+    """
+
+    before: float
+    plain: float
+    full: float
+    torque_plain: Array
+    torque_full: Array
+
+
+def run(case: Case) -> Closed:
+    """Correct the file of an arm by its logs, and let it follow commands that these do not hold."""
+    arm = drawn_arm(case.arm, case.seed, case.withheld)
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / "arm.xml", Path(folder) / "corrected.xml"
+        path.write_bytes(arm.xml)
+        gap = mc.motion_gap(path, logged(arm, RUNS, SECONDS), write=out, driven=False)
+        module = Path(gap.module).read_text() if gap.module else ""
+        first, plain, full = (mujoco().MjModel.from_xml_path(str(one)) for one in (path, out, out))
+    at = commands(arm, UNSEEN, UNSEEN_SPEED)
+    real = drive_along(arm, arm.real(), at, UNSEEN_SECONDS, arm.withheld)
+
+    def missed(model: Any) -> tuple[float, Array]:
+        course = drive_along(arm, model, at, UNSEEN_SECONDS)
+        off, torque = course.q - real.q, course.torque - real.torque
+        return 1e3 * float(np.sqrt((off**2).mean())), np.sqrt((torque**2).mean(axis=0))
+
+    before, after = missed(first), missed(plain)
+    last = with_module(arm, module, full, missed) if module else after
+    return Closed(before[0], after[0], last[0], after[1] / before[1], last[1] / before[1])
+
+
+def with_module(arm: DrivenArm, text: str, model: Any, missed: Any) -> tuple[float, Array]:
+    """What a model misses with the module beside it."""
+    assert arm.known is not None  # MuJoCo compiles no model while a callback is installed
+    module = loaded(text)
+    module.install(model)
+    try:
+        found: tuple[float, Array] = missed(model)
+    finally:
+        module.remove()
+    return found
+
+
+# ---- the real arm ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Left:
+    """The run of the real arm that judges."""
+
+    run: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """RMS current (n,) under the measured motion of the run [A], all rows.
+
+    before: of the URDF.  plain: of the corrected file.  full: with its module.
+    """
+
+    name: str
+    before: Array
+    plain: Array
+    full: Array
+
+
+def judge(left: Left) -> Judged:
+    """The corrected model on a run of the real arm that no fit saw."""
+    files = sorted((SHARED / REAL).glob("*.csv"))
+    name = files[left.run].stem
+    gap = mc.motion_gap(
+        SHARED / REAL / "ur10e.urdf",
+        files,
+        holdout_run=name,
+        drive_gain=DRIVE_GAIN,
+        ratio=RATIO,
+        driven=False,
+    )
+    inside = [rung for rung in gap.rungs if not rung.name.endswith("(module)")]
+    ends = (gap.rungs[0], inside[-1], gap.rungs[-1])
+    return Judged(name, *(np.array(rung.torque_rms) for rung in ends))
+
+
+# ---- tables ------------------------------------------------------------------------------------
+
+
+def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
+    """What remains on the unseen run, case by case, and its median."""
+    rows: list[tuple[Cell, ...]] = []
+    for case, one in zip(cases, found, strict=True):
+        rows.append((f"{case.arm} {case.seed}: {', '.join(case.withheld)}", one.before,
+                     *shares(one)))  # fmt: skip
+    each = np.array([shares(one) for one in found])
+    rows.append(("median", float(np.median([one.before for one in found])),
+                 *np.median(each, axis=0).tolist()))  # fmt: skip
+    header = ("withheld", "joint error as given mrad", "remains %", "worst torque %",
+              "with module %", "worst torque %")  # fmt: skip
+    title = "Simulated arms on a run that no log holds: what remains after gap --write"
+    return Table(title, header, tuple(rows), ("", ".3g", ".3g", ".3g", ".3g", ".3g"))
+
+
+def shares(one: Closed) -> tuple[float, float, float, float]:
+    """Of joint error and worst torque, by elements and with the module [%]."""
+    return (
+        100.0 * one.plain / one.before,
+        100.0 * float(one.torque_plain.max()),
+        100.0 * one.full / one.before,
+        100.0 * float(one.torque_full.max()),
+    )
+
+
+def real_table(found: Sequence[Judged]) -> Table:
+    """RMS current of the real arm's runs, each judged by a model that did not see it."""
+    n = len(found[0].before)
+    rows: list[tuple[Cell, ...]] = []
+    for name in ("before", "plain", "full"):
+        each = np.array([getattr(one, name) for one in found])
+        said = {"before": "URDF", "plain": "corrected file", "full": "with its module"}[name]
+        rows.append((said, *np.sqrt((each**2).mean(axis=0)).tolist()))
+    title = f"UR10e: RMS current [A] under measured motion, {len(found)} runs left out, all rows"
+    return Table(title, ("model", *(f"J{j + 1}" for j in range(n))), tuple(rows),
+                 ("", *[".3g"] * n))  # fmt: skip
+
+
+@click.command()
+@study_options("motion_gap")
+def main(study: Study) -> None:
+    """The dynamic gap in the simulator, before and after."""
+    arms = ARMS[-1:] if study.quick else ARMS
+    kinds = WITHHELD[2:3] if study.quick else WITHHELD
+    cases = [Case(arm, kind, study.seed + number)
+             for arm in arms for number, kind in enumerate(kinds)]  # fmt: skip
+    found = study.sweep(run, cases, "simulated arms")
+    tables = [closed_table(cases, found)]
+    content: dict[str, object] = {
+        "cases": [{"arm": case.arm, "withheld": list(case.withheld), "seed": case.seed,
+                   "before_mrad": one.before, "remains_percent": list(shares(one))}
+                  for case, one in zip(cases, found, strict=True)]
+    }  # fmt: skip
+    if not study.quick and here(REAL):
+        count = len(list((SHARED / REAL).glob("*.csv")))
+        judged = study.sweep(judge, [Left(i) for i in range(count)], "runs left out")
+        tables.append(real_table(judged))
+        content["real"] = [{"run": one.name, "before": one.before.tolist(),
+                            "plain": one.plain.tolist(), "full": one.full.tolist()}
+                           for one in judged]  # fmt: skip
+    elif not study.quick:
+        click.echo(f"{REAL}: its logs are not on this machine; only simulated arms", err=True)
+    study.save(tables, content)
+
+
+if __name__ == "__main__":
+    sweep.start(__file__)
