@@ -29,10 +29,10 @@ from minimax_cal.simulators.motion.fit import (
 )
 from minimax_cal.simulators.motion.judge import Judge, Missed
 from minimax_cal.simulators.motion.module import HELD, installed, module_text
-from minimax_cal.simulators.motion.numbers import Contact, Numbers, has_powers
+from minimax_cal.simulators.motion.numbers import Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
-from minimax_cal.simulators.motion.written import stiffen, unwritten, write_numbers
+from minimax_cal.simulators.motion.written import stiffen, unwritten, write_numbers, write_onset
 
 ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",
@@ -43,7 +43,8 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     GAIN: "gear, gain",
     DELAY: "delay",
 }
-CONTACTS = (None, Contact((0.004, 1.0), (0.999, 0.9999, 0.001)))  # as given, and friction at once
+SETS_IN = (0.0005, 0.002, 0.005, 0.015)  # of the largest speed: where friction may have set in
+EARLIER = 0.01  # fall of the RMS of all rows by which friction sets in where the model has it not
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
 MODULE = 0.01  # the same, for a module beside the file
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
@@ -91,19 +92,18 @@ class Bench:
     judge: Judge
     opened: Opened
     study: Study
-    made: dict[tuple[Asked, Contact | None], Candidate] = field(default_factory=dict)
+    made: dict[Asked, Candidate] = field(default_factory=dict)
 
-    def candidate(self, asked: Asked, contact: Contact | None) -> Candidate:
+    def candidate(self, asked: Asked) -> Candidate:
         """The model with what is asked for, fitted to the runs to learn from."""
-        key = asked, contact
-        if key not in self.made:
-            numbers = fit_numbers(self.study, asked, contact)
+        if asked not in self.made:
+            numbers = fit_numbers(self.study, asked)
             opened = self.written(numbers)
             text = self.module(opened, numbers) if asked.laws else ""
             with installed(text, opened.chain):
                 missed = self.judge.torque(opened.chain, numbers)
-            self.made[key] = Candidate(asked, numbers, opened, missed, text)
-        return self.made[key]
+            self.made[asked] = Candidate(asked, numbers, opened, missed, text)
+        return self.made[asked]
 
     def written(self, numbers: Numbers) -> Opened:
         """The model with numbers in it."""
@@ -111,6 +111,10 @@ class Bench:
         write_numbers(document, self.opened.chain, self.study.given, numbers)
         if self.opened.new:
             stiffen(document.root, self.opened.chain, numbers)
+        found = self.opened.again(document)
+        if not numbers.sets_in.any():
+            return found
+        write_onset(document, found.chain, numbers)
         return self.opened.again(document)
 
     def module(self, opened: Opened, numbers: Numbers) -> str:
@@ -177,18 +181,33 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
 def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
     """All elements and laws: with the masses of all links or of the one that changed.
 
-    Friction sets in as softly as the model has it, unless it fits better where it does at once.
+    Friction sets in as the model has it, unless another speed fits a joint better.
     """
     if any(term.law.family == SPEED_CURVE for term in laws):
         whole = replace(whole, elements=whole.elements - {CURVE})  # the laws say it better
     whole = replace(whole, laws=laws)
-    soft, hard = CONTACTS
-    best = bench.candidate(replace(whole, link=-1), soft)
+    best = bench.candidate(replace(whole, link=-1))
     if whole.link >= 0:
-        one = bench.candidate(whole, soft)
+        one = bench.candidate(whole)
         best = one if one.score < best.score + STAYS else best
-    other = bench.candidate(best.asked, hard)
-    return other if other.whole_score < best.whole_score - STAYS else best
+    return with_onset(bench, best)
+
+
+def with_onset(bench: Bench, best: Candidate) -> Candidate:
+    """With friction that sets in, joint by joint, where all rows are predicted best."""
+    fastest = bench.judge.arm.fastest
+    every = [np.zeros(len(fastest)), *(share * fastest for share in SETS_IN)]
+    made = [best, *(bench.candidate(at_speeds(best.asked, speeds)) for speeds in every[1:])]
+    missed = np.array([one.missed.whole for one in made])
+    missed[1:] *= 1.0 + EARLIER
+    chosen = np.take_along_axis(np.array(every), missed.argmin(axis=0)[None], axis=0)[0]
+    mixed = bench.candidate(at_speeds(best.asked, chosen)) if chosen.any() else best
+    return mixed if mixed.whole_score < best.whole_score - STAYS else best
+
+
+def at_speeds(asked: Asked, speeds: Array) -> Asked:
+    """The same, with friction that sets in at speeds (n,)."""
+    return replace(asked, sets_in=tuple(map(float, speeds)))
 
 
 def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
@@ -197,19 +216,18 @@ def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
         return full
     elements = full.asked.elements | (whole.elements & {CURVE, FRICTION})
     asked = replace(full.asked, elements=elements, laws=(), behind=full.asked.laws)
-    return bench.candidate(asked, full.numbers.contact)
+    return bench.candidate(asked)
 
 
 def without_idle(bench: Bench, best: Candidate) -> Candidate:
     """Without elements and laws that do not make held-out motion better."""
-    contact = best.numbers.contact
     fewer: list[Callable[[Asked], Asked]] = [
         partial(without_law, effect=effect) for effect in effects_of(best.asked.laws)
     ]
     fewer += [partial(Asked.without, element=name) for name in reversed(ATTRIBUTES)
               if name in best.asked.elements]  # fmt: skip
     for less in fewer:
-        bare = bench.candidate(less(best.asked), contact)
+        bare = bench.candidate(less(best.asked))
         best = bare if bare.score < best.score + STAYS else best
     return best
 
@@ -228,16 +246,16 @@ def ladder(
     bench: Bench, plain: Candidate, full: Candidate, progress: Progress
 ) -> Iterator[MotionRung]:
     """A rung for each element, fitted with those before it, and for each effect of the module."""
-    contact, taken = plain.numbers.contact, set[str]()
+    taken = set[str]()
     for name in ATTRIBUTES:
         if name in plain.asked.elements:
             taken.add(name)
             asked = replace(plain.asked, elements=frozenset(taken))
-            yield rung(bench, bench.candidate(asked, contact), f"+ {name}", progress)
+            yield rung(bench, bench.candidate(asked), f"+ {name}", progress)
     some: tuple[Term, ...] = ()
     for effect in effects_of(full.asked.laws):
         some += tuple(term for term in full.asked.laws if term.effect == effect)
-        one = bench.candidate(replace(full.asked, laws=some), contact)
+        one = bench.candidate(replace(full.asked, laws=some))
         yield rung(bench, one, f"+ {WORDS[effect]} (module)", progress)
 
 
@@ -258,7 +276,7 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
     """What each element of the file is worth."""
     for name, attributes in ATTRIBUTES.items():
         if name in plain.asked.elements:
-            bare = bench.candidate(plain.asked.without(name), plain.numbers.contact)
+            bare = bench.candidate(plain.asked.without(name))
             yield WrittenElement(
                 name, "file", attributes, worth_of(bare.missed.moving, plain.missed.moving)
             )
@@ -267,7 +285,7 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
 def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:
     """What each effect of the module is worth."""
     for effect in effects_of(full.asked.laws):
-        bare = bench.candidate(without_law(full.asked, effect), full.numbers.contact)
+        bare = bench.candidate(without_law(full.asked, effect))
         where = ", ".join(t.place for t in full.asked.laws if t.effect == effect)
         worth = worth_of(bare.missed.moving, full.missed.moving)
         yield WrittenElement(WORDS[effect], "module", f"at {where}", worth)

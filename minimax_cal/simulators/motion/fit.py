@@ -8,6 +8,7 @@ in its log-Cholesky coordinates, each armature by one of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +19,9 @@ from minimax_cal.dynamics.rows import Logs, Whitening, whitening
 from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, generous
 from minimax_cal.ground.arrays import Array
-from minimax_cal.simulators.chain import Chain
-from minimax_cal.simulators.motion.bodies import Bodies
-from minimax_cal.simulators.motion.numbers import POWERS, Contact, Numbers, given_numbers
+from minimax_cal.simulators.chain import Chain, mujoco
+from minimax_cal.simulators.motion.bodies import Bodies, inertial
+from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
 PRIOR_ASSUMED = 1.5  # the same where the masses of the model are assumed
@@ -30,6 +31,8 @@ ROUNDS = 3  # of fits, each with the load and the friction of the one before
 STEPS = 60  # of a fit, and trials of a step
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9  # of the normal matrix with a unit diagonal
 CLOSE = 1e-7  # relative fall of the squares that ends a fit
+IMPEDANCES = (1e-4, 0.9999)  # least and largest that MuJoCo takes [mjMINIMP, mjMAXIMP]
+USUAL_TIME = 0.02  # of a constraint, where the speed at which friction sets in is chosen [s]
 LEAST_FRICTION = 1e-6  # of a joint's largest torque: a smaller one has no say
 DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction")  # with its sense
 
@@ -44,7 +47,8 @@ class Asked:
     elements: of those above.  link: the only one whose masses change, -1 for all.
     behind: laws with which masses and armature are fitted first, and kept.
     curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
-    gain is off.  laws: that no element holds.
+    gain is off.  laws: that no element holds.  sets_in: speed at which friction has set in, of each
+    joint, 0 as the model has it [rad/s, m/s]; empty for all as it has.
     """
 
     elements: frozenset[str]
@@ -54,6 +58,7 @@ class Asked:
     geared: tuple[int, ...] = ()
     laws: tuple[Term, ...] = ()
     behind: tuple[Term, ...] = ()
+    sets_in: tuple[float, ...] = ()
     late: float = 0.0
 
     def without(self, element: str) -> Asked:
@@ -125,13 +130,14 @@ def of_all(links: Array) -> Array:
     return np.broadcast_to(links.ravel(), (len(links), links.size))
 
 
-def fit_numbers(study: Study, asked: Asked, contact: Contact | None = None) -> Numbers:
-    """The numbers that the logs show.  contact: of the friction, None as the model has it."""
+def fit_numbers(study: Study, asked: Asked) -> Numbers:
+    """The numbers that the logs show."""
     if asked.behind:
         whole = replace(asked, laws=asked.behind, behind=())
-        study = study.with_masses(fit_numbers(study, whole, contact))
+        study = study.with_masses(fit_numbers(study, whole))
         asked = replace(asked, behind=(), elements=asked.elements - {MASSES, ARMATURE})
-    scene, numbers = study.scene, study.given.put(contact=contact, fastest=study.scene.arm.fastest)
+    sets_in = np.array(asked.sets_in or [0.0] * study.given.joints)
+    scene, numbers = study.scene, study.given.put(sets_in=sets_in, fastest=study.scene.arm.fastest)
     late = asked.late if DELAY in asked.elements else 0.0
     error = study.error(late)
     for _ in range(ROUNDS):
@@ -381,7 +387,6 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
     [MuJoCo, Computation: constraint solver].
     """
     motion = scene.logs.motion
-    stiffness, rate = softness(study.chain, numbers.contact)
     least = LEAST_FRICTION * np.abs(scene.logs.torque).max(axis=0) * scene.divisor
     whole = np.maximum(numbers.friction, least + 1e-12) + np.zeros_like(motion.q)
     sliding = scene.with_body(scene.rigid, scene.friction)
@@ -390,19 +395,31 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
         if term.effect in DRY and len(value):
             amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
             whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
-    return np.asarray(np.clip(stiffness * (motion.qdd + rate * motion.qd) / whole, -1.0, 1.0))
+    stiffness, rate = softness(study.chain, numbers)
+    soft = np.where(numbers.sets_in > 0.0, rate * numbers.sets_in, whole / stiffness)
+    return np.asarray(np.clip((motion.qdd + rate * motion.qd) / soft, -1.0, 1.0))
 
 
-def softness(chain: Chain, contact: Contact | None) -> tuple[Array, Array]:
-    """(n,) D [kg m^2] and b [1/s] of the friction of each joint."""
+def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
+    """(n,) D [kg m^2] and b [1/s] of the friction of each joint, as a model has it."""
     model = chain.model
     dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
     reference, impedance = np.array(model.dof_solref[dofs]), np.array(model.dof_solimp[dofs])
-    if contact is not None:
-        reference[:], impedance[:, :3] = contact.reference, contact.impedance
-    start, end = np.clip(impedance[:, :2].T, 1e-4, 0.9999)
-    weight = np.maximum(np.array(model.dof_invweight0[dofs]), 1e-15)
-    standard = reference[:, 0] > 0.0
+    start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
     time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
-    rate = np.where(standard, 2.0 / (end * time), -reference[:, 1] / end)
-    return start / (1.0 - start) / weight, rate
+    rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
+    rate = np.where(numbers.sets_in > 0.0, 2.0 / (IMPEDANCES[1] * USUAL_TIME), rate)
+    return start / (1.0 - start) / weights(chain, numbers), rate
+
+
+def weights(chain: Chain, numbers: Numbers) -> Array:
+    """(n,) inverse inertia of each joint at rest in a model with other masses [1/(kg m^2)]."""
+    mj, model = mujoco(), copy(chain.model)
+    dofs = [int(model.jnt_dofadr[j]) for j in chain.joints]
+    for body, pseudo in zip(chain.bodies, numbers.bodies, strict=True):
+        values = inertial(pseudo)
+        model.body_mass[body], model.body_ipos[body] = values["mass"][0], values["pos"]
+        model.body_iquat[body], model.body_inertia[body] = values["quat"], values["diaginertia"]
+    model.dof_armature[dofs] = numbers.armature
+    mj.mj_setConst(model, mj.MjData(model))
+    return np.asarray(np.maximum(model.dof_invweight0[dofs], 1e-15))

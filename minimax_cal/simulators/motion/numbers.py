@@ -16,17 +16,6 @@ POWERS = 3  # of the speed in MuJoCo's damping: v, v |v|, v^3; of the angle in i
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
-    """How fast MuJoCo's friction sets in: attributes of a joint.
-
-    reference: (2,) solreffriction.  impedance: (3,) solimpfriction, the first of its numbers.
-    """
-
-    reference: tuple[float, float]
-    impedance: tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
 class Numbers:
     """Of n joints, all in SI and at the joints.
 
@@ -34,7 +23,8 @@ class Numbers:
     armature: (n,) [kg m^2].  friction: (n,) [N m].  damping: (n, 3) of v, v |v|, v^3.
     stiffness: (n, 3) of x, x^2, x^3, x from rest: (n,) [rad].
     gain: (n,) torque of the log per torque of the joint.  late: by which torques are logged after
-    the motion [s].  contact: of the friction, None as the model has it.
+    the motion [s].  sets_in: (n,) speed at which friction has set in, 0 where it is as in
+    the model [rad/s, m/s].
     laws, value: what no element holds, in the unit of the log; fastest, soft: (n,) speeds by which
     these count.
     """
@@ -46,8 +36,8 @@ class Numbers:
     stiffness: Array
     rest: Array
     gain: Array
+    sets_in: Array
     late: float = 0.0
-    contact: Contact | None = None
     laws: tuple[Term, ...] = ()
     value: tuple[Array, ...] = ()
     fastest: Array = field(default_factory=lambda: np.zeros(0))
@@ -80,6 +70,7 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
         stiffness=spring,
         rest=np.array(model.qpos_spring[places]),
         gain=np.ones(len(dofs)),
+        sets_in=np.zeros(len(dofs)),
     )
 
 
