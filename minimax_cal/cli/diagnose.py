@@ -19,6 +19,7 @@ from minimax_cal.cli.options import (
     options_from,
     options_of,
     result_options,
+    workers,
 )
 from minimax_cal.diagnosing.diagnose import diagnose
 from minimax_cal.fitting.calibrate import calibrate
@@ -49,6 +50,7 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
         group="What is sought",
     ),
 )
+@workers(1, "1")
 @ROWS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")
 def diagnose_command(

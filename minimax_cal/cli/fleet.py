@@ -7,27 +7,16 @@ from pathlib import Path
 import click
 
 from minimax_cal.cli import FAILED
-from minimax_cal.cli.options import PATH, InGroups, Output, plain_option, result_options, show
+from minimax_cal.cli.options import PATH, InGroups, Output, result_options, show, workers
 from minimax_cal.cli.stderr import tell
 from minimax_cal.reporting.fleet.overview import fleet
-
-WORK = "Who does the work"
 
 
 @click.command(name="fleet", cls=InGroups)
 @click.argument("cells", type=PATH)
 @click.option("--out", type=PATH, metavar="FOLDER", help="Write each cell's calibration there.")
 @click.option("--page", "path", type=PATH, metavar="HTML", help="Write one overview page of all.")
-@plain_option(
-    WORK, "--jobs", type=int, default=-1, help="The number of processes [default: one a core]."
-)
-@plain_option(
-    WORK,
-    "--cluster",
-    default="",
-    metavar="tcp://HOST:PORT",
-    help="Let a Dask cluster do it instead.",
-)
+@workers(-1, "one a core")
 @result_options("all rows (JSON)")
 def fleet_command(
     cells: Path, out: Path | None, path: Path | None, jobs: int, cluster: str, to: Output

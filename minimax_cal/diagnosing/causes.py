@@ -41,7 +41,8 @@ class Causes:
     choice: the effects selected, effects: as findings, the weightiest first.
     left: what they leave.  untestable: effects, and what the data lack for them.  wary:
     whether anything is left that matters, or names that change with the poses.  maps: of joints,
-    sought beside the effects, once there is a ladder.
+    sought beside the effects, once there is a ladder.  jobs: processes that search parts of the
+    poses, cluster: address of a Dask scheduler instead.
     """
 
     faults: tuple[Fault, ...]
@@ -53,6 +54,13 @@ class Causes:
     untestable: tuple[tuple[str, str], ...]
     wary: bool
     maps: Mapped = NO_MAPS
+    jobs: int = 1
+    cluster: str = ""
+
+    def portable(self) -> Causes:
+        """What folds of the poses need, for another process."""
+        choice = self.choice.portable()
+        return replace(self, choice=choice, library=choice.library, effects=())
 
     @property
     def ripple(self) -> bool:
@@ -61,7 +69,12 @@ class Causes:
 
 
 def causes_of(
-    study: Study, faults: Sequence[Fault], exclude: Sequence[str], progress: Progress
+    study: Study,
+    faults: Sequence[Fault],
+    exclude: Sequence[str],
+    progress: Progress,
+    jobs: int = 1,
+    cluster: str = "",
 ) -> tuple[Study, Causes]:
     """The effects that explain a study's errors, beside faults that are known.
 
@@ -80,7 +93,9 @@ def causes_of(
         exclude = (*exclude, *play)
         lib, choice = chosen(study, exclude)
     every, told, left = (*faults, *read_back), lib.untestable, left_by(study, choice)
-    causes = Causes(every, lib, tuple(exclude), choice, (), left, told, wary=False)
+    causes = Causes(
+        every, lib, tuple(exclude), choice, (), left, told, wary=False, jobs=jobs, cluster=cluster
+    )
     return study, found_again(study, causes)
 
 
@@ -92,7 +107,7 @@ def found_again(study: Study, causes: Causes) -> Causes:
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     found = [with_untested(one, study.scene, causes.exclude) for one in found]
-    effects = judged_again(found, choice, study)
+    effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(causes.left) is not None
     return replace(causes, effects=effects, wary=wary)

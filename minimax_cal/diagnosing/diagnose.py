@@ -98,6 +98,8 @@ def diagnose(
     instrument: str | None = None,
     exclude: Sequence[str] = (),
     quick: bool = False,
+    jobs: int = 1,
+    cluster: str = "",
     progress: Progress = silent,
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
@@ -107,8 +109,10 @@ def diagnose(
     holdout_by: a column (session, group ...) or region, whose poses are held out together.
     instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say. exclude: effects
     that are not to be considered. quick: leave no parts of the poses out in turn, so that there
-    is no claim outside the measured poses. progress: called with a word on each stage. Lengths
-    of the result are in m, in mm where a name says so. Raises CalibrationError for wrong input.
+    is no claim outside the measured poses. jobs: processes that search parts of the poses, -1
+    for one a core. cluster: address of a Dask scheduler, as tcp://host:port, whose workers then
+    do it. progress: called with a word on each stage. Lengths of the result are in m, in mm where
+    a name says so. Raises CalibrationError for wrong input.
 
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
     """
@@ -131,7 +135,8 @@ def diagnose(
     notices = (*notices, *few_judges(raw.take(held)), *unplaced(raw, ~held))
     raw = stationed(robot, raw, ~held)
     with threadpool_limits(limits=1, user_api="blas"):  # more would wait for each other, and longer
-        return examined(Asked(robot, raw, held, options), notices, progress, began)
+        asked = Asked(robot, raw, held, options, jobs, cluster)
+        return examined(asked, notices, progress, began)
 
 
 def few_judges(held: Measurements) -> Iterator[str]:
@@ -163,6 +168,8 @@ class Asked:
     data: Measurements
     held: Array
     options: DiagnosisOptions
+    jobs: int = 1
+    cluster: str = ""
 
     def train(self, data: Measurements) -> Measurements:
         """Of some of the rows those that fits may see."""
@@ -178,7 +185,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
-    study, causes = causes_of(study, clean.faults, options.exclude, progress)
+    workers = asked.jobs, asked.cluster
+    study, causes = causes_of(study, clean.faults, options.exclude, progress, *workers)
     causes, spoken, ladder = in_rungs(study, causes, progress)
     noise = causes.choice.noise
     last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)

@@ -16,14 +16,17 @@ from minimax_cal.evidence.stability import Repeats, repeated
 from minimax_cal.measuring.grouping import clusters
 
 
-def judged_again(findings: Sequence[Finding], whole: Choice, study: Study) -> tuple[Finding, ...]:
+def judged_again(
+    findings: Sequence[Finding], whole: Choice, study: Study, jobs: int = 1, cluster: str = ""
+) -> tuple[Finding, ...]:
     """The findings, sought again in subsamples of the poses.
 
-    whole: what was chosen on all poses.
+    whole: what was chosen on all poses.  jobs, cluster: as `repeated` has them.
     """
     if not findings:
         return ()
-    found = repeated(whole, np.repeat(clusters(study.data), study.rows.width))
+    group = np.repeat(clusters(study.data), study.rows.width)
+    found = repeated(whole, group, jobs=jobs, cluster=cluster)
     return tuple(judged(one, whole, found) for one in findings)
 
 

@@ -15,8 +15,10 @@ from minimax_cal.fitting.options import Progress
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.parallel import share
 from minimax_cal.ground.stages import count_stage
 from minimax_cal.measuring.grouping import parts
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
 
 
@@ -34,6 +36,17 @@ def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
         terms for terms in effects_of(choice) if not held_back(terms, every, causes, study.scene)
     ]
     return climbed(small, causes.maps.beside(named), wary=causes.wary)
+
+
+def fold_errors(
+    study: Study, causes: Causes, rows: Array, state: State, left: Measurements
+) -> tuple[Array, Array]:
+    """Errors (k, f, 3) at poses left out, of the model sought without them and of its geometry [m].
+
+    As `fold_of`; left: the poses left out.
+    """
+    fits = fold_of(study, causes, rows, state).fits
+    return fits[-1].cell.error(left), fits[0].cell.error(left)
 
 
 def beyond_of(
@@ -54,14 +67,19 @@ def beyond_of(
     )
     errors = Errors()
     states = without(estimator, study.fit.state, masks, steps_of(study.data.frames))
-    for number, (part, mask, state) in enumerate(zip(found, masks, states, strict=True)):
+    waiting = [i for i, state in enumerate(states) if state is not None]
+    for part, state in zip(found, states, strict=True):
         if state is None:
             errors.miss(part.name)
-            continue
-        progress(count_stage("part", number + 1, len(found), f" left out: {part.name}"))
-        fits = fold_of(study, causes, ~mask, state).fits
-        rows = data.take(part.rows)
-        errors.add(part.name, fits[-1].cell.error(rows), fits[0].cell.error(rows))
+    sent = causes.portable()
+    calls = [(study, sent, ~masks[i], states[i], data.take(found[i].rows)) for i in waiting]
+    ended = {}
+    for number, pair in share(fold_errors, calls, processes=causes.jobs, cluster=causes.cluster):
+        ended[number] = pair
+        name = found[waiting[number]].name
+        progress(count_stage("part", len(ended), len(calls), f" left out: {name}"))
+    for number, i in enumerate(waiting):
+        errors.add(found[i].name, *ended[number])
     if not found:
         return replace(known, reason="the poses are too few or too much alike")
     return replace(errors.beyond(sought=True), spans=known.spans)

@@ -38,6 +38,7 @@ from minimax_cal.evidence.limits import (
     TUNINGS,
 )
 from minimax_cal.evidence.noise import FREE, Noise
+from minimax_cal.evidence.products import Products
 from minimax_cal.evidence.sweeping import Grams
 from minimax_cal.ground.arrays import Array
 
@@ -89,6 +90,13 @@ class Choice:
         lib = self.library
         lines = [c for c in lib.found.values() if c.is_line and c not in lib.candidates]
         return replace(lib, candidates=(*lib.candidates, *lines)).part(self.grams, kept)
+
+    def portable(self) -> Choice:
+        """For parts of the rows in another process: without what is worked out again from it."""
+        plain = Products(self.library.products.columns)
+        out = replace(self, library=replace(self.library, products=plain, lines=None))
+        out.__dict__["grams"] = self.grams
+        return out
 
     @property
     def known(self) -> Array:

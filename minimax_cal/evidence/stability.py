@@ -16,6 +16,7 @@ from minimax_cal.evidence.dictionary import Key
 from minimax_cal.evidence.limits import INSTEAD, LEAST_DOF, PARTS, REPEATED_LEVEL, ROUNDS
 from minimax_cal.evidence.selection import NOTHING, Choice, select
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.parallel import share
 
 NOT_ASKED = float("nan")  # the frequency where rows are too few to leave any out
 
@@ -53,13 +54,22 @@ def subsamples(group: Array) -> list[Array]:
     return [part != left for part in parts for left in range(PARTS)]
 
 
-def repeated(whole: Choice, group: Array) -> Repeats:
-    """The search of subsamples, each choosing among what that of all rows tuned."""
+def repeated(whole: Choice, group: Array, *, jobs: int = 1, cluster: str = "") -> Repeats:
+    """The search of subsamples, each choosing among what that of all rows tuned.
+
+    jobs: processes, -1 for one a core.  cluster: address of a Dask scheduler instead.
+    """
     masks = subsamples(group)
-    parts = (whole.part(kept) for kept in masks)
-    choices = [
-        select(part, level=REPEATED_LEVEL)
-        for part in parts
-        if part.products.dof(NOTHING) >= LEAST_DOF
-    ]
-    return Repeats(tuple(frozenset(c.key for c in choice.chosen) for choice in choices), len(masks))
+    one = whole.portable()
+    calls = [(one, kept) for kept in masks]
+    found = dict(share(names_in, calls, processes=jobs, cluster=cluster))
+    names = [found[number] for number in range(len(masks))]
+    return Repeats(tuple(keys for keys in names if keys is not None), len(masks))
+
+
+def names_in(whole: Choice, kept: Array) -> frozenset[Key] | None:
+    """What the search of a part finds; None where its rows are too few.  kept: (N,) of its rows."""
+    part = whole.part(kept)
+    if part.products.dof(NOTHING) < LEAST_DOF:
+        return None
+    return frozenset(c.key for c in select(part, level=REPEATED_LEVEL).chosen)

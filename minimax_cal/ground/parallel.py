@@ -25,6 +25,7 @@ CHUNK = 1.0  # seconds of work sent at once; sending takes some 5 ms
 START = 2.0  # seconds that a process takes to import all and to load the compiled kernels (1.6)
 AHEAD = 2  # chunks of a process, so that it never waits for the next
 CLUSTER_SHARES = 16  # at least so many chunks of a cluster, whose workers come and go
+LARGE = "1 GiB"  # of what is sent to a cluster at once, beyond which it warns
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
@@ -199,7 +200,8 @@ def on_cluster(work: Work, cluster: str, modules: set[str]) -> Numbered:
     kills its worker, and it runs on this machine alone while the cluster has one worker.
     """
     distributed = optional("distributed", "a Dask cluster", DISTRIBUTED)
-    with connected(cluster) as client:
+    large = {"distributed.admin.large-graph-warning-threshold": LARGE}  # calls bring their data
+    with connected(cluster) as client, import_module("dask").config.set(large):
         need_modules(client, cluster, modules)
         futures = client.map(numbered, *zip(*work, strict=True), pure=False)
         try:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from problems_fit import study_of
 from scipy.spatial.transform import Rotation
 
@@ -22,11 +22,14 @@ from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.fitting.options import silent
 from minimax_cal.fitting.solve import fit_cell
 from minimax_cal.fitting.stations import stationed
+from minimax_cal.ground import parallel
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.parameters import State
+
+ALONE = SimpleNamespace(jobs=1, cluster="", portable=lambda: None)  # causes that no fold looks at
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def test_every_part_is_left_out_and_judges(
         return SimpleNamespace(fits=[SimpleNamespace(cell=cell) for cell in reversed(cells)])
 
     monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, None, judges, None, told.append)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, judges, None, told.append)  # type: ignore[arg-type]
     every = judges.everyone
     left_out = parts(every)
     assert [one.where for one in found.folds] == [part.name for part in left_out]
@@ -82,11 +85,11 @@ def test_a_part_that_the_fit_needs_judges_nothing(
 
     monkeypatch.setattr(folds, "fold_of", fold)
     monkeypatch.setattr(folds, "without", some)
-    found = beyond_of(play, None, judges, None, silent)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, judges, None, silent)  # type: ignore[arg-type]
     assert [one.where for one in found.folds] == [p.name for p in parts(judges.everyone)][1:]
     monkeypatch.setattr(folds, "parts", lambda data, by: ())
     monkeypatch.setattr(folds, "without", plain)
-    nothing = beyond_of(play, None, judges, None, silent)  # type: ignore[arg-type]
+    nothing = beyond_of(play, ALONE, judges, None, silent)  # type: ignore[arg-type]
     assert nothing.folds == ()
     assert nothing.reason == "the poses are too few or too much alike"
 
@@ -108,10 +111,10 @@ def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(folds, "fold_of", fold)
     every = tuple(f"session {name}" for name in "abc")
-    found = beyond_of(study, None, judges, None, silent)  # type: ignore[arg-type]
+    found = beyond_of(study, ALONE, judges, None, silent)  # type: ignore[arg-type]
     assert found.missed == every
     assert found.folds
-    grouped = beyond_of(study, None, judges, "session", silent)  # type: ignore[arg-type]
+    grouped = beyond_of(study, ALONE, judges, "session", silent)  # type: ignore[arg-type]
     assert len(grouped.missed) == 3
     assert not grouped.folds
 
@@ -123,7 +126,7 @@ def test_groups_that_are_named_are_the_parts(
         return SimpleNamespace(fits=[SimpleNamespace(cell=play.geometric)])
 
     monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, None, judges, "region", silent)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, judges, "region", silent)  # type: ignore[arg-type]
     known = [part.name for part in parts(judges.everyone, "region")]
     assert [one.where for one in found.folds] == known
     assert all(name.startswith("the region of line") for name in known)
@@ -149,3 +152,11 @@ def test_a_fold_fits_the_whole_of_a_law() -> None:
     rows = np.arange(study.data.poses) % 6 > 0
     fold = fold_of(study, causes, rows, study.fit.state)
     assert [term.text for term in fold.last.terms] == ["gear_error:J3:orders=2.0"]
+
+
+def test_two_processes_find_what_one_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "START", 0.0)  # so that they start for so little
+    data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
+    alone, beside = (mc.diagnose("irb120", data, jobs=jobs).to_dict() for jobs in (1, 2))
+    assert alone.pop("seconds") != beside.pop("seconds")
+    assert_equal(beside, alone)

@@ -13,7 +13,7 @@ import click
 import numpy as np
 import pytest
 from conftest import run
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from test_sweep import ENVIRONMENT, JOBS, Job, kill_worker, missing, same, wait_for, work
 
 import minimax_cal as mc
@@ -76,6 +76,14 @@ def test_calibrate_many_is_what_one_process_finds(cluster: str) -> None:
     for fit, sheet in zip(found[::2], sheets, strict=True):
         assert isinstance(fit, mc.Fit)
         assert_array_equal(fit.robot.mdh, mc.calibrate("irb120", sheet).robot.mdh)
+
+
+def test_a_diagnosis_is_what_one_process_finds(cluster: str) -> None:
+    data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
+    alone, found = mc.diagnose("irb120", data), mc.diagnose("irb120", data, cluster=cluster)
+    assert found.verdict == alone.verdict
+    assert [f.term.text for f in found.findings] == [f.term.text for f in alone.findings]
+    assert_allclose(found.beyond.typical_mm, alone.beyond.typical_mm, rtol=1e-12)
 
 
 def test_a_fleet_is_what_one_process_finds(
