@@ -192,7 +192,8 @@ def still(path: Path) -> None:
 
 def measured(path: Path) -> None:
     """Measurements, or logs of motions, are read.  Raises CalibrationError."""
-    is_log = path.read_text(encoding="utf-8-sig").startswith("t_s,")
+    header = path.read_text(encoding="utf-8-sig").split("\n", 1)[0]
+    is_log = "t_s" in header.split(",")
     mc.read_runs([path]) if is_log else mc.read_measurements(path)
 
 
