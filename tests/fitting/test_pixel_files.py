@@ -21,6 +21,21 @@ camera_matrix: {{rows: 3, cols: 3, data: {MATRIX}}}
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: [-0.12, 0.08, 2.0e-4, -0.0003, 1e-05]}}
 """
+VECTOR = f"""%YAML 1.2
+---
+image_width: 2448
+image_height: 2048
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {MATRIX}
+distortion_coefficients: !!opencv-nd-matrix
+   sizes: [ 5 ]
+   dt: d
+   data: [ -0.12, 0.08,
+       0.0002, -0.0003, 1e-05 ]
+"""  # OpenCV 5, of a distortion that is no matrix
 MESSAGE = f"""height: 2048
 width: 2448
 distortion_model: plumb_bob
@@ -53,7 +68,9 @@ def read(path: Path, names: tuple[str, ...] = ("left",), board: bool = True) -> 
     )
 
 
-@pytest.mark.parametrize("text", [OPENCV, ROS, MESSAGE], ids=["OpenCV", "ROS", "message"])
+@pytest.mark.parametrize(
+    "text", [OPENCV, VECTOR, ROS, MESSAGE], ids=["OpenCV", "vector", "ROS", "message"]
+)
 def test_cameras_of_opencv_and_ros_are_one(text: str, tmp_path: Path) -> None:
     (tmp_path / "camera.yaml").write_text(text)
     camera = read_camera("left", tmp_path / "camera.yaml")

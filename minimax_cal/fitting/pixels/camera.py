@@ -138,6 +138,8 @@ def undistorted(intrinsic: Array, pixel: Array) -> Array:
 
 # ---- the file --------------------------------------------------------------------------------
 
+TAG = re.compile(r"!!opencv-(nd-)?matrix\b")  # what FileStorage writes before a matrix
+
 
 def read_camera(name: str, path: Path | str) -> Camera:
     """A camera from a YAML file of OpenCV (FileStorage) or ROS (camera_info).  Raises DataError."""
@@ -146,7 +148,7 @@ def read_camera(name: str, path: Path | str) -> Camera:
     text = read_text(path, kind=DataError)
     if text.lstrip().startswith("<"):
         raise DataError(f"{path}: is XML; save the camera as YAML, with K and D")
-    text = re.sub(r"^\s*%YAML[^\n]*\n", "", text).replace("!!opencv-matrix", "")
+    text = TAG.sub("", re.sub(r"^\s*%YAML[^\n]*\n", "", text))
     try:
         content = parsed(text)
     except ValueError as error:
