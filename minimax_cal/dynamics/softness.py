@@ -17,6 +17,7 @@ from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
 
 SOFTER = np.geomspace(0.005, 0.1, 9)  # of a joint's largest speed
+NEAR = np.geomspace(0.7, 1.4, 9)  # of the best of these: a second, finer look
 WORTH = 0.15  # of the square of the remaining error that a softer friction must close
 
 
@@ -35,12 +36,18 @@ def softened(columns: Columns, terms: Sequence[Term]) -> Array:
             continue
         beside[:, parts[0].shape[2] + 2 * j] = 0.0  # the Coulomb friction of this joint
         basis = orthonormal(beside)
-        speeds = np.concatenate([arm.soft[[j]], arm.fastest[j] * SOFTER])
-        sense = logs.filtered(sense_of(logs.motion.qd[:, j, None], speeds))[rows]
-        sense = sense - basis @ (basis.T @ sense)
         left = error[j, rows] - basis @ (basis.T @ error[j, rows])
-        closed = (left @ sense) ** 2 / np.maximum((sense**2).sum(axis=0), 1e-300)
-        remaining, best = float(left @ left) - closed, int(np.argmax(closed))
-        if remaining[best] < (1.0 - WORTH) * remaining[0]:
-            out[j] = max(out[j], float(speeds[best]))
+
+        def remaining(speeds: Array, j: int = j, basis: Array = basis, left: Array = left) -> Array:
+            sense = logs.filtered(sense_of(logs.motion.qd[:, j, None], speeds))[logs.fitted[:, j]]
+            sense = sense - basis @ (basis.T @ sense)
+            size = np.maximum((sense**2).sum(axis=0), 1e-300)
+            return np.asarray(float(left @ left) - (left @ sense) ** 2 / size)
+
+        rough = arm.fastest[j] * SOFTER
+        found = rough[np.argmin(remaining(rough))] * NEAR
+        softer = float(found[np.argmin(remaining(found))])
+        as_it_is, then = remaining(np.array([arm.soft[j], softer]))
+        if then < (1.0 - WORTH) * as_it_is:
+            out[j] = max(out[j], softer)
     return out
