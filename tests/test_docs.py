@@ -265,6 +265,7 @@ STAMP = re.compile(r"^Figures: (version|several versions up to) `([0-9a-f]{7})`\
 # Pages whose tables came from runs of several versions; one that is made again leaves the list.
 SEVERAL = {
     "accuracy", "backends", "blind_study", "external", "planning", "relative", "simulator", "speed",
+    "torques",
 }  # fmt: skip
 
 
