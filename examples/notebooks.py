@@ -46,7 +46,7 @@ def cell(kind: str, text: str) -> dict[str, object]:
 
 
 def notebook(source: str) -> dict[str, object]:
-    """An example as a notebook that nobody has run yet."""
+    """An example as a notebook without outputs."""
     cells = [{"id": f"cell-{number}", **each} for number, each in enumerate(cells_of(source))]
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     about = {"kernelspec": kernel, "language_info": {"name": "python"}}

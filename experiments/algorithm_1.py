@@ -10,7 +10,7 @@ here each parameter scaled to unit curvature; redundant parameters, here left ou
 with q's <= 0, which would break the H > 0 that it asks for, here left out.
 
 Beside it the same with a line search, which the paper has not, and our own two backends of the
-method.  What is told is RMSE(φ) over the optimum of the exact SQP, minus one.
+method.  The figure is RMSE(φ) over the optimum of the exact SQP, minus one.
 """
 
 from __future__ import annotations

@@ -568,7 +568,7 @@ def per_effect(rows: Sequence[Row]) -> Table:
     return Table(
         "each effect, lambda >= 50 [%]",
         ("effect", "runs", "right", "all/one", "in set", "set size", "one_of", "unknown", "none",
-         "median rho^2", "usual rival"),
+         "median rho^2", "usual alternative"),
         tuple(lines),
         ("", "d", ".1f", ".1f", ".1f", ".2f", ".1f", ".1f", ".1f", ".3f", ""),
     )  # fmt: skip

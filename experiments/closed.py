@@ -95,7 +95,7 @@ def main(study: Study, runs: int) -> None:
     groups.append(("all", [share for _, share in pairs]))
     table = Table(
         "the share of the gap that is closed: its 95 % interval on new poses",
-        ("arms with", "runs", "held %", "from", "to", "true is below", "above", "told, median",
+        ("arms with", "runs", "held %", "from", "to", "true is below", "above", "reported, median",
          "true, median", "width, median"),
         tuple(line(name, shares) for name, shares in groups if shares),
         ("", "d", ".1f", ".1f", ".1f", "d", "d", ".3f", ".3f", ".3f"),

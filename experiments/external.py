@@ -1,4 +1,4 @@
-"""Do the claims hold on poses that nobody has seen?
+"""Do the claims hold on poses that were set aside first?
 
     python -m experiments.external [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N] ...
 

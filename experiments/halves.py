@@ -1,8 +1,8 @@
-"""Do the sigmas of effects tell how far two halves of a measurement differ?
+"""Do the sigmas of effects predict how far two halves of a measurement differ?
 
     python -m experiments.halves [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N] ...
 
-All poses are diagnosed; the effects that are established are then fitted, with the geometry, to two
+All poses are diagnosed; the confirmed effects are then fitted, with the geometry, to two
 halves of the poses by themselves (repeated poses on one side).  z is the difference of a parameter
 over the root of the sum of both variances: if the sigmas hold its standard deviation is 1.  Halves
 differ in the poses alone, so that what the model lacks counts too.  Real arms where their

@@ -1,11 +1,11 @@
-"""Do names hold on arms as shops have them?  Blind, as `blind_gap`, under harder conditions.
+"""Are causes identified correctly on arms as shops have them?  Blind, under harder conditions.
 
     python -m experiments.machine_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
         [--only CONDITION]... [--every N]
 
-`machines` makes the arms; the diagnosis sees a robot file and a CSV.  A name counts where it is
-established; what is only tentative makes no verdict.  Separable is a cause with lambda >= 50 of
-which its own law explains so much more than the best other that 25 of lambda tell them apart.
+`machines` makes the arms; the diagnosis sees a robot file and a CSV.  Only confirmed
+causes count; possible ones do not change the verdict.  Separable is a cause with lambda >= 50 of
+which its own law explains so much more than the best other that 25 of lambda distinguish them.
 """
 
 from __future__ import annotations
@@ -221,11 +221,11 @@ def criteria(rows: Sequence[Row]) -> list[Criterion]:
         return bool(row["names"])
 
     return [
-        Criterion("no fault: nothing established, not unknown", "false alarm", sound,
+        Criterion("no fault: nothing confirmed, not unknown", "false alarm", sound,
                   lambda r: not named(r) and r["verdict"] != "unknown", 0.985),
-        Criterion("  something established", "", sound, named),
+        Criterion("  something confirmed", "", sound, named),
         Criterion("one cause, separable: right", "not right", plain, right, 0.96),
-        Criterion("  a strange name established", "", plain, lambda r: r["strange"] > 0),
+        Criterion("  a wrong cause confirmed", "", plain, lambda r: r["strange"] > 0),
         Criterion("  verdict unknown", "", plain, lambda r: r["verdict"] == "unknown"),
         Criterion("  two orders of one gear", "orders", orders, right, 0.95),
         Criterion("one cause, lambda >= 50: in the sets", "",

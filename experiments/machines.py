@@ -1,7 +1,7 @@
 """Arms as shops have them, for the harder half of the blind study: more makes, worse conditions.
 
 Six arms from a SCARA to a six-axis arm on a rail; poses all over, in one half of the workspace, or
-in clusters; 40 to 600 of them; masses told or not; trackers whose range is better than their
+in clusters; 40 to 600 of them; masses given or not; trackers whose range is better than their
 angles; a few points that are slightly off; a base that creeps by microns.  Laws have the forms that
 machines show: two orders of one eccentricity, two time constants, settling that saturates.
 

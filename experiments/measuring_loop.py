@@ -1,10 +1,10 @@
-"""How many poses until the promise is met: planning after each few, one plan at the start, random.
+"""How many poses reach a required sigma: planning in a loop, one plan at the start, random poses.
 
     python -m experiments.measuring_loop [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
 Both papers describe the cell: the robot goes to a pose, the tracker measures, the robot goes on.
 Here what was measured decides where it goes next: a few planned poses on the nominal arm, a fit,
-the next few planned beside those at hand, and so on until the predicted sigma of a position over
+the next few planned in addition, and so on until the predicted sigma of a position over
 the workspace is as asked for.  Against it: one plan on the nominal arm, as large as its own promise
 says; and random poses of the same candidates.  An IRB 2600 with errors that the plan does not know,
 reflectors seen within 30 degrees, the flange in a box of one metre.

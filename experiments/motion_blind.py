@@ -267,7 +267,7 @@ QUESTIONS: tuple[tuple[str, Callable[[Sequence[Told]], list[Told]], Callable[[To
     ("sound: a minor effect confirmed", lambda t: condition(t, SOUND),
      lambda one: bool(one.minor), ""),
     ("single: right", separable, lambda one: one.right, ">= 75"),
-    ("single: right, its family, or not to be told from it", separable,
+    ("single: right, its family, or not distinguishable from it", separable,
      lambda one: one.related, ">= 92"),
     ("single: sure and wrong", separable, lambda one: one.wrong, "<= 4"),
     ("single: nothing named", separable, lambda one: not one.main, ""),

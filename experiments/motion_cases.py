@@ -1,4 +1,4 @@
-"""Arms in motion with causes that nobody told: torques by MuJoCo, or by an integration of our own.
+"""Arms in motion with hidden causes: torques by MuJoCo, or by our own integration.
 
 Half of the cases are MuJoCo's inverse dynamics along an excitation, with its own soft friction and
 rotor inertias; what MuJoCo has no element for is added as torque.  The other half is Newton and

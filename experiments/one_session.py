@@ -6,8 +6,8 @@ A session is cut in halves, by time and by the range of a joint; each half is ca
 `compare` of both, and `check` of each half by the poses of the other, should name nothing: whatever
 they name is a false alarm.  So should one fit, and one diagnosis, of both halves as two sessions of
 which the second was measured from elsewhere.  Real arms where their measurements are on this
-machine, and simulated ones whose model lacks what real ones lack: joints that give way under
-gravity, gears that err once and twice a turn, lengths and zeros that drift.  Of the simulated ones
+machine, and simulated ones whose model lacks what real ones lack: compliant joints,
+gears that err once and twice a turn, lengths and zeros that drift.  Of the simulated ones
 the zero of a joint is also shifted in the second half, by so much that its noncentrality is
 `LAMBDA`: its square over the variance with which least squares tells it beside moves of base,
 reflectors and links.  That variance counts noise and lack of fit, the lack of fit as it is drawn,

@@ -2,8 +2,8 @@
 
     python -m experiments.simulator_gap [--quick] [--out FOLDER] [--json FILE] [--seed N] ...
 
-Three arms, one of seven axes, that give way at their joints and foot, have play in their gears and
-encoders that count wrong; one of them again with masses unknown.  Their nominal models, with servo
+Three arms, one of seven axes, with compliant joints and a compliant foot, play in their gears and
+encoder errors; one of them again with masses unknown.  Their nominal models, with servo
 gains as published models have them, are corrected step by step; every figure is measured in the
 simulator, on poses that no fit has seen.  The last column drives the corrected file by a loop of
 its own.
@@ -186,7 +186,7 @@ def table_of(trials: Sequence[Trial], results: Sequence[Result]) -> Table:
     """All ladders."""
     rows = [row for t, r in zip(trials, results, strict=True) for row in rows_of(t, r)]
     return Table(
-        "held-out errors in the simulator, rung by rung, and what the fit says of the same poses",
+        "held-out errors in the simulator, step by step, and the fit's prediction of these poses",
         ("arm", "model", "RMS mm", "max mm", "fit says mm", "off um", "joints off mrad",
          "the file alone mm"),
         tuple(rows),

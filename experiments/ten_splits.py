@@ -1,10 +1,10 @@
-"""Do names of causes hold, whichever poses are held out?
+"""Are the same causes identified, whichever poses are held out?
 
     python -m experiments.ten_splits [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N]
 
-All poses of an arm are diagnosed ten times, another fifth of them held out each time.  Told are the
-verdicts, the accuracy held out, how much of the gap established causes close, and of every cause in
-how many splits it is established and in how many it is listed at all.  Real arms where their
+All poses of an arm are diagnosed ten times, another fifth of them held out each time.  The tables
+have the verdicts, the held-out accuracy, how much of the gap confirmed causes close, and in how
+many splits each cause is confirmed, and listed at all.  Real arms where their
 measurements are on this machine, and simulated ones.
 """
 
@@ -103,7 +103,7 @@ def arms_table(arms: Sequence[str], told: Sequence[Sequence[Told]]) -> Table:
     return Table(
         "diagnoses of all poses, a fifth of them held out; medians",
         ("arm", "splits", "verdicts", "geometry mm", "final mm", "worst split mm",
-         "of sound points mm", "closed %", "by established causes %"),
+         "of sound points mm", "closed %", "by confirmed causes %"),
         tuple(rows),
         ("", "d", "", ".4f", ".4f", ".4f", ".4f", ".0f", ".0f"),
     )  # fmt: skip
@@ -126,8 +126,8 @@ def names_table(arms: Sequence[str], told: Sequence[Sequence[Told]]) -> Table:
                 mine.append((arm, name, share, sure, len(causes), turns))
         rows += sorted(mine, key=lambda row: -float(row[2] or 0.0))
     return Table(
-        "causes that are established in some split",
-        ("arm", "cause", "share of gap %", "established in", "listed in", "waves a turn"),
+        "causes that are confirmed in some split",
+        ("arm", "cause", "share of gap %", "confirmed in", "listed in", "waves a turn"),
         tuple(rows),
         ("", "", ".1f", "d", "d", ""),
     )

@@ -203,7 +203,7 @@ def tables_1_4(studies: Studies) -> list[Verdict]:
         Verdict("M Table 1: the methods compared", "methods", "7 kinds of method",
                 f"{len(COMPARED)} run: {', '.join(COMPARED)}", told(*ended), "",
                 "reproduced: every fit converges; in part: some", len(present)),
-        Verdict("M Table 1: MDH against product of exponentials", "methods", "told apart",
+        Verdict("M Table 1: MDH against product of exponentials", "methods", "distinguishable",
                 f"held-out RMS differs by {100.0 * apart:.2f} % at most",
                 HOLDS if apart < 0.05 else NO, "pose fits; both free the same directions",
                 "within 5 % of each other", len(present)),

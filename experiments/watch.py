@@ -1,11 +1,11 @@
-"""Is a knock found?  Checks of simulated arms with ten poses, the tracker placed anew.
+"""Is a knock found?  Checks of simulated arms with ten poses, the tracker moved.
 
     python -m experiments.watch [--quick] [--out FOLDER] [--json FILE] [--seed N] [--jobs N] ...
 
-Each arm is calibrated on 60 poses.  Then the tracker is placed anew and ten other poses are
+Each arm is calibrated on 60 poses.  Then the tracker is moved and ten other poses are
 measured, twice: of the arm as it was, where whatever is named is a false alarm, and with the zero
 of one joint of 2 ... n-1 shifted by 0.2 mrad, which should be named, alone.  Also with a law that
-the calibrated model lacks (joints give way under gravity), where honest sigmas find less.
+the calibrated model lacks (joint compliance under gravity), where honest sigmas find less.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SHIFT = 2e-4  # of a joint's zero [rad]
 POSES = 10  # of a check
 CALIBRATED = 60  # poses
 LACKING = 3e-7  # turn of a joint per gravity torque, which geometry does not hold [rad/(N m)]
-KINDS = (("geometry and noise", 0.0), ("joints give way, not modelled", LACKING))
+KINDS = (("geometry and noise", 0.0), ("compliant joints, not modelled", LACKING))
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,9 @@ def main(study: Study, count: int) -> None:
             ]
             rows.append(row_of(arm, kind, chosen))
     table = Table(
-        f"a joint of 2 ... n-1 shifted by {1e3 * SHIFT:g} mrad, tracker placed anew, {POSES} poses",
+        f"a joint of 2 ... n-1 shifted by {1e3 * SHIFT:g} mrad, tracker moved, {POSES} poses",
         ("arm", "model", "arms", "found %", "another named too %", "false alarms %",
-         "J1 told as hidden %", "smallest found mrad", "poses enough"),
+         "J1 reported as hidden %", "smallest found mrad", "poses enough"),
         tuple(rows),
         ("", "", "d", ".1f", ".1f", ".2f", ".1f", ".3f", ".0f"),
     )  # fmt: skip

@@ -14,8 +14,10 @@ import pytest
 from browsing import browsing  # stands beside this
 
 import minimax_cal as mc
-from minimax_cal.cli import main
+from minimax_cal.cli import main, progress
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+
+progress.FIRST = 60.0  # tests compare stderr, and a busy machine takes more than a second
 
 ROOT = Path(__file__).parent.parent
 SHARED = ROOT.parent / "shared" / "data"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from click.core import ParameterSource
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
+    DETAILS,
     PATH,
     ROBOT,
     ROWS,
@@ -24,6 +25,7 @@ from minimax_cal.cli.options import (
     stacked,
 )
 from minimax_cal.fitting.calibrate import calibrate
+from minimax_cal.fitting.first_screen import first_table, frames_table
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.pixels.options import CAMERAS, PixelOptions, camera_of
@@ -31,6 +33,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.reporting.plots.figures import save_errors
 from minimax_cal.robots.kernels.choice import work
+from minimax_cal.solvers.status import Status
 
 if TYPE_CHECKING:
     from minimax_cal.judging.bootstrap import Bootstrap
@@ -85,7 +88,7 @@ PIXEL_FILES = stacked(
     "replicates",
     type=int,
     metavar="N",
-    help="Calibrate N times more, on poses drawn anew, for intervals by percentiles (500 serve).",
+    help="Calibrate N resampled sets of poses for bootstrap intervals (500 are enough).",
 )
 @click.option(
     "--no-poses",
@@ -93,6 +96,7 @@ PIXEL_FILES = stacked(
     is_flag=True,
     help="Leave the poses out of the JSON, which of very many poses are nearly all of it.",
 )
+@DETAILS
 @result_options("the result (JSON)", figure="the errors before and after")
 def calibrate_command(
     robot: str,
@@ -107,6 +111,7 @@ def calibrate_command(
     camera_on: str,
     fix_camera: bool,
     camera_prior: str,
+    details: bool,
     to: Output,
     **chosen: Any,
 ) -> int:
@@ -133,8 +138,13 @@ def calibrate_command(
             more = (bootstrap(fit, replicates, chosen["seed"], progress),)
     to.notice(*(notice for notice in fit.notices if notice != fit.reason))
     if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
-        tables = (*fit.tables(), *(found.table() for found in more))
-        options.show(*tables, headline=fit.headline())
+        intervals = [found.table() for found in more]
+        if details:
+            options.show(*fit.tables(), *intervals, headline=fit.headline())
+            options.show(headline=fit.solution())
+        else:
+            first = (first_table(fit), frames_table(fit), *intervals)
+            options.first_screen(fit.sentences(), *first, advice=advice(fit, robot, data, to.path))
     to.draw(save_errors, fit)
     return options.exit_code(fit.status, fit.reason)
 
@@ -182,6 +192,20 @@ def by_cameras(
     if to.deliver(fit.json, fit.status):
         options.show(*fit.tables(), headline=fit.headline())
     return options.exit_code(fit.status, fit.reason)
+
+
+def advice(
+    fit: Fit, robot: str, data: tuple[Path, ...], written: Path | None
+) -> Iterator[tuple[str, str]]:
+    """What to do next, and its command.  written: where the result went."""
+    left = f"{fit.within.after.rms_mm:.3f} mm"
+    diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
+    yield f"Next, to find the cause of the remaining {left}", diagnose
+    if written and fit.status is Status.CONVERGED:
+        yield "To write a file for a simulator", f"minimax-cal export {written} --to urdf"
+        yield "To see every parameter and table", "add --details"
+    else:
+        yield "To keep the result, and to see every table", "add -o fit.json --details"
 
 
 def text_of(fit: Fit, *more: Bootstrap, poses: bool = True) -> str:

@@ -57,9 +57,9 @@ def check_command(
     simulated: bool,
     to: Output,
 ) -> int:
-    """Whether the calibration FIT is still valid, and what moved, by a few new poses in DATA.
+    """Check with a few poses in DATA whether the calibration FIT is still valid, and what moved.
 
-    Instrument and reflectors may stand anew.  Ends with 0 where it is valid, else with 1.
+    Instrument and reflectors may have moved.  The exit code is 0 if it is valid, else 1.
     """
     found = check(fit, data, tolerance, known=known, seed=seed, simulated=simulated)
     to.notice(*found.notices)

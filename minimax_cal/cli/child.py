@@ -12,7 +12,7 @@ PATIENCE = 3.0  # seconds from being interrupted to being ended
 
 
 def end_with_parent() -> None:
-    """Interrupt the work once nobody holds the other end of stdin any more."""
+    """Interrupt the work once the other end of stdin is closed."""
     while os.read(0, 1):
         pass
     interrupt_main()

@@ -46,8 +46,8 @@ COMMANDS: dict[str, dict[str, Entry]] = {
         ),
         "check": (
             "check",
-            "Whether the calibration FIT is still valid, and what moved, by a few new poses in "
-            "DATA.",
+            "Check with a few poses in DATA whether the calibration FIT is still valid, and what "
+            "moved.",
         ),
         "compare": (
             "compare",

@@ -19,7 +19,7 @@ def compare_command(a: Path, b: Path, to: Output) -> int:
     """What differs between two calibrations A and B: before and after a repair, say.
 
     Both are what `calibrate` or `check` wrote with -o, the earlier first.  Base and reflectors may
-    stand anew; parameters that these imitate are told as they are drawn in both.
+    have moved; parameters that look the same as such a move are shown as nominal.
     """
     found = compare(a, b)
     to.notice(*found.notices)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import click
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
     CAMPAIGNS,
+    DETAILS,
     JSON,
     ROBOT,
     ROWS,
@@ -22,6 +24,8 @@ from minimax_cal.cli.options import (
     workers,
 )
 from minimax_cal.diagnosing.diagnose import diagnose
+from minimax_cal.diagnosing.first_screen import budget_table
+from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
@@ -30,6 +34,7 @@ from minimax_cal.ground.options import Option
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
+from minimax_cal.solvers.status import Status
 
 
 @click.command(name="diagnose", cls=InGroups)
@@ -46,26 +51,45 @@ from minimax_cal.reporting.tables import effects_list, effects_table, remainder_
         group="What is sought",
     ),
     quick=Option(
-        "Leave no parts of the poses out in turn: no claim outside the measured poses.",
+        "Hold out no parts of the poses in turn: no claim outside the measured region.",
         group="What is sought",
     ),
 )
 @workers(1, "1")
 @ROWS
+@DETAILS
 @result_options("the diagnosis (JSON)", figure="the gap and where it lies")
 def diagnose_command(
-    robot: str, data: tuple[Path, ...], in_rows: bool, to: Output, **chosen: Any
+    robot: str, data: tuple[Path, ...], in_rows: bool, details: bool, to: Output, **chosen: Any
 ) -> int:
     """Say why ROBOT still misses once calibrated, as far as the measurements in DATA can tell."""
     with to.stages() as progress:
         found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
     to.notice(*found.notices)
     if to.deliver(found.json, found.status):
-        options.terminal().print(found.headline() + "\n", markup=False)
-        left = remainder_table(found)
-        options.show(*found.tables(), *([left] if left.rows else []), *where_tables(found.where))
+        if details:
+            options.terminal().print(found.headline() + "\n", markup=False)
+            left = remainder_table(found)
+            shown = [left] if left.rows else []
+            options.show(*found.tables(), *shown, *where_tables(found.where))
+        else:
+            first = [budget_table(found)] if found.ladder else []
+            options.first_screen(found.said, *first, advice=advice(found, robot, data, to.path))
     to.draw(save_diagnosis, found)
     return options.exit_code(found.status)
+
+
+def advice(
+    found: Diagnosis, robot: str, data: tuple[Path, ...], written: Path | None
+) -> Iterator[tuple[str, str]]:
+    """What to do next, and its command.  written: where the diagnosis went."""
+    if written and found.main and found.status is Status.CONVERGED:
+        files = " ".join(map(str, data))
+        fit = f"minimax-cal calibrate {robot} {files} --effects {written}"
+        yield "Next, to calibrate with the confirmed causes", fit
+    keep = "" if written else "-o diagnosis.json "
+    what = "To see" if written else "To keep the result, and to see"
+    yield f"{what} every effect, parameter and table", f"add {keep}--details"
 
 
 @click.command(name="effects", cls=InGroups)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import reduce, wraps
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from minimax_cal.measuring.measurements import Measurements
 
 WIDTH = 110  # of text that goes to no terminal
+FIRST_WIDTH = 80  # of a first screen, which any terminal can show
 MOST_NOTICES = 50
 MOST = 1e12  # of any number: squares of what is larger overflow somewhere
 RESULT = "Measurements and result"
@@ -51,11 +52,26 @@ ROWS = click.option(
     is_flag=True,
     help="Take the rows as the poses were visited, where the file tells no order.",
 )
+
+
+class Renamed(click.Option):
+    """An option whose earlier spelling still works, and which help does not show."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Name and help, with the first spelling alone."""
+        record = super().get_help_record(ctx)
+        _, *earlier = self.opts
+        return record and (record[0].replace(f", {', '.join(earlier)}", ""), record[1])
+
+
 RUNG = click.option(
+    "--step",
     "--rung",
+    "rung",
+    cls=Renamed,
     type=int,
     metavar="N",
-    help="Take this rung of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: "
+    help="Use this step of a diagnosis: 0 nominal, 1 geometric, 2 ... with each effect [default: "
     "the last].",
 )
 JSON = click.option(
@@ -215,7 +231,7 @@ class Output:
     quiet: bool
 
     def stages(self) -> AbstractContextManager[Callable[[str], None]]:
-        """To be told of each stage of long work, which stderr shows."""
+        """A callback for each stage of long work, which stderr shows."""
         return stages(self.quiet)
 
     def notice(self, *texts: str) -> None:
@@ -259,7 +275,7 @@ class Output:
     def deliver(self, text: Callable[[], str], status: Status = Status.CONVERGED) -> bool:
         """Write the JSON of a result where it was asked for; whether people want to read it too.
 
-        A result that failed goes into no file: nobody shall load it.
+        A result that failed is not written to a file.
         """
         made = text() if self.path or self.as_json else ""
         if self.path and status is not Status.FAILED:
@@ -345,6 +361,31 @@ def result_options(what: str, *, figure: str = "") -> Decorator:
 def output(what: str) -> Decorator:
     """The option -o."""
     return click.option("-o", "--output", type=PATH, help=f"Write {what} to this file.")
+
+
+DETAILS = click.option(
+    "--details", is_flag=True, help="Print every table, not the first screen alone."
+)
+
+
+def first_screen(
+    sentences: Iterable[str], *tables: Table, advice: Iterable[tuple[str, str]]
+) -> None:
+    """Print what people want to know first: sentences, small tables, and what to do next.
+
+    advice: what for, and the command.
+    """
+    whole = Console(highlight=False)
+    width = min(whole.width, FIRST_WIDTH) if whole.is_terminal else FIRST_WIDTH
+    console = Console(highlight=False, width=width)
+    for sentence in sentences:
+        console.print(Text(visible(sentence)))
+    click.echo()
+    for table in tables:
+        console.print(table.rich())
+    for purpose, command in advice:
+        console.print(Text(visible(f"{purpose}:")))
+        console.print(Text(visible(f"  {command}")))
 
 
 def terminal() -> Console:

@@ -60,7 +60,7 @@ SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
     help="A calibration (JSON): robot, base, targets, and its poses.",
 )
 @plain_option(
-    "What is known", "--data", type=PATH, help="Measurements at hand (CSV); they count as known."
+    "What is known", "--data", type=PATH, help="Existing measurements (CSV); the plan adds to them."
 )
 @options_from(PlanOptions)
 @click.option(

@@ -1,18 +1,22 @@
-"""Progress of long work on stderr: a live line on a terminal, else a line now and then."""
+"""Progress of long work on stderr: a live line on a terminal, else a line every ten seconds."""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from rich.console import Console
+from rich.live import Live
+from rich.text import Text
 
 from minimax_cal.cli.stderr import AS_JSON, tell
-from minimax_cal.ground.stages import Stage, clock
+from minimax_cal.ground.stages import Stage, clock, silent
 
-EVERY = 10.0  # seconds between lines where there is no terminal
+FIRST, EVERY = 1.0, 10.0  # seconds to the first line, and between lines, without a terminal
 
 
 class Stages:
@@ -29,14 +33,14 @@ class Stages:
         if stage.kind != self.kind:
             self.kind, self.counting = stage.kind, now
         done = stage.part - 1  # the part named has just begun
-        if done < 1:
+        if done < 1 or now <= self.counting:
             return now - self.began, None
         return now - self.began, (now - self.counting) / done * (stage.parts - done)
 
     def line(self, text: str) -> str:
         """A stage with the time so far, and the time left of those that count."""
         seconds, left = self.times(as_stage(text))
-        return f"{text} ({clock(seconds)}{'' if left is None else f', {clock(left)} left'})"
+        return f"{text} ({clock(seconds)}{'' if left is None else f', about {clock(left)} left'})"
 
     def event(self, text: str) -> dict[str, Any]:
         """What a line of JSON holds of a stage, beside its words."""
@@ -57,27 +61,78 @@ def as_stage(text: str) -> Stage:
     return text if isinstance(text, Stage) else Stage(text)
 
 
+class Ticker:
+    """The last stage as a line on stderr: after the first second, then every `EVERY` seconds."""
+
+    def __init__(self, shown: Stages) -> None:
+        self.shown, self.text = shown, Stage("reading")
+        self.over = threading.Event()
+
+    def show(self, text: str) -> None:
+        """A stage has begun; its time counts from now."""
+        self.text = as_stage(text)
+        self.shown.times(self.text)
+
+    def tick(self) -> None:
+        """Print the line."""
+        tell("progress", self.shown.line(self.text))
+
+    def run(self) -> None:
+        """Print lines until the work is over."""
+        pause = FIRST
+        while not self.over.wait(pause):
+            self.tick()
+            pause = EVERY
+
+
+@contextmanager
+def ticking(shown: Stages) -> Iterator[Callable[[str], None]]:
+    """A callback for each stage, of which a thread prints the last now and then."""
+    ticker = Ticker(shown)
+    thread = threading.Thread(target=ticker.run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield ticker.show
+    finally:
+        ticker.over.set()
+        thread.join()
+
+
 @contextmanager
 def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """To be told of each stage: shown on a terminal, else a line after every `EVERY` seconds.
+    """A callback for each stage: shown on a terminal, else a line every `EVERY` seconds.
 
-    As JSON every stage is a line.
+    On a terminal the clock ticks, and steps of an error budget stay.  As JSON every stage is a
+    line.
     """
-    told, console = Stages(), Console(stderr=True, quiet=quiet, highlight=False)
+    shown, console = Stages(), Console(stderr=True, quiet=quiet, highlight=False)
     if AS_JSON.get() and not quiet:
-        yield lambda text: tell("progress", text, **told.event(text))
-        return
-    if console.is_terminal or quiet:
-        with console.status("reading") as status:
-            yield lambda text: status.update(told.line(text))
-        return
-    last = told.began
+        yield lambda text: tell("progress", text, **shown.event(text))
+    elif quiet:
+        yield silent
+    elif console.is_terminal:
+        with Live(Clock(shown), console=console, transient=True, refresh_per_second=1) as live:
+            yield partial(on_terminal, live)
+    else:
+        with ticking(shown) as show:
+            yield show
 
-    def show(text: str) -> None:
-        nonlocal last
-        line = told.line(text)
-        if told.now() - last >= EVERY:
-            last = told.now()
-            tell("progress", line)
 
-    yield show
+class Clock:
+    """The last stage with the time so far, whenever it is drawn."""
+
+    def __init__(self, shown: Stages) -> None:
+        self.shown, self.text = shown, Stage("reading")
+
+    def __rich__(self) -> Text:
+        return Text(self.shown.line(self.text), overflow="ellipsis", no_wrap=True)
+
+
+def on_terminal(live: Live, text: str) -> None:
+    """Show a stage; a step that is done stays above it."""
+    stage, clock = as_stage(text), live.get_renderable()
+    if isinstance(clock, Clock):
+        clock.text = stage
+        clock.shown.times(stage)
+    if stage.rung:
+        live.console.print(Text(str(stage)))

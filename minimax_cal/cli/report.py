@@ -27,7 +27,7 @@ ASKED, SAID = "What is required", "What the page says"
         'What is required, in mm, as "rms 0.2, max 0.5".', metavar="LIMITS", group=ASKED
     ),
     tolerance_for=Option(
-        "Whether that holds for poses inside or outside the measured ones.",
+        "Judge poses inside or outside the measured region.",
         metavar="CLAIM",
         group=ASKED,
     ),

@@ -48,7 +48,7 @@ class Compensation:
     of the flange pose by the calibrated model [m, rad]; distance_before, angle_before: without
     correction.  outcome: m words.  sliding: (n,).  line: (m,) line of the file.
     frame: how the nominal arm was placed.  notices: what the reader should know.  delivered: the
-    arm that was corrected for, and how well it does; None where nobody asked.
+    arm that was corrected for, and how well it does; None if not asked for.
     """
 
     q: Array

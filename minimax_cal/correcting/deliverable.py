@@ -79,7 +79,7 @@ class Figures:
         said = [] if math.isnan(self.rms) else [f"held-out RMS {self.rms:.3f} mm"]
         if not math.isnan(self.typical):
             said.append(
-                f"outside the measured poses {self.typical:.3f} mm, at worst {self.worst:.3f} mm"
+                f"outside the measured region {self.typical:.3f} mm, at worst {self.worst:.3f} mm"
             )
         return ", ".join(said) or "not known"
 

@@ -211,7 +211,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     unread = filter(None, [study.scene.unused_torques])
     told = (*asked.data.notices, *notices, *clean.remarks, *unread)
     if late:
-        told = (*told, f"points that stand out beside all that was found: {listed(late)}")
+        told = (*told, f"outliers that no effect found explains: {listed(late)}")
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
     every = ladder.last.cell.placed(clean.given)
     told = (*told, *contradictions(every, ladder.last.cell.error(every)))

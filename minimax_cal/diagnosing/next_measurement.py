@@ -170,7 +170,7 @@ class Site:
 
 
 def plan(scene: Scene, weight: Array, rng: np.random.Generator) -> Plan:
-    """The poses at hand, and after them those that are proposed."""
+    """The existing poses, and after them those that are proposed."""
     m, n = scene.poses, scene.joints
     outer = np.argsort(-aside(scene), kind="stable")[: max(AGAIN)]
     first = np.argsort(scene.column("clock"), kind="stable")[: max(AGAIN)]

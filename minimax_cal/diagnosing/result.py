@@ -55,6 +55,7 @@ PEOPLES = {  # how people read a unit of the file
 }
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
+SMALL = 0.05  # share of the gap below which a confirmed cause is minor to the reader
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -85,6 +86,11 @@ class Alternative:
     def at(self) -> str:
         """Where, in words."""
         return in_words(self.place, self.effect)
+
+    @property
+    def name(self) -> str:
+        """Effect and place, in words."""
+        return f"{self.effect.replace('_', ' ')} {self.at}"
 
     @property
     def helps(self) -> bool:
@@ -139,15 +145,15 @@ class Finding:
 
     @property
     def why_tentative(self) -> str:
-        """What keeps it from being established; '' if nothing does."""
+        """What keeps it from being confirmed; '' if nothing does."""
         if math.isnan(self.again):
             return "poses too few to leave any out"
         return "not found again without some of the poses" if self.again < CONFIRMED else ""
 
     @property
     def evidence(self) -> str:
-        """Whether it is established, and the frequency that decides."""
-        said = "established" if self.established else "tentative"
+        """Whether it is confirmed, and the frequency that decides."""
+        said = "confirmed" if self.established else "possible"
         return said if self.rows or math.isnan(self.again) else f"{said}, {self.again:.2f}"
 
     @property
@@ -262,7 +268,7 @@ class Diagnosis:
 
     status: of the geometric fit.  verdict: one of VERDICTS.  findings: by share of the gap.
     ladder: nominal, geometric, then with each effect.  beyond: on whole parts left out, effects
-    sought anew without each.  floor: RMS that noise alone would leave.
+    searched again without each.  floor: RMS that noise alone would leave.
     closed: share of the gap closed, 0 to 1, with its interval, NaN where it says nothing.
     noise: of a coordinate [m].  jitter: of a joint [rad].
     structure: probability that what remains is unrelated to pose and time.
@@ -333,6 +339,25 @@ class Diagnosis:
         at = [rungs.index(name) if name in rungs else 0 for name in names]
         return [self.findings[i] for i in sorted(range(len(at)), key=at.__getitem__)]
 
+    @property
+    def main(self) -> list[Finding]:
+        """The confirmed causes but for the minor ones, the largest first; at least one if any."""
+        sure = [f for f in self.findings if f.established]
+        return [f for f in sure if not f.share < SMALL] or sure[:1]
+
+    @property
+    def minor(self) -> list[Finding]:
+        """The other confirmed causes."""
+        main = self.main
+        return [f for f in self.findings if f.established and f not in main]
+
+    @property
+    def minor_sizes(self) -> tuple[float, float]:
+        """RMS that the minor causes explain, and what they take off the held-out RMS [mm]."""
+        both = [(f.before, f.after) for f in self.minor if math.isfinite(f.before - f.after)]
+        explained = sum(before**2 - after**2 for before, after in both)
+        return math.sqrt(max(explained, 0.0)), sum(before - after for before, after in both)
+
     def leftover(self) -> Leftover:
         """What geometry leaves and what the effects leave, pose by pose."""
         found = [finding.term for finding in self.findings]
@@ -387,6 +412,11 @@ class Diagnosis:
                 "noise_floor_mm": finite(self.floor.value),
                 "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
                 "noise_floor_from": self.floor.source,
+                "minor_effects": {
+                    "count": len(self.minor),
+                    "explained_mm": self.minor_sizes[0],
+                    "gain_mm": self.minor_sizes[1],
+                },
                 "closed": finite(self.closed),
                 "closed_ci95": list(self.closed_ci) if self.has_interval else None,
                 "ladder": [
@@ -457,7 +487,7 @@ class Diagnosis:
         write_whole(path, self.json())
 
     def ladder_table(self) -> Table:
-        """The gap, rung by rung."""
+        """The error budget, step by step."""
         rows: list[tuple[TableCell, ...]] = [
             (step.name, step.train.rms_mm, step.train.max_mm, step.holdout.rms_mm,
              step.holdout.max_mm)
@@ -466,14 +496,14 @@ class Diagnosis:
         floor = self.floor.value
         rows.append((f"noise floor ({self.floor.source})", floor, "", floor, ""))
         return Table(
-            f"{self.robot}: the gap, step by step",
+            f"{self.robot}: error budget, step by step",
             ("model", "train RMS mm", "train max mm", "held-out RMS mm", "held-out max mm"),
             tuple(rows),
             ("", ".4f", ".4f", ".4f", ".4f"),
         )
 
     def effects_table(self) -> Table:
-        """The effects found, with what each does for held-out poses; tentative ones last."""
+        """The effects found, with what each does for held-out poses; possible ones last."""
         found = sorted(self.by_rung, key=lambda f: not f.established)
         rows: list[tuple[TableCell, ...]] = [
             (f"{f.term.effect} {f.term.place}{f.lines}",
@@ -481,8 +511,8 @@ class Diagnosis:
              100.0 * f.share + 0.0, f.before, f.after, f.chance, f.evidence)
             for i, f in enumerate(found)
         ]  # fmt: skip
-        title = f"effects found, rung by rung; by chance, {LEVEL:g} is rare enough"
-        header = ("effect", "cause", "share of gap %", "before mm", "after mm", "by chance",
+        title = f"effects found, step by step; p-values below {LEVEL:g} are significant"
+        header = ("effect", "cause", "share of error %", "before mm", "after mm", "p-value",
                   "evidence")  # fmt: skip
         formats = ("", "", ".0f", ".4f", ".4f", "", "")
         shown = len(header) - all(
@@ -510,11 +540,11 @@ class Diagnosis:
             for f in self.by_rung
             for a in f.alternatives
         )  # fmt: skip
-        header = ("named", "or rather", "likeness", "power", "fits worse by",
+        header = ("effect", "alternative", "similarity", "power", "fits worse by",
                   "what to measure next")  # fmt: skip
         title = (
-            f"rivals that these data do not rule out: they fit worse by less than {BAND:.0f}, or "
-            f"less than the power {ENOUGH:.0f} tells apart; likeness 1 is the same motion"
+            f"alternatives that these data do not exclude: they fit worse by less than {BAND:.0f}, "
+            f"or the power is below {ENOUGH:.0f}; at similarity 1 both move the arm alike"
         )
         return Table(title, header, rows,
                      ("", "", ".3f", ".3g", ".3g", ""))  # fmt: skip
@@ -529,10 +559,15 @@ class Diagnosis:
                  self.parameter_table(), self.rival_table(), self.untestable_table())  # fmt: skip
         return tuple(table for table in every if table.rows)
 
+    @property
+    def said(self) -> tuple[str, ...]:
+        """The verdict and why, and what was set aside, in sentences."""
+        aside = aside_sentence(self.set_aside, self.with_them) if self.set_aside else ""
+        return tuple(filter(None, [*self.reasons, aside]))
+
     def headline(self) -> str:
         """The verdict in words."""
-        aside = aside_sentence(self.set_aside, self.with_them) if self.set_aside else ""
-        return " ".join(filter(None, [*self.reasons, aside]))
+        return " ".join(self.said)
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

@@ -1,4 +1,4 @@
-"""A diagnosis in words: the verdict first, each number one that stands in the JSON."""
+"""A diagnosis in words: the main cause first; each number is in the JSON, too."""
 
 from __future__ import annotations
 
@@ -11,46 +11,43 @@ from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.measuring.floor import REPEATS
 from minimax_cal.solvers.status import Status
 
-NOTHING_MM = 5e-4  # of a length that is told to three digits
-SMALL = 0.05  # share of the gap below which a cause is told with its like, in one line
+NOTHING_MM = 5e-4  # of a length that is reported to three digits
+MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
 REVISIT = "Next measurement: visit 10 poses twice, to know the measurement noise."
-NO_CHANCE = f"below {STRUCTURE:g} is no accident"
 CONTRADICTED = (
-    "Verdict: unknown. The best fit contradicts the measurements: this is no calibration of this "
-    "arm, and no cause is to be read from it."
+    "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
+    "says nothing about causes."
 )
-VERDICTS = {  # what stands first
-    "none": "Verdict: none. Nothing beyond geometry and noise is established.",
-    "named": "Verdict: named, and no rival explains the errors as well.",
-    "one_of": "Verdict: one of several: these data leave more than one name for a cause.",
-    "unknown": "Verdict: unknown.",
-    "not_repeatable": "Verdict: not repeatable. The arm does not return to the same place when a "
-    "pose is repeated, and no known effect of time, load or approach explains it.",
+OPENINGS = {  # by the JSON's verdict
+    "none": "No cause beyond geometry was found.",
+    "named": "Main cause",
+    "one_of": "Ambiguous cause",
+    "unknown": "Unexplained",
+    "not_repeatable": "Not repeatable: the arm does not return to the same place when a pose is "
+    "repeated, and no known effect of time, load or approach explains it.",
 }
 
 
 def reasons(found: Diagnosis) -> tuple[str, ...]:
-    """Verdict, established causes, share, remainder, next measurement; then what is tentative.
+    """Main causes with their share, minor ones, errors, remaining error, next measurement.
 
-    Nothing but the verdict of a diagnosis that failed.
+    Only one sentence where the fit failed.
     """
     if found.status is Status.FAILED:
         return (CONTRADICTED,)
-    causes = [f for f in found.by_rung if f.established]
     tentative = [f for f in found.by_rung if not f.established]
-    large = [f for f in causes if not f.share < SMALL] or causes[:1]
-    small = [f for f in causes if f not in large]
+    main = listed(title_of(found), found.main)
     return tuple(
         sentence
         for sentence in (
-            verdict(found, causes),
-            listed("Cause", large, rivals=True),
-            listed(f"Small, each below {100 * SMALL:.0f} % of the gap", small),
+            opening(found),
+            main,
+            minor(found),
             shrunk(found),
             remaining(found),
             away(found),
             proposal(found),
-            listed("Tentative, and no cause yet", tentative),
+            f"Possible causes, not confirmed: {names_of(tentative)}." if tentative else "",
         )
         if sentence
     )
@@ -59,48 +56,94 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
 # ---- the sentences -----------------------------------------------------------------------------
 
 
-def verdict(found: Diagnosis, causes: Sequence[Finding]) -> str:
-    """The verdict, and of an unknown one why."""
-    text = VERDICTS[found.verdict]
-    if found.verdict != "unknown":
-        return text
-    carrying = [f for f in causes if not f.share < SMALL]
-    if carrying:
-        names = ", ".join(f"{f.term.effect} {f.at}" for f in carrying)
-        text = f"Verdict: unknown beside {names}."
-    if found.structure_in in (ABOVE_NOISE, ONLY_MINOR):
-        said = found.structure_in[:1].upper() + found.structure_in[1:]
-        joints = "" if found.floor.source == REPEATS else ", and what sound joints add"
+def opening(found: Diagnosis) -> str:
+    """What comes before the causes; empty where these say it all."""
+    if found.verdict in ("named", "one_of") and found.main:
+        return ""
+    text = OPENINGS[found.verdict]
+    return f"{text}: {unexplained(found)}" if found.verdict == "unknown" else text
+
+
+def title_of(found: Diagnosis) -> str:
+    """Main cause, ambiguous cause, or causes found beside what is unexplained."""
+    many = "s" if len(found.main) > 1 else ""
+    if found.verdict == "unknown":
+        return f"Cause{many} found"
+    ambiguous = found.verdict == "one_of" and bool(found.main and found.main[0].alternatives)
+    return f"{OPENINGS['one_of' if ambiguous else 'named']}{many}"
+
+
+def unexplained(found: Diagnosis) -> str:
+    """What is not explained, and how that is known."""
+    left = found.structure_in
+    if left in (ABOVE_NOISE, ONLY_MINOR):
+        joints = "" if found.floor.source == REPEATS else ", with what sound joints add"
         return (
-            f"{text} {said}: {found.ladder[-1].trusted.rms_mm:.3f} mm against "
-            f"{found.floor.high:.3f} mm at most ({found.floor.source}{joints})."
+            f"{left}, {found.ladder[-1].trusted.rms_mm:.3f} mm against at most "
+            f"{found.floor.high:.3f} mm ({found.floor.source}{joints})."
         )
-    what = "the causes below leave" if causes else "geometry leaves"
-    guess = "these names are a best guess" if causes else "the cause is unknown"
-    if not found.structure < STRUCTURE:  # it is the names that do not hold
-        return f"{text} {found.structure_in[:1].upper()}{found.structure_in[1:]}: {guess}."
+    sure = any(f.established for f in found.findings)
+    guess = "the causes listed are a best guess" if sure else "the cause is unknown"
+    if not found.structure < STRUCTURE:  # it is the causes that are not certain
+        return f"{left}: {guess}."
+    after = "after the causes below" if sure else "after geometry"
     return (
-        f"{text} What {what} is not noise ({found.structure_in}: by chance {found.structure:.1g}, "
-        f"{NO_CHANCE}), and no known effect explains it: {guess}."
+        f"the error {after} is not random ({left}: p = {found.structure:.1g}, significant below "
+        f"{STRUCTURE:g}), and no known effect explains it; {guess}."
     )
 
 
-def listed(title: str, findings: Sequence[Finding], *, rivals: bool = False) -> str:
-    """Effects in the order of the ladder, those of one kind together; with their rivals."""
+def listed(title: str, findings: Sequence[Finding]) -> str:
+    """Causes with their share, the largest first, those of one kind together."""
     kinds: dict[str, list[Finding]] = {}
     for finding in findings:
         kinds.setdefault(finding.term.effect, []).append(finding)
-    parts = []
-    for effect, same in kinds.items():
-        why = f" ({same[0].cause})" if rivals else ""
-        parts.append(f"{effect} {together([f.at for f in same])}{why}{lines_of(same[0])}")
-        for finding in same if rivals else ():
-            others = {f"{a.effect} {a.at}" for a in finding.alternatives}
-            where = f" {finding.at}" if len(same) > 1 else ""
-            if others:
-                parts[-1] += f",{where} or else {' or '.join(sorted(others))}"
-    many = "s" if title == "Cause" and len(findings) > 1 else ""
-    return f"{title}{many}: {'; '.join(parts)}." if parts else ""
+    parts = [cause_of(same, first=i == 0) for i, same in enumerate(kinds.values())]
+    share = " of the remaining error" if any("%" in part for part in parts) else ""
+    return f"{title}: {'; '.join(parts)}{share}." if parts else ""
+
+
+def cause_of(same: Sequence[Finding], *, first: bool) -> str:
+    """One kind of cause: where, of the first one also what it is, its alternatives, its share."""
+    why = f" ({same[0].cause})" if first else ""
+    others = sorted({f"{a.name}{at_which(f, same)}" for f in same for a in f.alternatives})
+    text = f"{words_of(same[0].term.effect)} {together([f.at for f in same])}{why}"
+    text += lines_of(same[0])
+    if others:
+        text += f", or {' or '.join(others)}"
+    shares = [f"{100.0 * f.share:.0f} %" for f in same if f.share > 0.0]
+    return ", ".join([text, " and ".join(shares)]) if shares else text
+
+
+def at_which(finding: Finding, same: Sequence[Finding]) -> str:
+    """To which of several places an alternative belongs."""
+    return f" (for {finding.at.removeprefix('at ')})" if len(same) > 1 else ""
+
+
+def words_of(effect: str) -> str:
+    """An effect as people call it, as joint compliance."""
+    return effect.replace("_", " ")
+
+
+def names_of(findings: Sequence[Finding]) -> str:
+    """Effects with their places, those of one kind together."""
+    kinds: dict[str, list[str]] = {}
+    for finding in findings:
+        kinds.setdefault(words_of(finding.term.effect), []).append(finding.at)
+    return "; ".join(f"{kind} {together(places)}" for kind, places in kinds.items())
+
+
+def minor(found: Diagnosis) -> str:
+    """The minor effects in one line, and what they gain."""
+    small = found.minor
+    if not small:
+        return ""
+    size, gain = found.minor_sizes
+    few = len(small) <= MAX_NAMED_MINOR
+    names = f" ({names_of(small)})" if few else ""
+    many = "" if len(small) == 1 else "s, together"
+    keep = "" if few else f"; keep the {len(found.main)} above, the others gain {gain:.3f} mm"
+    return f"{len(small)} minor effect{many}{names} {size:.3f} mm{keep}."
 
 
 def together(places: Sequence[str]) -> str:
@@ -113,79 +156,78 @@ def together(places: Sequence[str]) -> str:
 
 
 def lines_of(finding: Finding) -> str:
-    """Of joints that were read back: how much of the rest it explains."""
+    """Of joints that were read back: how much of the remaining error it explains."""
     share = dict(zip(finding.names, finding.values, strict=True)).get("explained", math.nan)
     if math.isfinite(finding.before) or not math.isfinite(share):
         return ""
-    return f", with {100.0 * share:.0f} % of the rest along the last moves"
+    return f", with {100.0 * share:.0f} % of the remaining error along the last moves"
 
 
 def shrunk(found: Diagnosis) -> str:
-    """How far the error falls on poses that no fit has seen."""
+    """How far the error falls on held-out poses."""
     nominal, geometric, last = (found.ladder[i].holdout for i in (0, 1, -1))
     text = (
-        f"RMS error on poses that no fit has seen: nominal robot {nominal.rms_mm:.3f} mm, "
-        f"calibrated geometry {geometric.rms_mm:.3f} mm (largest {geometric.max_mm:.3f} mm)"
+        f"RMS error on held-out poses: nominal arm {nominal.rms_mm:.3f} mm, calibrated geometry "
+        f"{geometric.rms_mm:.3f} mm (largest {geometric.max_mm:.3f} mm)"
     )
     if len(found.ladder) < 3:
         return f"{text}."
-    text += f", whole model {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm{without_far(found)})"
+    text += f", all effects {last.rms_mm:.3f} mm (largest {last.max_mm:.3f} mm{without_far(found)})"
     return f"{text}; {closed_words(found)}." if math.isfinite(found.closed) else f"{text}."
 
 
 def closed_words(found: Diagnosis) -> str:
-    """How much of the gap to the noise is closed, for people, and how sure that is."""
+    """How much of the error above noise is explained, and how sure that is."""
     low, high = (100.0 * end for end in found.closed_ci)
     ends = f" (95 % interval {low:.0f} to {high:.0f} %)" if found.has_interval else ""
     share = f"{100.0 * found.closed:.0f} %"
-    if not (found.floor.certain or share == "100 %"):  # told as if noise alone left nothing
+    if not (found.floor.certain or share == "100 %"):  # reported as if noise were zero
         share = f"at least {share}"
-    return f"{share} of the gap to the noise is closed{ends}"
+    return f"{share} of the error above noise is explained{ends}"
 
 
 def without_far(found: Diagnosis) -> str:
-    """What the whole model does where no held-out point stands out; empty where none does."""
+    """What the whole model does without held-out outliers; empty where there are none."""
     every, sound = found.ladder[-1].holdout, found.ladder[-1].trusted
     count = sum(every.counts) - sum(sound.counts)
-    points = "the point that stands" if count == 1 else f"{count} points that stand"
-    return f"; {sound.rms_mm:.3f} mm without {points} out" if count and sum(sound.counts) else ""
+    points = "1 outlier" if count == 1 else f"{count} outliers"
+    return f"; {sound.rms_mm:.3f} mm without {points}" if count and sum(sound.counts) else ""
 
 
 def remaining(found: Diagnosis) -> str:
-    """What is left: what could be predicted, what could not, what noise alone would leave."""
-    floor = found.floor
+    """The remaining error: what depends on the pose, what looks random, and the noise."""
+    floor, left = found.floor, found.remainder
     noise = (
-        f"{floor.value:.3f} mm ({floor.source})"
+        f"measurement noise is {floor.value:.3f} mm ({floor.source})"
         if floor.certain
-        else f"at most {floor.value:.3f} mm, the noise of the fit"
+        else f"measurement noise is at most {floor.value:.3f} mm (from the residuals)"
     )
-    left = found.remainder
     if left is None:
-        return f"Noise alone would leave {noise}."
+        return f"{noise[:1].upper()}{noise[1:]}."
     if left.predictable_mm < NOTHING_MM:
-        return f"Nothing tells poses left out what remains; noise alone would leave {noise}."
+        return f"The remaining {found.ladder[-1].holdout.rms_mm:.3f} mm looks random; {noise}."
     where = ", ".join(f"{in_words(place)} {100.0 * share:.0f} %" for place, share in left.where[:3])
-    told = f" ({where})" if where else ""
+    named = f" ({where})" if where else ""
     return (
-        f"Of what remains at poses left out, {left.predictable_mm:.3f} mm follow the pose{told}, "
-        f"{left.unpredictable_mm:.3f} mm follow nothing known; noise alone would leave {noise}."
+        f"Remaining error: {left.predictable_mm:.3f} mm depends on the pose{named}, "
+        f"{left.unpredictable_mm:.3f} mm looks random; {noise}."
     )
 
 
 def away(found: Diagnosis) -> str:
-    """How the model does on whole parts that were left out."""
+    """How the model does on whole parts that were held out."""
     beyond = found.beyond
     text = beyond.sentence()
     if beyond.worst and beyond.typical_mm > beyond.geometric_typical_mm:
         text = text.removesuffix(".") + (
-            f"; geometry alone does better beyond them ({beyond.geometric_typical_mm:.3f} mm), so "
-            "that the effects do not carry over to places that were not measured."
+            f"; geometry alone is better there ({beyond.geometric_typical_mm:.3f} mm): the effects "
+            "do not extrapolate."
         )
     return text
 
 
 def proposal(found: Diagnosis) -> str:
-    """The one measurement to make next: what settles causes, else what tells the noise."""
+    """The one measurement to make next: what settles causes, else what shows the noise."""
     settles = next_measurement([f for f in found.by_rung if f.established])
     return settles or ("" if found.floor.certain else REVISIT)
 
@@ -193,7 +235,7 @@ def proposal(found: Diagnosis) -> str:
 def next_measurement(causes: Sequence[Finding]) -> str:
     """The one measurement that settles most of the gap; empty where none would.
 
-    That is causes by their share, and of equal ones the most rivals.
+    That is causes by their share, and of equal ones the most alternatives.
     """
     by_text: dict[str, list[tuple[Finding, Alternative]]] = {}
     for finding in causes:
@@ -204,10 +246,10 @@ def next_measurement(causes: Sequence[Finding]) -> str:
         return ""
 
     def settled(pairs: Sequence[tuple[Finding, Alternative]]) -> tuple[float, int]:
-        told = {f.term.key: f.share for f, _ in pairs if f.share > 0.0}
-        return sum(told.values()), len(pairs)
+        shares = {f.term.key: f.share for f, _ in pairs if f.share > 0.0}
+        return sum(shares.values()), len(pairs)
 
     text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
-    named = " and ".join(dict.fromkeys(f"{f.term.effect} {f.at}" for f, _ in pairs))
-    others = " and ".join(dict.fromkeys(f"{a.effect} {a.at}" for _, a in pairs))
-    return f"Next measurement: {text}, to tell {named} from {others}."
+    named = " and ".join(dict.fromkeys(f"{words_of(f.term.effect)} {f.at}" for f, _ in pairs))
+    others = " and ".join(dict.fromkeys(a.name for _, a in pairs))
+    return f"Next measurement: {text}, to distinguish {named} from {others}."

@@ -12,9 +12,9 @@ from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.what_remains import loudest
 from minimax_cal.evidence.limits import HALF
 
-UNSURE = "names that change with the poses"
-UNASKED = "names that so few poses cannot confirm"
-UNHELPFUL = "names that do not help at poses left out"
+UNSURE = "the causes found change with the choice of poses"
+UNASKED = "too few poses to confirm the causes found"
+UNHELPFUL = "the causes found do not improve held-out poses"
 
 Structure = tuple[str, float]
 

@@ -97,7 +97,7 @@ class Beyond:
     @property
     def kept(self) -> str:
         """That the effects were given, a clause for people; empty where they were sought anew."""
-        return ", effects not sought anew" if self.sought is False else ""
+        return ", with the same effects" if self.sought is False else ""
 
     @property
     def worst(self) -> Fold | None:
@@ -118,19 +118,19 @@ class Beyond:
         """For the headline, empty where there is no claim and no joint that is the cause."""
         if not self.worst:
             return (
-                f"Outside the measured poses nothing is claimed: {self.reason}."
+                f"Outside the measured region nothing is claimed: {self.reason}."
                 if self.narrow
                 else ""
             )
-        parts = "each part left out in turn"
+        parts = "each part held out in turn"
         if self.missed:
-            parts = f"{self.judged} left out in turn (the fit cannot do without the others)"
+            parts = f"{self.judged} held out in turn (the fit needs the others)"
         less = ""
         if self.trusted:
             worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
-            less = f"; without the points that stand out at worst {worst}"
+            less = f"; without outliers at worst {worst}"
         return (
-            f"Outside the measured poses, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
+            f"Outside the measured region, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
             f"at worst {self.worst_mm:.3f} mm ({self.worst.where}){less}."
         )
 
@@ -150,7 +150,7 @@ class Beyond:
             rows.append((f"{whole}, without suspects", count, typical, math.nan, math.nan))
         how = f"each part judged by a fit without it{self.kept}"
         return Table(
-            f"outside the measured poses: {how}, the worst ones",
+            f"outside the measured region: {how}, the worst ones",
             ("left out", "poses", "RMS mm", "max mm", "geometry alone RMS mm"),
             tuple(rows),
             ("", "d", ".4f", ".4f", ".4f"),

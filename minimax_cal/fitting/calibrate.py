@@ -152,7 +152,7 @@ def calibrate(
     hessian: gauss-newton or bfgs. distance: form of the distance constraints, two-sided,
     squared or off; distance_tolerance: theirs [m], as measured unless given. resolution:
     relative singular value that counts as not measured. effects: beyond geometry, as
-    joint_compliance:J2, or a diagnosis (or its file), whose established effects are taken.
+    joint_compliance:J2, or a diagnosis (or its file), whose confirmed effects are taken.
     loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
     allow_large_changes: accept links that differ from the drawing by more than 5 % of the
     reach, 5 degrees (alpha, beta) or 30 degrees (theta). simulated: the points may be exact.

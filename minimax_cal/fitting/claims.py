@@ -57,8 +57,8 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
         )
         more = f" and {len(held) - LISTED} more" if len(held) > LISTED else ""
         yield (
-            f"{source}: held-out points that stand out: {named}{more}; they stay in the held-out "
-            "accuracy and outside the measured poses, which also stand there without them"
+            f"{source}: outliers among the held-out points: {named}{more}; they count in the "
+            "held-out accuracy, which is also given without them"
         )
 
 

@@ -340,7 +340,7 @@ class Fit:
     data: all m poses, with their history where effects need it; none in an old file.
     held: (m,) True where held out.  error_nominal, error: (k, m, 3) measured minus predicted, NaN
     where not measured [m].
-    loss: of the least squares.  suspects: training points that stand out from the fit.
+    loss: of the least squares.  suspects: training points that are outliers of the fit.
     weights: (k, training poses) of the points besides their u95, 0 where set aside.  share: (k,)
     weight of each target, or (k, training poses) of each point, in the objective.  prior: (p,)
     weight of each parameter's nominal value.  widening: what a robust loss adds to all sigmas.
@@ -674,22 +674,32 @@ class Fit:
         header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
         return Table("effects beyond geometry", header, tuple(rows), ("", "", ".4g", ".2g", ""))
 
-    def headline(self) -> str:
-        """The result in a sentence or two."""
+    def sentences(self) -> tuple[str, ...]:
+        """The result: what went wrong if anything, inside, set aside, outside, identified."""
         before, after, where = self.within.before, self.within.after, self.within.where
         identified = sum(p.identifiable for p in self.parameters)
-        aside = f"{self.aside_sentence()} " if self.set_aside else ""
-        beyond = f"{said} " if (said := self.beyond.sentence()) else ""
-        text = (
-            f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
-            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}. {aside}{beyond}"
-            f"{identified} of {len(self.parameters)} parameters identified "
-            f"(condition {self.identification.condition:.3g}); {self.status} after "
-            f"{self.iterations} iterations, {self.seconds:.2f} s.{self.solved_by()}"
-        )
         advice = "" if self.reason else self.status.advice
-        first = f"{self.reason[:1].upper()}{self.reason[1:]}. " if self.reason else ""
-        return first + text + (f" {advice}." if advice else "")
+        every = (
+            f"{self.reason[:1].upper()}{self.reason[1:]}." if self.reason else "",
+            f"RMS error {before.rms_mm:.3f} mm -> {after.rms_mm:.3f} mm, largest "
+            f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
+            self.aside_sentence() if self.set_aside else "",
+            self.beyond.sentence(),
+            f"{identified} of {len(self.parameters)} parameters identified; {self.status}.",
+            f"{advice}." if advice else "",
+        )
+        return tuple(sentence for sentence in every if sentence)
+
+    def headline(self) -> str:
+        """The result in a few sentences."""
+        return " ".join(self.sentences())
+
+    def solution(self) -> str:
+        """How the fit was found: condition, steps, time, and who answered the QPs."""
+        return (
+            f"Condition {self.identification.condition:.3g}; {self.iterations} iterations, "
+            f"{self.seconds:.2f} s.{self.solved_by()}"
+        )
 
     def solved_by(self) -> str:
         """Who answered the quadratic programs, after a space; empty where there were none."""
@@ -721,7 +731,8 @@ class Fit:
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
-        return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
+        tables = (table.text(width) for table in self.tables())
+        return "\n\n".join([self.headline(), *tables, self.solution()])
 
     def to_dict(self, *, poses: bool = True) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back to the last digit.

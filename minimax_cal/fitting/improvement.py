@@ -115,7 +115,7 @@ def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
     off = [f"line {one.line} {one.target} {1e3 * one.distance:.3g} mm" for one in suspects]
     more = f" and {len(off) - NAMED} more" if len(off) > NAMED else ""
-    rows = f"; check the points that stand out ({', '.join(off[:NAMED])}{more})" if off else ""
+    rows = f"; check the outliers ({', '.join(off[:NAMED])}{more})" if off else ""
     return (
         f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "
         "the drawn arm, or calibrate again with more poses, joint values with all their digits "

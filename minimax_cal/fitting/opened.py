@@ -95,7 +95,7 @@ class Opened:
         rung = self.rungs[self.number]
         if rung.cell is None:
             raise CalibrationError(
-                f"{self.source}: does not tell the arm of rung {self.number} ({rung.name}); "
+                f"{self.source}: does not hold the arm of step {self.number} ({rung.name}); "
                 "make the file again"
             )
         return rung.cell
@@ -179,7 +179,7 @@ def at_rung(found: Opened, number: int) -> Opened:
     """The same result at another rung.  Raises OptionError."""
     if not 0 <= number < len(found.rungs):
         names = ", ".join(f"{i} ({rung.name})" for i, rung in enumerate(found.rungs))
-        raise OptionError(f"{found.source}: has no rung {number}; it has {names}")
+        raise OptionError(f"{found.source}: has no step {number}; it has {names}")
     whole = found.uncertainty if number == len(found.rungs) - 1 else None
     return replace(found, number=number, uncertainty=whole, possible=frozenset())
 

@@ -82,14 +82,14 @@ class Options:
     instrument's own accuracy.  resolution: relative singular value that counts as not measured.
     effects: beyond geometry, fitted jointly, as joint_compliance:J2 or backlash:all.
     loss: of the distances in the least squares: square, huber, cauchy or tukey.
-    trim: at most this share of the points, those that stand out, is set aside.
+    trim: at most this fraction of the points, the largest outliers, is set aside.
     allow_large_changes: whether the arm may be another than the one drawn.  simulated: whether
     points may be exact, as no instrument measures them.
     """
 
     objective: str = option(
         "minimax",
-        "What is made small: sum, minimax (the worst target), point (the worst point), pose, or "
+        "What is minimised: sum, minimax (the worst target), point (the worst point), pose, or "
         "one target alone, as smr:2.",
         group="What is fitted",
     )
@@ -130,7 +130,7 @@ class Options:
     )
     free: Sequence[str] = option(
         (),
-        "Keep these ones where several cannot be told apart.",
+        "Identify these where several parameters are not distinguishable.",
         many=tuple,
         group="What is fitted",
     )
@@ -172,13 +172,13 @@ class Options:
     loss: str = option(
         SQUARE,
         f"How errors count, against outliers: {', '.join((SQUARE, *LOSSES))}.",
-        group="Points that stand out",
+        group="Outliers",
     )
     trim: float = option(
         0.0,
-        "Set at most this share of the points aside, those that stand out.",
+        "Set aside at most this fraction of the points, the largest outliers.",
         metavar="SHARE",
-        group="Points that stand out",
+        group="Outliers",
     )
     hessian: str = option(
         "gauss-newton",

@@ -192,18 +192,18 @@ def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: floa
     """What the reader should know beside the list of suspects."""
     away = int((at.plain.seen & (kept == 0.0)).sum())
     if suspects:
-        yield f"{len(suspects)} of {at.count} points stand out from the fit: {EXPLANATION}"
+        yield f"{len(suspects)} of {at.count} points are outliers: {EXPLANATION}"
     if trim:
         yield f"trim {trim:g}: {away} of {at.count} points are set aside"
-    more = f"trim {trim:g}: {len(suspects) - away} more points stand out"
+    more = f"trim {trim:g}: {len(suspects) - away} more outliers"
     if trim and len(suspects) > away and away == at.most(trim):
-        yield f"{more} and pull at the fit; give a larger share or another loss"
+        yield f"{more} affect the fit; give a larger share or another loss"
     elif trim and len(suspects) > away:
-        yield f"{more}, but not from a fit without them; they stay in it"
+        yield f"{more}, but not in a fit without them; they stay in it"
     names = at.plain.names.all
     lost = ", ".join(names[i] for i in np.flatnonzero(at.plain.active)[untold(at)])
     if lost:
-        yield f"without the points that stand out the poses hardly tell {lost}"
+        yield f"without the outliers the poses hardly determine {lost}"
 
 
 def untold(at: Weighted) -> Array:

@@ -90,7 +90,7 @@ def with_trimmed(data: Measurements, held: Array, solved: Solved, options: Optio
     gone[~held] = (solved.robust.weights == 0.0).T & data.seen[~held]
     why = f"trim {options.trim:g}" if options.trim else f"loss {options.loss}"
     told = options.trim or options.loss != SQUARE
-    return set_aside(data, gone, f"stands out from the fit ({why})", TOOL) if told else data
+    return set_aside(data, gone, f"outlier ({why})", TOOL) if told else data
 
 
 def judged_with(

@@ -323,8 +323,8 @@ def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Arra
 def table_of(suspects: Sequence[Suspect]) -> Table:
     """The list for people."""
     return Table(
-        "points that stand out, 1 % of such a list by chance; they may be real effects",
-        ("line", "target", "distance mm", "score", "by chance", "pose", "of the pose"),
+        "outliers (1 % of the list are false alarms; they may be real effects)",
+        ("line", "target", "distance mm", "score", "p-value", "pose", "of the pose"),
         tuple(
             (s.line, s.target, 1e3 * s.distance, s.score, s.p_value,
              "held out" if s.held else "training", "all targets" if s.together else "")

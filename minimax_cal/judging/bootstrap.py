@@ -109,7 +109,7 @@ class Bootstrap:
             numbers = (self.value[i] - start, self.sigma[i], low - start, high - start)
             rows.append((one.title, unit, *(scale * float(number) for number in numbers)))
         return Table(
-            f"{len(self.change)} calibrations of poses drawn anew: {100.0 * level:g} % intervals",
+            f"{len(self.change)} calibrations of resampled poses: {100.0 * level:g} % intervals",
             ("name", "unit", "value", "sigma", "low", "high"),
             tuple(rows),
             ("", "", *[".5g"] * 4),
@@ -156,7 +156,7 @@ def bootstrap(
     check_seed(seed)
     if fit.objective == "point":
         raise OptionError(
-            "objective point rests on the few worst points, which a bootstrap cannot draw anew; "
+            "objective point depends on the few worst points, which a bootstrap cannot resample; "
             "choose sum, minimax, pose or smr:K"
         )
     draws = draw(fit.group, replicates, np.random.default_rng(seed))

@@ -146,13 +146,13 @@ def beyond(found: Beyond) -> Claim:
         return Claim("outside", nothing, nothing, 0, "", reason=found.reason)
     far = max(found.folds, key=lambda fold: fold.max_mm)
     of = f"; {found.judged} could be judged" if found.judged else ""
-    kept = "; effects not sought anew" if found.sought is False else ""
+    kept = "; with the same effects" if found.sought is False else ""
     return Claim(
         "outside",
         Bound(worst.rms_mm, found.rms_high_mm),
         Bound(far.max_mm, found.max_high_mm),
         worst.poses,
-        f"outside the measured poses, in the worst part that was left out ({worst.where}, "
+        f"outside the measured region, in the worst part that was held out ({worst.where}, "
         f"{worst.poses} poses{of}{kept})",
         open=open_of(found),
         sets=(f"{worst.poses} left out", f"{far.poses} left out"),

@@ -148,9 +148,7 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
         for target, pose in worst
     )
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-    return [
-        f"{data.source}: points that stand out (typical error {1e3 * usual:.3g} mm): {named}{more}"
-    ]
+    return [f"{data.source}: outliers (typical error {1e3 * usual:.3g} mm): {named}{more}"]
 
 
 def check_spread(robot: Robot, data: Measurements) -> None:

@@ -41,7 +41,7 @@ class Poses:
         rows = tuple((name, 100.0 * share) for name, share in self.rejected.items())
         title = f"{self.drawn} candidates of {self.tested} poses drawn"
         if len(self.q) > self.drawn:
-            title += f", and {len(self.q) - self.drawn} near those that told most"
+            title += f", and {len(self.q) - self.drawn} near the best ones"
         return Table(title, ("condition", "rejects alone %"), rows, ("", ".1f"))
 
     def to_dict(self) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def limits_of(
     notices = []
     if went.any():
         notices.append(
-            f"{robot.name} has no limits for some joints: they go where the poses at hand went "
+            f"{robot.name} has no limits for some joints: they get the range of the existing poses "
             f"({', '.join(ranges(robot, lower, upper, went))}); set others with joints="
         )
     if (still := ~known & ~named & ~went).any():

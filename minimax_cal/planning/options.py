@@ -51,7 +51,7 @@ class PlanOptions:
 
     criterion: str = option(
         "I",
-        "What is made small: "
+        "What is minimised: "
         + "; ".join(f"{name}, {said}" for name, said in MEANINGS.items() if name != POWER)
         + ".",
         group="What the poses are for",
@@ -65,8 +65,8 @@ class PlanOptions:
     )
     separate: Sequence[str] = option(
         (),
-        "Choose poses that tell two effects apart instead, as joint_compliance:J2 link_bending:L2.",
-        metavar="EFFECT RIVAL",
+        "Choose poses that distinguish two effects, as joint_compliance:J2 link_bending:L2.",
+        metavar="EFFECT EFFECT",
         values=2,
         group="What the poses are for",
     )

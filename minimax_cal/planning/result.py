@@ -96,7 +96,7 @@ class Plan:
     def headline(self) -> str:
         """The plan in a few sentences."""
         robot, here = self.cell.robot.name, self.here
-        more = f" beside {self.at_hand} at hand" if self.at_hand else ""
+        more = f" in addition to {self.at_hand} existing ones" if self.at_hand else ""
         out = [
             f"{robot}: {self.poses} poses{more}, at least {100.0 * self.efficiency:.1f} % as good "
             f"as the best {self.poses} of {len(self.candidates.q)} candidates.",

@@ -74,7 +74,7 @@ def ground_of(
             raise DataError(f"{own[0].source}: {first.notices[-1]}")
         cells = [first.cell]
         notices.append(
-            "the poses at hand were calibrated first, geometry alone; fit= takes another model"
+            "the existing poses were calibrated first, geometry alone; give fit= for another model"
         )
     if cells:
         if len(options.tracker) or len(options.spots):
@@ -138,7 +138,7 @@ def shown_noise(
         noise = noise_of(cell, measured[0])
         if np.sqrt(noise.variance) > EXACT:
             source = (
-                ", as the poses at hand show them: what the model leaves is in both; give noise= "
+                ", estimated from the existing poses, with the model errors in them; give noise= "
                 "and jitter= where you know them"
             )
             base = Instrument(float(np.sqrt(noise.variance)), 0.0, noise.jitter)

@@ -58,16 +58,16 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
     parts = (
         ("by target", ("target", "points", "RMS mm", "max mm", "mean along the line of sight mm"),
          targets, ("", "d", ".4f", ".4f", "+.4f")),
-        (f"as turns of each joint; by chance, {LEVEL:g} is rare enough",
-         ("joint", "unit", "RMS", "share that its own value explains", "by chance"),
+        (f"as rotations of each joint; p-values below {LEVEL:g} are significant",
+         ("joint", "unit", "RMS", "share that its own value explains", "p-value"),
          joints, ("", "", ".4f", ".2f", ".1g")),
         ("by direction", ("direction", "RMS mm"), directions, ("", ".4f")),
         ("by region", ("region", "from the base axis mm", "to mm", "height from mm", "to mm",
                        "points", "RMS mm"), regions, ("", ".0f", ".0f", ".0f", ".0f", "d", ".4f")),
-        (f"trends; by chance, {LEVEL:g} is rare enough", ("against", "share explained",
-         "by chance"), trends, ("", ".2f", ".1g")),
+        (f"trends; p-values below {LEVEL:g} are significant", ("against", "share explained",
+         "p-value"), trends, ("", ".2f", ".1g")),
     )  # fmt: skip
-    left = [Table(f"what geometry leaves, {by}", *rest) for by, *rest in parts]
+    left = [Table(f"error after geometry, {by}", *rest) for by, *rest in parts]
     shown = tuple(table for table in (triage_table(where["triage"]), *left) if table.rows)
     for table in shown:
         table.cells()  # an entry that is no number is found here, where its file is known
@@ -75,7 +75,7 @@ def where_tables(where: Mapping[str, Any]) -> tuple[Table, ...]:
 
 
 def remainder_table(found: Diagnosis) -> Table:
-    """What the last rung leaves: what follows the pose, and where; what follows nothing known."""
+    """What the last rung leaves: what follows the pose, and where; what random."""
     left, rows = found.remainder, []
     if left:
         ends = zip(("at least", "at most"), left.floor_mm or (), strict=False)
@@ -85,11 +85,11 @@ def remainder_table(found: Diagnosis) -> Table:
                 (f"  of it {in_words(place)}", math.nan, 100.0 * share)
                 for place, share in left.where
             ),
-            ("follows nothing known", left.unpredictable_mm, math.nan),
+            ("random", left.unpredictable_mm, math.nan),
             *((f"noise alone, {name}", end, math.nan) for name, end in ends),
         ]
-    header = ("what remains", "RMS mm", "share %")
-    return Table("what the last rung leaves", header, tuple(rows), ("", ".4f", ".0f"))
+    header = ("part", "RMS mm", "share %")
+    return Table("remaining error", header, tuple(rows), ("", ".4f", ".0f"))
 
 
 def bare_scene() -> Scene:

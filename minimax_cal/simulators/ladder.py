@@ -149,7 +149,7 @@ class Last:
 
 
 class Run:
-    """One ladder in the making: model, poses and fits, and what is to be told."""
+    """One ladder in the making: model, poses and fits, and its notices."""
 
     def __init__(self, given: Given, chain: Chain, causes: Causes, progress: Progress) -> None:
         self.given, self.chain, self.causes, self.progress = given, chain, causes, progress
@@ -175,7 +175,7 @@ class Run:
         stiff = self.rung("servo sag removed", self.of(document), self.nominal)[0]
         fall = first[0].sag_mrad
         return [
-            replace(first[0], why=f"servos give way by up to {fall:.3g} mrad"),
+            replace(first[0], why=f"servos sag by up to {fall:.3g} mrad"),
             replace(stiff, why="gains that hold the arm where it is commanded"),
         ]
 

@@ -63,7 +63,7 @@ class SimulatorGap:
     last of them with its command map, None where nothing is mapped.  floor: what noise alone would
     leave [mm], floor_from: how that is known.  status: of the last fit.  beyond: its claim for
     poses where none was measured, by its own formulas.  left_out: effects that the simulator has no
-    element for.  written: where the last rung's model was written, empty where it was not.
+    element for.  written: where the last step's model was written, empty where it was not.
     """
 
     model: str
@@ -168,11 +168,11 @@ class SimulatorGap:
         typical, worst = (self.beyond.get(key) for key in ("typical_mm", "worst_mm"))
         if typical is not None and worst is not None:
             text += (
-                f". Outside the measured poses its fit claims {typical:.3f} mm, at worst "
+                f". Outside the measured region its fit claims {typical:.3f} mm, at worst "
                 f"{worst:.3f} mm ({self.beyond.get('worst_where')})"
             )
         elif self.beyond.get("narrow"):
-            text += f". Outside the measured poses nothing is claimed: {self.beyond['reason']}"
+            text += f". Outside the measured region nothing is claimed: {self.beyond['reason']}"
         return text + "."
 
     def summary(self, width: int = 110) -> str:

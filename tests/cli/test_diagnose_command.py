@@ -30,8 +30,8 @@ def here(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_words_come_first_then_tables(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--seed", 3, "--holdout", 0.3, "--quick", "-o", "gap.json")
+def test_details_are_words_then_tables(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--seed", 3, "--holdout", 0.3, "--quick", "--details", "-o", "gap.json")
     assert run("diagnose", "ur10", "gap.csv", *options) == 0
     out, err = capsys.readouterr()
     found = load_diagnosis("gap.json")
@@ -39,7 +39,13 @@ def test_words_come_first_then_tables(here: Path, capsys: pytest.CaptureFixture[
     assert found.held.sum() == 18  # of 60
     assert " ".join(out.split()).startswith(" ".join(found.headline().split()))
     assert max(map(len, out.splitlines())) <= 110
-    titles = ("step by step", "effects found", "kind of error", "by target", "turns of each joint")
+    titles = (
+        "step by step",
+        "effects found",
+        "kind of error",
+        "by target",
+        "rotations of each joint",
+    )
     places = [out.index(title) for title in titles]
     assert places == sorted(places)
     assert f"{found.ladder[-1].holdout.rms_mm:.4f}" in out

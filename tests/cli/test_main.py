@@ -22,7 +22,7 @@ def csv(tmp_path: Path, noisy: Simulation) -> Path:
 
 
 def test_summary_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("calibrate", "irb2600", csv) == 0
+    assert run("calibrate", "irb2600", csv, "--details") == 0
     out, err = capsys.readouterr()
     for words in (
         "held out, calibrated",
@@ -32,6 +32,30 @@ def test_summary_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> Non
     ):
         assert words in out
     assert "\x1b" not in out + err  # no colour codes into a pipe
+
+
+def test_the_first_screen_is_short_and_narrow(
+    csv: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("calibrate", "irb2600", csv, "-o", csv.with_name("fit.json")) == 0
+    out = capsys.readouterr().out
+    lines = [line.rstrip() for line in out.splitlines()]
+    assert max(map(len, lines)) <= 80
+    assert len(lines) < 40
+    rule = next(i for i, line in enumerate(lines) if "─" in line)
+    rows = lines[rule + 1 :][: lines[rule + 1 :].index("")]
+    assert len(rows) <= 6
+    assert rows[0].startswith("  new poses, nominal")
+    said = " ".join(out.split())
+    fit = mc.load_fit(csv.with_name("fit.json"))
+    assert said.startswith(fit.headline())
+    assert f"{fit.within.after.rms_mm:.3f} mm" in said
+    assert (
+        f"Outside the measured region, each part held out in turn: RMS {fit.beyond.typical_mm:.3f}"
+        in said
+    )
+    assert f"minimax-cal diagnose irb2600 {csv}" in " ".join(lines)
+    assert "--details" in out
 
 
 def test_json_alone_on_stdout(csv: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -232,7 +256,7 @@ def test_a_bootstrap_is_shown_and_saved(
     out = tmp_path / "fit.json"
     arguments = ("calibrate", "irb2600", csv, "--objective", "sum", "--bootstrap")
     assert run(*arguments, "40", "-o", out) == 0
-    assert "calibrations of poses drawn anew" in capsys.readouterr().out
+    assert "calibrations of resampled poses" in capsys.readouterr().out
     found = json.loads(out.read_text())["bootstrap"]
     assert found["replicates"] + found["lost"] == 40
     assert all(row["interval"][0] < row["interval"][1] for row in found["parameters"])

@@ -8,7 +8,7 @@ from conftest import run
 
 import minimax_cal as mc
 from minimax_cal.cli import progress
-from minimax_cal.cli.progress import Stages, stages
+from minimax_cal.cli.progress import Stages, Ticker, stages
 from minimax_cal.ground.stages import Stage, clock, count_stage
 
 
@@ -33,30 +33,41 @@ def test_time_left_is_that_of_the_steps_so_far() -> None:
     now.at += 60.0
     assert told.line(replicate(1)) == "replicate 1 of 10 (1 min 0 s)"
     now.at += 4.0  # two steps took four seconds, eight are left
-    assert told.line(replicate(3)) == "replicate 3 of 10 (1 min 4 s, 16 s left)"
+    assert told.line(replicate(3)) == "replicate 3 of 10 (1 min 4 s, about 16 s left)"
     now.at += 10.0
     first = count_stage("part", 1, 3, " left out: joint 2")
     assert told.line(first) == "part 1 of 3 left out: joint 2 (1 min 14 s)"
-    assert told.line("rung 3 of 9") == "rung 3 of 9 (1 min 14 s)"  # words are never read back
+    assert told.line("step 3 of 9") == "step 3 of 9 (1 min 14 s)"  # words are never read back
     assert clock(125.4) == "2 min 5 s"
 
 
-def test_a_line_after_every_ten_seconds(
+def test_a_line_every_ten_seconds_from_the_first_second(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    now = Hands()
-    monkeypatch.setattr(progress.time, "monotonic", now)
-    monkeypatch.setattr(Stages.__init__, "__defaults__", (now,))
-    with stages(quiet=False) as show:
-        for text in ("start", "geometry", "effects", "ladder"):
-            now.at += 6.0
-            show(text)
+    now, waits = Hands(), list[float]()
+    ticker = Ticker(Stages(now))
+
+    def wait(seconds: float) -> bool:
+        """As an event that is set after three lines; stages begin meanwhile."""
+        waits.append(seconds)
+        now.at += seconds
+        if len(waits) == 2:
+            ticker.show(count_stage("part", 3, 18))
+        return len(waits) > 3
+
+    monkeypatch.setattr(progress, "FIRST", 1.0)  # as it is but for tests
+    ticker.show("geometry")
+    monkeypatch.setattr(ticker.over, "wait", wait)
+    ticker.run()
+    assert waits == [progress.FIRST, 10.0, 10.0, 10.0]
     assert capsys.readouterr().err.splitlines() == [
-        "progress: geometry (12 s)",
-        "progress: ladder (24 s)",
+        "progress: geometry (1 s)",
+        "progress: part 3 of 18 (11 s)",
+        "progress: part 3 of 18 (21 s, about 1 min 20 s left)",
     ]
     with stages(quiet=True) as show:
-        now.at += 60.0
+        show("start")
+    with stages(quiet=False) as show:  # over before the first second
         show("start")
     assert capsys.readouterr().err == ""
 
@@ -93,7 +104,7 @@ def test_help_lists_options_in_parts(capsys: pytest.CaptureFixture[str]) -> None
     assert run("calibrate", "--help") == 0
     out = capsys.readouterr().out
     titles = ("What is fitted:", "How it is solved:", "What is held out:",
-              "Points that stand out:", "Measurements and result:")  # fmt: skip
+              "Outliers:", "Measurements and result:")  # fmt: skip
     places = [out.index(title) for title in titles]
     assert places == sorted(places)
     assert out.index("--cv") > out.index("What is held out:")

@@ -79,7 +79,7 @@ def test_rungs_are_those_of_the_ladder(
     assert len(again.cells) == len(found.cells)
     assert again.nominal is not None
     assert run("evaluate", here / "diagnosis.json", here / "gap.csv", "--rung", 9) == 2
-    assert "has no rung 9; it has 0 (nominal), 1 (geometric)" in capsys.readouterr().err
+    assert "has no step 9; it has 0 (nominal), 1 (geometric)" in capsys.readouterr().err
 
 
 def test_a_diagnosis_that_kept_two_arms_is_read(here: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_diagnosis_that_kept_two_arms_is_read(here: Path) -> None:
     for number in (1, len(content["gap"]["ladder"]) - 1):
         one, other = (open_result(path, number) for path in (old, here / "diagnosis.json"))
         assert_allclose(one.cell.robot.mdh, other.cell.robot.mdh, atol=1e-12)
-    with pytest.raises(mc.CalibrationError, match=r"does not tell the arm of rung 0 \(nominal\)"):
+    with pytest.raises(mc.CalibrationError, match=r"does not hold the arm of step 0 \(nominal\)"):
         mc.evaluate(old, here / "gap.csv", rung=0)
     assert "after" in open_saved(old, nominal="ur10").cells
 

@@ -376,7 +376,7 @@ def test_tables_hold_what_a_hand_reckons() -> None:
     assert found.headline() == (
         "1 of 2 targets corrected, which are off by up to 3.000 mm, 1.000 mrad as commanded; "
         "1 missed, which stay off by up to 0.004 mm, 0.002 mrad. Expect on the arm: held-out RMS "
-        "0.070 mm, outside the measured poses 0.080 mm, at worst 0.100 mm."
+        "0.070 mm, outside the measured region 0.080 mm, at worst 0.100 mm."
     )
     assert found.complaint().startswith("1 of 2 targets are missed: limit at line 3: ")
     told = found.to_dict()

@@ -242,7 +242,7 @@ def test_the_tables_hold_the_numbers_of_people(made: Diagnosis) -> None:
         "outliers all (line 3, 5)", "joint_compliance J3", "backlash J2"]  # fmt: skip
     assert_allclose([row[2] for row in effects.rows], [10.0, 60.0, 30.0])
     assert [row[-1] for row in effects.rows] == [
-        "established", "established, 1.00", "tentative, 0.80"]  # fmt: skip
+        "confirmed", "confirmed, 1.00", "possible, 0.80"]  # fmt: skip
     assert effects.rows[1][3:6] == (0.84, 0.5, "1e-09")
     values = {row[0]: row[3:] for row in made.parameter_table().rows}
     assert_allclose(values["backlash"][:2], (0.03, 0.002))

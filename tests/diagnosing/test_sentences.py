@@ -11,8 +11,7 @@ import pytest
 import minimax_cal as mc
 from minimax_cal.diagnosing.remainder import Remainder
 from minimax_cal.diagnosing.result import VERDICTS, Alternative, Diagnosis, Finding, Step
-from minimax_cal.diagnosing.sentences import REVISIT
-from minimax_cal.diagnosing.sentences import VERDICTS as OPENINGS
+from minimax_cal.diagnosing.sentences import OPENINGS, REVISIT
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.floor import AT_MOST, Floor
@@ -74,17 +73,27 @@ def marked(found: Diagnosis, **more: Any) -> Diagnosis:
 
 def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
     assert set(OPENINGS) == set(VERDICTS)
+    alternative = Alternative("link_bending", "L2", 0.9, 3.0, 1.0)
+    first = replace(found.findings[0], alternatives=(alternative,))
     for verdict in VERDICTS:
-        told = replace(found, verdict=verdict)
-        assert told.headline().startswith(f"Verdict: {verdict.split('_')[0]}"), verdict
-        assert told.summary().startswith(told.headline())
+        changed = replace(found, verdict=verdict)
+        if verdict == "one_of":
+            changed = replace(changed, findings=(first, *found.findings[1:]))
+        assert changed.headline().startswith(OPENINGS[verdict]), verdict
+        assert changed.summary().startswith(changed.headline())
+    minor = replace(found.findings[-1], alternatives=(alternative,))
+    main = replace(found, verdict="one_of", findings=(*found.findings[:-1], minor))
+    assert main.headline().startswith(OPENINGS["named"])  # a minor one alone is ambiguous
 
 
-def test_words_and_tables_stand_in_the_order_of_the_ladder(found: Diagnosis) -> None:
-    causes = next(text for text in found.reasons if text.startswith("Cause"))
-    order = [name.split()[0] for name in LADDER[:3]]
-    places = [causes.index(name) for name in order]
+def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
+    found: Diagnosis,
+) -> None:
+    causes = found.reasons[0]
+    assert causes.startswith("Main causes: joint compliance at joint 2 (")
+    places = [causes.index(f", {share} %") for share in (60, 20, 12)]
     assert places == sorted(places)
+    assert causes.endswith("12 % of the remaining error.")
     assert [row[0] for row in found.effects_table().rows] == list(LADDER)
     assert [row[0] for row in found.parameter_table().rows] == [n.split()[0] for n in LADDER]
     assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]
@@ -97,102 +106,111 @@ def test_the_words_are_short_and_have_no_loose_pronoun(found: Diagnosis) -> None
     for text in found.reasons:
         assert text.split()[0] not in ("It", "They", "Together", "There", "This", "These", "That")
         assert "tell it " not in text
-    small = next(text for text in found.reasons if text.startswith("Small"))
-    assert "gear_error at joint 5" in small
-    assert "backlash at joint 4" in small
+
+
+def test_minor_effects_take_one_line(found: Diagnosis) -> None:
+    (line,) = [text for text in found.reasons if "minor" in text]
+    assert line.startswith("2 minor effects, together (gear error at joint 5; backlash at joint 4)")
+    size = math.sqrt(0.25**2 - 0.24**2 + 0.24**2 - 0.23**2)
+    assert line.endswith(f" {size:.3f} mm.")
+    many = tuple(replace(found.findings[-1], terms=(Term("backlash", f"J{n}"),))
+                 for n in range(1, 7))  # fmt: skip
+    (line,) = [
+        text for text in replace(found, findings=(*found.findings[:3], *many)).reasons
+        if "minor" in text
+    ]  # fmt: skip
+    assert line.startswith("6 minor effects, together ")
+    assert line.endswith("; keep the 3 above, the others gain 0.060 mm.")
 
 
 def test_a_single_cause_is_one(found: Diagnosis) -> None:
     alone = replace(found, findings=found.findings[:1], ladder=found.ladder[:3])
-    assert "Cause: joint_compliance at joint 2 (" in alone.headline()
-    assert "Causes" not in alone.headline()
-    assert "Small" not in alone.headline()
+    assert alone.headline().startswith("Main cause: joint compliance at joint 2 (")
+    assert "minor" not in alone.headline()
 
 
-def test_rivals_stand_at_their_own_place(found: Diagnosis) -> None:
+def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     """Of two causes of a kind only the second has one; the measurement is for the larger share."""
-    rivals = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
+    others = [Alternative("link_bending", f"L{n}", 0.9, 3.0, 1.0, f"measure {n}") for n in (1, 2)]
     large, small = found.findings[:2]
     second = replace(small, terms=(replace(small.term, effect=large.term.effect),),
-                     alternatives=(rivals[0], replace(rivals[0], place="L3")))  # fmt: skip
-    told = replace(found, findings=(large, second), ladder=found.ladder[:4])
-    causes = next(text for text in told.reasons if text.startswith("Cause"))
-    assert "joint_compliance at joint 3 and 2" in causes
-    assert f", {second.at} or else link_bending at link 1 or link_bending at link 3" in causes
-    assert f"{large.at} or else" not in causes
-    both = replace(told, findings=(replace(large, alternatives=(rivals[1],)), second))
+                     alternatives=(others[0], replace(others[0], place="L3")))  # fmt: skip
+    both = replace(found, findings=(large, second), ladder=found.ladder[:4])
+    causes = both.reasons[0]
+    assert "joint compliance at joint 2 and 3" in causes
+    assert (
+        ", or link bending at link 1 (for joint 3) or link bending at link 3 (for joint" in causes
+    )
+    assert "(for joint 2)" not in causes
+    both = replace(both, findings=(replace(large, alternatives=(others[1],)), second))
     text = next(text for text in both.reasons if text.startswith("Next measurement"))
     assert large.share > second.share > 0.0
-    assert text.startswith("Next measurement: measure 2, to tell")
+    assert text.startswith("Next measurement: measure 2, to distinguish")
 
 
-def test_tentative_effects_stand_together_below(found: Diagnosis) -> None:
-    told = marked(found, established={"gear_ripple": False})
-    causes = next(text for text in told.reasons if text.startswith("Cause"))
-    assert "gear_ripple" not in causes
-    assert told.reasons[-1] == "Tentative, and no cause yet: gear_ripple at joint 1."
-    table = told.effects_table()
+def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
+    unsure = marked(found, established={"gear_ripple": False})
+    assert "gear ripple" not in unsure.reasons[0]
+    assert unsure.reasons[-1] == "Possible causes, not confirmed: gear ripple at joint 1."
+    table = unsure.effects_table()
     assert table.header[-1] == "evidence"
-    assert [(row[0], row[-1]) for row in table.rows][-1] == ("gear_ripple J1", "tentative, 0.00")
+    assert [(row[0], row[-1]) for row in table.rows][-1] == ("gear_ripple J1", "possible, 0.00")
 
 
-def test_what_remains_is_told_in_its_parts(found: Diagnosis) -> None:
-    assert not remainder_table(replace(found, remainder=None)).rows  # of a file that tells none
+def test_the_remaining_error_is_given_in_its_parts(found: Diagnosis) -> None:
+    assert not remainder_table(replace(found, remainder=None)).rows  # of a file without it
     left = Remainder(0.2, (("J3", 0.6),), 0.05, (0.02, 0.03))
-    told = replace(found, remainder=left)
-    text = next(text for text in told.reasons if text.startswith("Of what remains"))
-    assert "0.200 mm follow the pose (at joint 3 60 %), 0.050 mm follow nothing known" in text
-    assert [row[1] for row in remainder_table(told).rows if not math.isnan(float(row[1]))] == [
+    parts = replace(found, remainder=left)
+    text = next(text for text in parts.reasons if text.startswith("Remaining error"))
+    assert "0.200 mm depends on the pose (at joint 3 60 %), 0.050 mm looks random" in text
+    assert [row[1] for row in remainder_table(parts).rows if not math.isnan(float(row[1]))] == [
         0.2, 0.05, 0.02, 0.03
     ]  # fmt: skip
-    told = replace(found, remainder=replace(left, predictable_mm=0.0))
-    nothing = "Nothing tells poses left out what remains;"
-    assert any(text.startswith(nothing) for text in told.reasons)
-    told = replace(found, remainder=None)
-    assert not any(text.startswith("Of what remains") for text in told.reasons)
+    parts = replace(found, remainder=replace(left, predictable_mm=0.0))
+    assert any("0.230 mm looks random;" in text for text in parts.reasons)
+    parts = replace(found, remainder=None)
+    assert not any("looks random" in text for text in parts.reasons)
 
 
-def test_what_stands_out_is_left_out_beside(found: Diagnosis) -> None:
+def test_outliers_are_left_out_beside(found: Diagnosis) -> None:
     *before, last = found.ladder
     assert "without" not in found.headline()
-    for count, words in ((19, "the point that stands out"), (17, "3 points that stand out")):
+    for count, words in ((19, "1 outlier"), (17, "3 outliers")):
         sound = replace(scores(0.11), counts=(count,))
-        told = replace(found, ladder=(*before, replace(last, trusted=sound)))
-        assert f"(largest 0.460 mm; 0.110 mm without {words})" in told.headline()
+        changed = replace(found, ladder=(*before, replace(last, trusted=sound)))
+        assert f"(largest 0.460 mm; 0.110 mm without {words})" in changed.headline()
 
 
 def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
-    rivals = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
+    others = (Alternative("link_bending", "L2", 0.9, 3.0, 1.0, WIDER),
               Alternative("base_flex", "frame", 0.9, 3.0, 1.0, "no measurement considered is "
                           "enough: the best raises the power to 2 of the 25 needed"))  # fmt: skip
-    first = replace(found.findings[0], alternatives=rivals)
-    told = replace(found, verdict="one_of", findings=(first, *found.findings[1:]))
-    (text,) = [text for text in told.reasons if text.startswith("Next measurement")]
+    first = replace(found.findings[0], alternatives=others)
+    changed = replace(found, verdict="one_of", findings=(first, *found.findings[1:]))
+    (text,) = [text for text in changed.reasons if text.startswith("Next measurement")]
     assert text == (
-        f"Next measurement: {WIDER}, to tell joint_compliance at joint 2 from link_bending at "
-        "link 2."
+        f"Next measurement: {WIDER}, to distinguish joint compliance at joint 2 from link bending "
+        "at link 2."
     )
-    causes = next(text for text in told.reasons if text.startswith("Cause"))
-    assert "or else base_flex at frame or link_bending at link 2" in causes
-    nothing = replace(told, findings=(replace(first, alternatives=rivals[1:]),))
+    assert "or base flex at frame or link bending at link 2" in changed.reasons[0]
+    nothing = replace(changed, findings=(replace(first, alternatives=others[1:]),))
     said = [text for text in nothing.reasons if text.startswith("Next measurement")]
     assert said == [REVISIT]  # the noise is not known here
 
 
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
-    assert "by chance 1e-07, below 0.005 is no accident" in told.headline()
-    assert told.headline().startswith("Verdict: unknown beside gear_error at joint 3, joint_")
-    assert replace(told, findings=()).headline().startswith("Verdict: unknown. What geometry")
-    assert "0.005 is rare enough" in told.effects_table().title
-    assert "less than the power 25 tells apart" in told.rival_table().title
-    assert " p = " not in told.headline()
+    assert "p = 1e-07, significant below 0.005" in told.headline()
+    assert told.headline().startswith("Unexplained: the error after the causes below is not random")
+    assert replace(told, findings=()).headline().startswith("Unexplained: the error after geometry")
+    assert "below 0.005 are significant" in told.effects_table().title
+    assert "the power is below 25" in told.rival_table().title
     assert "lambda" not in told.summary()
     from minimax_cal.reporting.tables import where_tables
 
     for table in where_tables(found.where):
         assert "p" not in table.header
-        assert ("by chance" in table.header) == ("rare enough" in table.title)
+        assert ("p-value" in table.header) == ("significant" in table.title)
 
 
 def test_people_read_millimetres_and_milliradians_with_two_digits_of_sigma(

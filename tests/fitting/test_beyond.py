@@ -108,7 +108,7 @@ def test_parts_that_effects_alone_need_are_judged_as_a_calibration_of_the_rest_w
         again = mc.calibrate(robot, replace(data, columns=labels), "sum", effects=gear)
         error = again.cell.error(again.data)[:, rows]
         assert_allclose(fold.rms_mm, 1e3 * np.sqrt((error**2).sum(axis=-1).mean()), rtol=0.01)
-    assert "effects not sought anew" in fit.headline()
+    assert "with the same effects" in fit.headline()
     assert fit.within.missed == 0
     assert "40 poses, each judged" in fit.headline()
 
@@ -144,7 +144,7 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot: mc.Robot) -> Non
     found = mc.calibrate(robot, data, "sum", holdout=0.0).beyond
     assert found.missed
     made = len(found.folds) + len(found.missed)
-    assert f"{len(found.folds)} of {made} parts left out in turn" in found.sentence()
+    assert f"{len(found.folds)} of {made} parts held out in turn" in found.sentence()
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
     assert found.to_dict()["not_judged"] == list(found.missed)
     assert found.to_dict()["effects_sought_anew"] is None
@@ -237,7 +237,7 @@ def test_nothing_is_claimed_outside_what_joints_spanned(
         assert f"joint {name[1:]} spans" in content["reason"]
     assert content["plan"] in content["reason"]
     assert content["plan"].startswith("minimax-cal plan ROBOT --poses ")
-    said = "Outside the measured poses nothing is claimed: joint 1 spans"
+    said = "Outside the measured region nothing is claimed: joint 1 spans"
     assert said in fit.headline()
     # the claim inside stays, and is true; fresh poses elsewhere are far worse
     inside = fit.within.after.rms_mm
@@ -269,7 +269,7 @@ def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:
     gap = found.to_dict()["gap"]["beyond"]
     assert gap["worst_mm"] is None
     assert gap["narrow"] == ["J1", "J2", "J3"]
-    assert "Outside the measured poses nothing is claimed: joint 1 spans" in found.headline()
+    assert "Outside the measured region nothing is claimed: joint 1 spans" in found.headline()
     assert mc.Diagnosis.from_dict(found.to_dict()).beyond == found.beyond
 
 

@@ -46,7 +46,7 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     fit = mc.calibrate(robot, data, "sum")
     assert fit.status == "converged"
     assert {one.line for one in fit.suspects if one.held} >= set(data.line[wrong].tolist())
-    assert any("held-out points that stand out" in text for text in fit.notices)
+    assert any("outliers among the held-out points" in text for text in fit.notices)
     assert fit.accuracy["holdout"].rms_mm > 20.0
     clean = mc.calibrate(robot, noisy.data, "sum")
     # the same arm judged by the rows that are left
@@ -54,7 +54,7 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     assert fit.beyond.worst_mm > 20.0  # they judge beyond the measured poses as well
     assert fit.beyond.trusted is not None
     assert_allclose(fit.beyond.trusted.worst_mm, clean.beyond.worst_mm, rtol=0.3)
-    assert "without the points that stand out at worst" in fit.headline()
+    assert "without outliers at worst" in fit.headline()
 
 
 def test_sound_held_out_rows_are_no_suspects(robot: mc.Robot) -> None:

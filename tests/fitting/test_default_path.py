@@ -64,7 +64,7 @@ def test_result_file_and_headline_say_who_answered(
     again = mc.Fit.from_dict(content) if hasattr(mc, "Fit") else type(fit).from_dict(content)
     assert (again.answered, again.work) == (fit.answered, fit.work)
     count = fit.answered["daqp"]
-    assert f"QPs: {count} by daqp ({count - 1} warm-started)" in fit.headline()
+    assert f"QPs: {count} by daqp ({count - 1} warm-started)" in fit.summary()
     assert "QPs" not in mc.calibrate(robot, noisy.data, "sum").headline()
 
 

@@ -588,7 +588,7 @@ def test_a_real_arm_by_lengths_of_its_trackers_points() -> None:
     data = mc.read_measurements(SHARED / "irb120" / "measurements.csv").only(0)
     robot = mc.load_robot(SHARED / "irb120" / "robot.json")
     said = [relative(robot, seen_from(data, kind)).notices for kind in ("wires_3", "wires_1")]
-    weakly = [any("positions are told weakly" in notice for notice in some) for some in said]
+    weakly = [any("positions are poorly determined" in notice for notice in some) for some in said]
     assert weakly == [False, True]
 
 

@@ -221,7 +221,7 @@ def test_an_image_with_other_joints_is_named_whole(cell: Cell) -> None:
     q = data.at.q.copy()
     q[7] += 0.1
     fit = fitted(cell.drawn, replace(data, at=replace(data.at, q=q)), PixelOptions())
-    assert any("whole images stand out" in n and "pose P7 of" in n for n in fit.notices)
+    assert any("whole images are outliers" in n and "pose P7 of" in n for n in fit.notices)
     assert arm_error(cell, fit.robot) < GIVEN_MM
 
 

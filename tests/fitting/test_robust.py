@@ -361,7 +361,7 @@ def test_points_that_stand_out_but_stay_in_are_told() -> None:
     for share in (0.02, 0.05, 0.1, 0.2):
         found = case.robust(trim=share)
         away = int(((found.weights == 0.0) & case.model.seen).sum())
-        told = [note for note in found.notices if "more points stand out" in note]
+        told = [note for note in found.notices if "more outliers" in note]
         assert bool(told) == (len(found.suspects) > away)
         assert all(f"{len(found.suspects) - away} more" in note for note in told)
 

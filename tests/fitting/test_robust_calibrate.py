@@ -61,7 +61,7 @@ def test_suspects_reach_table_and_json(robot: mc.Robot) -> None:
     for row, one in zip(content["suspects"], fit.suspects, strict=True):
         assert {"line", "target", "distance_mm", "score"} <= set(row)
         assert row["distance_mm"] == pytest.approx(1e3 * one.distance)
-    assert any("stand out" in table.title for table in fit.tables())
+    assert any("outliers" in table.title for table in fit.tables())
     assert (fit.weights == 0.0).sum() == 9
     # the points that decide are named among those that were kept
     assert (fit.weights > 0.0).sum() == 171

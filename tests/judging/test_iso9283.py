@@ -433,7 +433,7 @@ def test_conditions_say_what_the_data_tell(cell: mc.Cell) -> None:
     assert told["6.3"] == "temperature 20.5 to 22 C"
     assert told["6.6"] == "payload 5 kg"
     assert told["6.5"] == "u95 0.02 mm"
-    assert told["6.7"] == "not told"
+    assert told["6.7"] == "not given"
 
 
 @pytest.mark.parametrize(

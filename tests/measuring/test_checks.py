@@ -118,10 +118,10 @@ def test_an_outlier_is_named_wherever_it_is(robot: mc.Robot, noisy: Simulation) 
     for seed in range(3):
         fit = mc.calibrate(robot, noisy.data.with_y(y), seed=seed)
         assert any(
-            "stand out" in note and f"line {noisy.data.line[30]} smr2" in note
+            "outliers" in note and f"line {noisy.data.line[30]} smr2" in note
             for note in fit.notices
         )
-    assert not any("stand out" in note for note in mc.calibrate(robot, noisy.data).notices)
+    assert not any("outliers" in note for note in mc.calibrate(robot, noisy.data).notices)
 
 
 def test_another_robot_is_doubted(noisy: Simulation) -> None:

@@ -105,7 +105,7 @@ def test_the_page_says_which_model_is_signed(results: Path, whole: Path) -> None
     assert any(title == "Model: geometry, joint compliance" for title in both.tables)
     assert "Signed is the calibration" not in both.text["verdict"]
     # all that these data tell of the noise is that it is no larger than what the model leaves
-    assert "that follows nothing known; noise alone would leave at most" in both.text["verdict"]
+    assert "that looks random; measurement noise is at most" in both.text["verdict"]
     # parameters of effects stand once: with the fit if it has them
     assert "parameters of the effects" in plain.tables
     assert "parameters of the effects" not in both.tables
@@ -139,12 +139,12 @@ def test_a_floor_that_is_an_upper_bound_is_no_cause(results: Path) -> None:
     assert (sure.certain, open_.certain) == (True, False)
     near = 0.05
     assert left_now(replace(gap, floor=sure), near) == (
-        "the noise of the measurements, which alone leaves 0.043\N{NO-BREAK SPACE}mm."
+        "measurement noise (0.043\N{NO-BREAK SPACE}mm)."
     )
     told = left_now(replace(gap, floor=open_, remainder=rest), near)
-    assert told.startswith("a remainder that no known effect explains (0.026")
+    assert told.startswith("a remaining error that no known effect explains (0.026")
     assert "at most 0.043" in told
-    assert "do not tell how much it is" in told
+    assert "no pose was measured twice" in told
 
 
 def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
@@ -154,9 +154,9 @@ def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
         found = rows(rendered(wording, results / "gap.json"))["RMS, inside measured poses"]
         assert found[0] == f"{step.holdout.poses} held out"
         assert found[2] == f"{step.holdout.rms_mm:.3f}"
-    with pytest.raises(mc.OptionError, match="no rung 7"):
+    with pytest.raises(mc.OptionError, match="no step 7"):
         mc.report(gap, tmp_path / "a.html", rung=7)
-    with pytest.raises(mc.OptionError, match="only a report of a diagnosis alone has rungs"):
+    with pytest.raises(mc.OptionError, match="only a report of a diagnosis alone has steps"):
         mc.report(results / "fit.json", tmp_path / "a.html", rung=1)
 
 

@@ -199,7 +199,7 @@ def test_parameters_are_those_of_the_file(fit: dict[str, Any], seen: Seen) -> No
 def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
     for reason in gap["reasons"]:
         assert reason in seen.text["diagnosis"]
-    ladder = table_of(seen, "the gap, step by step")[1:]
+    ladder = table_of(seen, "error budget, step by step")[1:]
     assert [row[0] for row in ladder[:-1]] == [r["step"] for r in gap["gap"]["ladder"]]
     for row, rung in zip(ladder, gap["gap"]["ladder"], strict=False):
         numbers = [rung[p][k] for p in ("train", "holdout") for k in ("rms_mm", "max_mm")]
@@ -210,7 +210,7 @@ def test_diagnosis_is_that_of_the_file(gap: dict[str, Any], seen: Seen) -> None:
     assert [row[3:5] for row in effects] == [
         [f"{e['holdout_rms_mm'][k]:.4f}" for k in ("before", "after")] for e in gap["effects"]
     ]
-    regions = seen.tables["what geometry leaves, by region"][1:]
+    regions = seen.tables["error after geometry, by region"][1:]
     assert [row[-1] for row in regions] == [
         f"{cell['rms_mm']:.4f}" for cell in gap["where"]["by_region"]["cells"]
     ]
@@ -269,9 +269,9 @@ def test_what_later_files_tell_is_shown(
     assert [row[0], *row[2:4], *row[5:]] == ["calibrated", "0.1110", "0.2220", "0.2220", "-"]
     assert "95 % interval 0.111 to 0.222\N{NO-BREAK SPACE}mm;" in seen.text["accuracy"]
     assert seen.tables["Strongest correlations"][1] == ["a1", "theta2", "+0.500"]
-    assert seen.tables[
-        "points that stand out, 1 % of such a list by chance; they may be real effects"
-    ][1][:4] == ["7", "smr2", "1.5000", "9.2"]
+    assert seen.tables["outliers (1 % of the list are false alarms; they may be real effects)"][1][
+        :4
+    ] == ["7", "smr2", "1.5000", "9.2"]
 
 
 @pytest.mark.parametrize(("given", "lacking"), [("fit.json", "gap"), ("gap.json", "parameters")])

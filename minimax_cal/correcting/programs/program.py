@@ -99,8 +99,8 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
         raise DataError(f"{path}: holds over {MOST} points; split it")
     for line, name in language.displacements(text):
         raise DataError(
-            f"{path}:{line}: {name} displaces the points after it, so that nobody knows where they "
-            "are; correct programs whose points are not displaced"
+            f"{path}:{line}: {name} displaces the points after it, so their positions are not "
+            "known; remove it, or correct a program without displaced points"
         )
     known, given = language.frames(text), {"tool": tool, "wobj": work}
     check_frames_stay(language, text, points, given)
@@ -131,8 +131,8 @@ def check_frames_stay(
     for line, kind, name, part in language.changes(text):
         if (kind, name.lower()) in used:
             raise DataError(
-                f"{text.source}:{line}: the run writes {part}, so that nobody knows where the "
-                f"points are; correct programs whose {WORDS[kind]} stays"
+                f"{text.source}:{line}: the program changes {part}, so the positions of its points "
+                f"are not known; correct a program whose {WORDS[kind]} stays the same"
             )
 
 

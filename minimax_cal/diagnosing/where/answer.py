@@ -199,5 +199,5 @@ def triage_table(triage: Mapping[str, Any]) -> Table:
         (cause, *(number((triage[kind] or nothing).get(key)) for key in ("rms_mm", "share", "p")))
         for kind, cause in causes.items()
     )
-    title = "kind of error; by chance, 0.01 is rare enough"
-    return Table(title, ("kind", "RMS mm", "share", "by chance"), rows, ("", ".4f", ".3f", ".2g"))
+    title = "kind of error; p-values below 0.01 are significant"
+    return Table(title, ("kind", "RMS mm", "share", "p-value"), rows, ("", ".4f", ".3f", ".2g"))

@@ -166,7 +166,7 @@ def errors_of(
 
 def notices_of(fitted: PoseFit) -> tuple[str, ...]:
     """Those of `calibrate`, but for what is said of poses instead."""
-    again = ("points that stand out", "no pose is held out")
+    again = ("outliers", "no pose is held out")
     return tuple(told for told in fitted.fit.notices if not any(words in told for words in again))
 
 

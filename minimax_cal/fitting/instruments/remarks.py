@@ -83,10 +83,10 @@ def weak(result: RelativeCalibration) -> tuple[str, ...]:
     ]
     if expected_mm <= WEAK * rms_mm and not untold:
         return ()
-    where = f" ({', '.join(untold)} not told at all)" if untold else ""
+    where = f" ({', '.join(untold)} not at all)" if untold else ""
     more = "more sockets, farther apart" if result.kind == "closures" else "more anchors, around it"
     return (
-        f"positions are told weakly{where}: by the sigmas they are good to {expected_mm:.3g} mm, "
+        f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
         f"turn the flange more from pose to pose, and measure with {more}",
     )

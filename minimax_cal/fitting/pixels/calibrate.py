@@ -328,7 +328,7 @@ def set_aside(data: PixelData, rows: Array) -> tuple[SetAside, ...]:
             row=int(data.line[row]),
             pose=int(data.pose[row]) + 1,
             target=data.targets[data.target[row]],
-            why="the pixel stands out from all others",
+            why="the pixel is an outlier",
             by=TOOL,
         )
         for row in rows

@@ -85,7 +85,7 @@ def contradiction(robot: Robot, data: PixelData, fit: PixelFit, options: PixelOp
     if miss > GROSS * robot.reach():
         said = f"the calibrated arm misses by {1e3 * miss:.3g} mm at the target"
     elif aside > MOST_ASIDE:
-        said = f"{100 * aside:.0f} % of the pixels stand out from the rest"
+        said = f"{100 * aside:.0f} % of the pixels are outliers"
     if said:
         return (
             f"{said}: check that joints, detections, board and camera files belong together, and "
@@ -182,7 +182,7 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
         )
         more = f" and {len(first) - LISTED} more" if len(first) > LISTED else ""
         out.append(
-            f"{data.source}: {len(first)} whole images stand out and are set aside: {named}{more}; "
+            f"{data.source}: {len(first)} whole images are outliers and are set aside: {named}{more}; "
             "are the joint values those of the image?"
         )
     if len(single):

@@ -402,7 +402,7 @@ def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], 
         column = data.columns.get(stem, np.zeros(0)).astype(float)
         known = scale * column[np.isfinite(column)]
         if not len(known):
-            return "not told"
+            return "not given"
         return f"{stem} {between(known)} {unit}"
 
     cycles = f"{between(often)} visits; {CYCLES} or more at {enough} of {poses} poses"
@@ -413,7 +413,7 @@ def conditions(data: Measurements, stops: Stops) -> tuple[tuple[str, str, str], 
         ("6.5", "uncertainty of the instrument at most a quarter of a value",
          told("u95", 1e3, "mm")),
         ("6.6", "rated load on the flange", told("payload", 1.0, "kg")),
-        ("6.7", "stated velocities, up to the rated one", "not told"),
+        ("6.7", "stated velocities, up to the rated one", "not given"),
         ("6.8", "five poses on a plane in a cube of the workspace", f"{poses} poses, anywhere"),
         ("6.9", f"{CYCLES} cycles", cycles),
     )  # fmt: skip

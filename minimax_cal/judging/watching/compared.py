@@ -83,9 +83,9 @@ class Comparison:
 
     def tables(self) -> tuple[Table, ...]:
         """Which joints changed, accuracy on common poses, every parameter."""
-        changed = moved_table("what explains the differences", self.changed)
+        changed = moved_table("parameters that explain the differences", self.changed)
         common = Table(
-            "the same poses, base and reflectors placed anew",
+            "the same poses; base and reflectors may have moved",
             ("poses", "count", "A RMS mm", "A max mm", "B RMS mm", "B max mm"),
             tuple(
                 (where, one.poses, one.rms_mm, one.max_mm, other.rms_mm, other.max_mm)

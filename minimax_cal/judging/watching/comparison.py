@@ -40,7 +40,7 @@ def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     """What differs between two calibrations of an arm.
 
     a, b: calibrations with their covariance, or their files, the earlier first.  Instrument and
-    reflectors may stand anew.  Raises CalibrationError for wrong input.
+    reflectors may have moved.  Raises CalibrationError for wrong input.
 
     >>> print(mc.compare("may.json", "june.json").summary())
     """

@@ -55,7 +55,7 @@ def check(
     fit: a calibration with its covariance, or its file.  data: new measurements.  tolerance: what
     is required of the error, in mm, as "rms 0.2, max 0.5".  known: what is where it was at the
     calibration: frame (the instrument), targets (the reflectors); reflectors on the foot, columns
-    base1_x_mm ... of both, tell the frame too.  All else is placed anew.  seed: of samples behind
+    base1_x_mm ... of both, fix the frame too.  All else is fitted again.  seed: of samples behind
     the intervals.  simulated: the new points may be exact.  Raises CalibrationError for wrong
     input.
 

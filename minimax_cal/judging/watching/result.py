@@ -119,7 +119,7 @@ class Health:
     def tables(self) -> tuple[Table, ...]:
         """What was required, what moved, what could have been found."""
         required = Table(
-            f"required of {self.robot}, placed anew on {self.poses} poses",
+            f"required of {self.robot}; base and reflectors fitted to {self.poses} poses",
             ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
             tuple(
                 (KINDS[v.limit.kind], v.limit.size_mm, v.value_mm, v.low_mm, v.high_mm,
@@ -139,8 +139,8 @@ class Health:
             ("", "", ".3f"),
         )
         hidden = Table(
-            "not told by these data",
-            ("zero position", "moves all like", "told by"),
+            "joints that these data cannot check",
+            ("zero position", "looks like", "measure"),
             tuple((h.parameter, h.like, h.needs) for h in self.hidden),
         )
         return tuple(table for table in (required, moved, found, hidden) if table.rows)

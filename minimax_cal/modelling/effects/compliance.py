@@ -239,7 +239,7 @@ def crossed(scene: Scene, place: str, choice: Choice) -> Columns:
 
 CROSS_COMPLIANCE = Effect(
     "cross_compliance",
-    "a joint gives way to the load of its neighbour",
+    "a joint is compliant under the load of its neighbour",
     "dq_j = c tau_i(q), i next to j",
     lambda scene: (
         tuple(f"J{j + 1}" for j in turning(scene) if neighbours(scene, f"J{j + 1}"))

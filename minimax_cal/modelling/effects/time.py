@@ -191,7 +191,7 @@ def reseats(scene: Scene, place: str) -> Sequence[Choice]:
 
 TARGET_RESEAT = Effect(
     "target_reseat",
-    "the plate of the reflectors, or all of them, seated anew",
+    "the plate of the reflectors, or all of them, re-seated",
     "all targets sit elsewhere on the flange after row k, or from a session on",
     lambda scene: ("all",) if can_change(scene) else (),
     plate,
@@ -221,7 +221,7 @@ def jump(scene: Scene, place: str, choice: Choice) -> Columns:
 
 SESSION_JUMP = Effect(
     "session_jump",
-    "instrument or robot was set up anew",
+    "instrument or robot was moved",
     "the base stands elsewhere by (t, r) after row k, or in a further session",
     lambda scene: ("frame",) if scene.has("clock") else (),
     jump,

@@ -105,7 +105,7 @@ def fleet(
     path: a TOML file with ``[[cells]]``, each with name, robot and data, or fit and check, and what
     ``[defaults]`` gives all; files are named from its folder.  out: folder for each cell's
     calibration.  page: of the overview, HTML.  processes: on this machine, -1 for one a core.
-    cluster: address of a Dask scheduler instead.  progress: told of each cell.  Raises
+    cluster: address of a Dask scheduler instead.  progress: called for each cell.  Raises
     CalibrationError for what is wrong with the file itself.
 
     >>> print(mc.fleet("cells.toml", page="fleet.html").summary())

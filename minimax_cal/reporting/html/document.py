@@ -49,8 +49,8 @@ SECTIONS = (  # name, title, what it holds
     ("iso9283", "Values by the formulas of ISO 9283", of_fit(fit_sections.iso_values)),
     ("solution", "How the fit was found", of_fit(fit_sections.solution)),
     ("diagnosis", "Diagnosis", of_gap(gap_verdict)),
-    ("gap", "The gap, step by step", of_gap(gap_sections.gap_steps)),
-    ("causes", "Causes, and their rivals", gap_sections.causes_of),
+    ("gap", "Error budget, step by step", of_gap(gap_sections.gap_steps)),
+    ("causes", "Causes and alternatives", gap_sections.causes_of),
     ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
     ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
     ("simulator", "The arm in the simulator", simulator_section.blocks),
@@ -96,7 +96,7 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
     facts = [("Robot", sources.robot), *told_facts(wording.facts, data)]
     facts += [("Customer", visible(wording.customer))] if wording.customer else []
     facts += [("Date of this report", wording.date), ("Poses", counted(sources))]
-    facts += [("Measurements", told.data or "not named")]
+    facts += [("Measurements", file_name(told.data) or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
     parts = WITHOUT_COORDINATES if sources.relative else SECTIONS
     sections = (
@@ -114,6 +114,11 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
         sections=(first, *sections, provenance_section(sources)),
         digest=told.data_sha256 if HEX.fullmatch(told.data_sha256) else "",
     )
+
+
+def file_name(path: str) -> str:
+    """A file without the folders of the machine; several are joined by commas."""
+    return ", ".join(re.split(r"[/\\]", visible(part).strip())[-1] for part in path.split(","))
 
 
 def signers(author: str, customer: str) -> tuple[tuple[str, str], ...]:
@@ -148,9 +153,11 @@ def provenance_section(sources: Sources) -> Section:
     settings: list[Table] = []
     notices: list[Block] = []
     for kind, result in named(sources):
-        files += [(f.kind, visible(f.path), f.digest) for f in sources.files if f.kind == kind]
+        files += [(f.kind, file_name(f.path), f.digest) for f in sources.files if f.kind == kind]
         told = result.provenance
-        if (row := ("measurements", told.data, told.data_sha256 or "not recorded")) not in files:
+        if (
+            row := ("measurements", file_name(told.data), told.data_sha256 or "not recorded")
+        ) not in files:
             files.append(row)
         settings.append(settings_table(f"Settings of the {kind}", told.settings))
         settings.append(Table(f"Versions used by the {kind}", ("package", "version"),

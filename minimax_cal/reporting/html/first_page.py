@@ -134,7 +134,7 @@ def signed(
     reaches what it says.  Raises OptionError.
     """
     if rung is not None and not (sources.gap and not sources.fit):
-        raise OptionError("rung: only a report of a diagnosis alone has rungs")
+        raise OptionError("step: only a report of a diagnosis alone has steps")
     if sources.fit:
         model, claims = model_of(sources.fit), claims_of(sources.fit)
     elif sources.gap:
@@ -245,7 +245,7 @@ def claims_at(gap: Diagnosis, rung: int | None) -> tuple[str, tuple[Claim, ...]]
     last = len(rungs) - 1
     if rung is not None and not 0 <= rung <= last:
         names = ", ".join(f"{i} ({name})" for i, (name, _) in enumerate(rungs)) or "the last alone"
-        raise OptionError(f"the diagnosis has no rung {rung}; it has {names}")
+        raise OptionError(f"the diagnosis has no step {rung}; it has {names}")
     at = last if rung is None else rung
     step = gap.ladder[0] if rungs and at == 0 else gap.ladder[len(gap.ladder) - 1 - (last - at)]
     if rungs and gap.data.poses:
@@ -285,17 +285,18 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
     banner = found.sentence[:1].upper() + found.sentence[1:] if found.verdict else NO_LIMIT
     kind = kind if found.sentence == found.verdict else "unstated"
+    alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed
     lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
-    lines += [Note(f"{said}.", "warning") for said in found.besides]
-    lines += [Note(f"{aside_of(found)}.", "warning")] if found.set_aside else []
     lines += [text(found.holds_for)] if found.row else []
     lines += [result_table(sources, found), text(basis(found))]
+    lines += [Note(f"{said}.", alarm) for said in found.besides]
+    lines += [Note(f"{aside_of(found)}.", alarm)] if found.set_aside else []
     lines += [delivered_table(found.rows)] if found.rows else []
     lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
     if limiting := limits_now(sources, found):
         lines.append(text(f"What limits it now: {limiting}"))
     lines += [text(which) for which in which_is_which(sources, found)]
-    lines += [Note(notice, "warning") for notice in sources.notices]
+    lines += [Note(notice, alarm) for notice in sources.notices]
     lines += fit_warnings(sources.fit) if sources.fit else ()
     lines += trouble(sources.gap.status, "") if sources.gap and not sources.fit else ()
     return tuple(lines)
@@ -352,7 +353,7 @@ def basis(found: Signed) -> str:
     out = f"Inside the measured poses: on {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
-        out += f"Outside: {away.where.removeprefix('outside the measured poses, in ')}. "
+        out += f"Outside: {away.where.removeprefix('outside the measured region, in ')}. "
     elif away:
         out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
@@ -391,7 +392,7 @@ def limits_now(sources: Sources, found: Signed) -> str:
             return few[0].removeprefix("too few poses: ") + "."
         return (
             f"what {model_of(sources.fit)} leaves, {number(left)} RMS; a diagnosis of the same "
-            "measurements tells its cause."
+            "measurements finds its cause."
         )
     return ""
 
@@ -403,20 +404,20 @@ def left_now(gap: Diagnosis, left: float) -> str:
     """
     floor, rest = gap.floor, gap.remainder
     if floor.certain and left <= NEAR_NOISE * floor.value:
-        return f"the noise of the measurements, which alone leaves {number(floor.value)}."
-    noise = f"noise alone would leave {'' if floor.certain else 'at most '}{number(floor.value)}"
+        return f"measurement noise ({number(floor.value)})."
+    noise = f"measurement noise is {'' if floor.certain else 'at most '}{number(floor.value)}"
     if not floor.certain:
-        noise += ", and these data do not tell how much it is"
+        noise += " (from the residuals: no pose was measured twice)"
     if rest and not rest.predictable_mm < NOTHING_MM:
-        known = f"{number(rest.predictable_mm)} of it follow the pose"
-        return f"a remainder that no known effect explains ({known}); {noise}."
+        known = f"{number(rest.predictable_mm)} of it depend on the pose"
+        return f"a remaining error that no known effect explains ({known}); {noise}."
     if rest and not floor.certain:
-        return f"a remainder of {number(left)} that follows nothing known; {noise}."
-    return f"a remainder that no known effect explains; {noise}."
+        return f"a remaining error of {number(left)} that looks random; {noise}."
+    return f"a remaining error that no known effect explains; {noise}."
 
 
 def causes(gap: Diagnosis) -> list[Finding]:
-    """The effects that the diagnosis holds for established, the largest first."""
+    """The confirmed effects, the largest first."""
     return [f for f in gap.findings if f.established and not f.rows]
 
 

@@ -56,14 +56,14 @@ def causes(gap: Diagnosis, *, parameters: bool) -> Blocks:
         blocks.append(rivals)
         blocks.append(
             text(
-                "Likeness is how much of the named effect's motion the rival imitates. Power is "
-                "what these data have to tell the two apart; a measurement is proposed where one "
-                "helps."
+                "Similarity: the fraction of the effect's motion that the alternative reproduces. "
+                "Power: how well these data distinguish the two. A measurement is proposed where "
+                "one helps."
             )
         )
     elif gap.findings:
-        blocks.append(text("No rival explains the effects as well: nothing is to be measured to "
-                           "tell them apart."))  # fmt: skip
+        blocks.append(text("No alternative explains the effects as well; no further measurement is "
+                           "needed to distinguish them."))  # fmt: skip
     if not gap.curves:
         blocks.append(missing("The file holds no curves to draw."))
     return blocks
