@@ -182,7 +182,7 @@ def outlier_notices(data: PixelData, rows: Array) -> list[str]:
         )
         more = f" and {len(first) - LISTED} more" if len(first) > LISTED else ""
         out.append(
-            f"{data.source}: {len(first)} whole images are outliers and are set aside: {named}{more}; "
+            f"{data.source}: {len(first)} whole images are outliers, set aside: {named}{more}; "
             "are the joint values those of the image?"
         )
     if len(single):

@@ -27,6 +27,7 @@ NO_FIT = (
     "calibrate` writes as well."
 )
 HEX = re.compile(r"[0-9a-f]{64}")
+FOLDERS = re.compile(r"(?:[A-Za-z]:)?[^,]*[/\\](?=[^/\\,]+\.[A-Za-z]\w*(?:,|$))")  # before a file
 
 
 def of_fit(blocks: Callable[[Fit], Blocks]) -> Callable[[Sources], Blocks]:
@@ -116,9 +117,9 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
     )
 
 
-def file_name(path: str) -> str:
-    """A file without the folders of the machine; several are joined by commas."""
-    return ", ".join(re.split(r"[/\\]", visible(part).strip())[-1] for part in path.split(","))
+def file_name(named: str) -> str:
+    """Files without the folders of the machine; what is no file stays as it is."""
+    return FOLDERS.sub("", visible(named))
 
 
 def signers(author: str, customer: str) -> tuple[tuple[str, str], ...]:
