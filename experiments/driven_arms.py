@@ -6,6 +6,7 @@ it along the same commands.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +31,8 @@ FREQUENCY = 2.0 * np.pi * 4.0  # of the controller [1/s]
 HUB = 1.5  # mass of each joint's motor [kg]
 NOISE_Q, NOISE_TORQUE = 2e-6, 2e-3  # of the log [rad, m]; of the largest torque
 WAVES, SLOWEST_WAVE = 5, 0.1  # of a trajectory, and its lowest frequency [Hz]
-REACH = {False: 1.0, True: 0.1}  # of a trajectory, of a hinge and of a slide [rad, m]
+REACH = {False: 1.5, True: 0.1}  # of a trajectory either side of 0, of a hinge and a slide [rad, m]
+WAVE_SHARE = 1.4  # of the reach, amplitudes together: waves seldom all add up
 SOFT = 0.01  # speed over which friction of the load changes its sign [rad/s, m/s]
 
 
@@ -175,8 +177,12 @@ def commands(arm: DrivenArm, number: int, speed: float) -> Motion:
     n, slides = arm.robot.joints, arm.robot.prismatic
     rate = 2.0 * np.pi * SLOWEST_WAVE * speed * np.arange(1, WAVES + 1)
     reach = np.where(slides, REACH[True], REACH[False])
-    waves = rng.normal(size=(2, WAVES, n)) / np.arange(1, WAVES + 1)[:, None] * reach * 0.6
-    middle = rng.uniform(-0.8, 0.8, n) * reach
+    low, high = np.maximum(arm.robot.lower, -reach), np.minimum(arm.robot.upper, reach)
+    low, high = np.minimum(low, high - 0.5 * reach), np.maximum(high, low + 0.5 * reach)
+    waves = rng.normal(size=(2, WAVES, n)) / np.arange(1, WAVES + 1)[:, None]
+    half = 0.5 * (high - low)
+    waves *= half / np.abs(waves).sum(axis=(0, 1)) * WAVE_SHARE
+    middle = 0.5 * (high + low)
 
     def at(time: Array) -> Array:
         turn = np.outer(time, rate)
@@ -247,6 +253,7 @@ def logged(arm: DrivenArm, numbers: int, seconds: float) -> list[Run]:
 
 def save_model(arm: DrivenArm, folder: Path) -> Path:
     """The file of the model."""
-    path = folder / f"{arm.robot.name.replace(' ', '_')}_{arm.seed}.xml"
+    name = re.sub(r"[^A-Za-z0-9]+", "_", arm.robot.name)
+    path = folder / f"{name}_{arm.seed}.xml"
     path.write_bytes(arm.xml)
     return path

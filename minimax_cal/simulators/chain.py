@@ -85,7 +85,13 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
             f"{source}: its timestep of {step:g} s is too short for an arm to come to rest; give "
             f'<option timestep="..."> of {SHORTEST:g} s or more'
         )
-    joints = joints_of(model, count, source, tip)
+    return chain_along(model, joints_of(model, count, source, tip), source, unknown=unknown)
+
+
+def chain_along(
+    model: Any, joints: tuple[int, ...], source: str, *, unknown: bool = False
+) -> Chain:
+    """The arm of some joints (n,) of a model, by their ids from the foot.  Raises RobotError."""
     seen = as_urdf(model, joints, source)
     down = np.array(model.opt.gravity)
     size = float(np.linalg.norm(down))
@@ -96,7 +102,7 @@ def chain_of(model: Any, count: int, source: str, tip: str = "", *, unknown: boo
         robot = replace(robot, mass=robot.mass * np.nan, com=robot.com * np.nan)
     base = seen.base
     told = told_robot(model, source)
-    if told is not None and told.joints == count:
+    if told is not None and told.joints == len(joints):
         with suppress(OptionError):  # the bodies were moved since: then they count
             place, off = match(told, seen)
             if off < SAME_ROBOT:

@@ -36,6 +36,7 @@ TIME = 0.02  # in which a spring comes to rest [s]
 ROTOR = 0.01  # inertia of a spring itself, of what it carries: parallel hinges need some
 FOOT = 1e-5  # mass of each weight that makes the tool sag, which no joint is to feel [kg]
 ANCHOR = 0.3  # distance of the balancing spring's anchor from joint 2 [m]
+RIGID = 1e-9  # compliance of a joint that nothing but its motor holds [rad/(N m)]
 LARGEST = 1e9  # of a force where one side alone is limited [N m]
 PASSES = 1e-12  # of an actuator's force through a joint that is a spring [N m]
 GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
@@ -106,17 +107,24 @@ def damping(stiffness: Array, inertia: Array) -> Array:
     return np.asarray(TIME * stiffness + 2.0 * np.sqrt(stiffness * inertia))
 
 
-def equip(layout: Layout, arm: Arm) -> None:
-    """Write the elements of an arm into a tree: what bends and plays, and servos that hold it."""
-    servos = choose_servos(arm, layout.drives)
-    compensate_gravity(layout, servos.share)
-    write_servos(layout, arm, servos)
+def equip(layout: Layout, arm: Arm, *, springs: bool = False, driven: bool = True) -> None:
+    """Write the elements of an arm into a tree: what bends and plays, and servos that hold it.
+
+    springs: whether joints that are compliant have springs of their own, whatever their servos: for
+    friction that the servos carry.  driven: whether servos hold the arm; a model whose motors are
+    given torques keeps these, and all its weight.
+    """
+    servos = choose_servos(arm, layout.drives, springs=springs or not driven)
+    if driven:
+        compensate_gravity(layout, servos.share)
+        write_servos(layout, arm, servos)
     flexes(layout, arm, servos)
-    plays(layout, arm, servos.share)
+    plays(layout, arm, servos.share if driven else 1.0)
     bends(layout, arm)
     base(layout, arm)
     own = np.where(servos.sprung, arm.turn, 0.0)
-    balancer(layout, arm, 1.0 / (1.0 / servos.gain + own)[1:2])
+    held = 1.0 / servos.gain if driven else np.full_like(own, RIGID)
+    balancer(layout, arm, 1.0 / (held + own)[1:2])
 
 
 def compensate_gravity(layout: Layout, share: float) -> None:

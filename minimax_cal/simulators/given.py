@@ -211,12 +211,18 @@ def told_masses(chain: Chain, nominal: Robot) -> tuple[Array, Array]:
 
 
 def corrected(
-    given: Given, chain: Chain, nominal: Robot, arm: Arm | None, names: Sequence[str] = ()
+    given: Given,
+    chain: Chain,
+    nominal: Robot,
+    arm: Arm | None,
+    names: Sequence[str] = (),
+    *,
+    driven: bool = True,
 ) -> tuple[Document, tuple[str, ...]]:
     """A copy of the model with an arm in it, and notices.
 
     nominal: the robot that the model is.  arm: None for the nominal one, that nothing bends.
-    names: of the targets that become sites.
+    names: of the targets that become sites.  driven: as in `elements.equip`.
     """
     base, misfit = match(nominal, chain.seen)
     notices = []
@@ -236,7 +242,7 @@ def corrected(
         ours(layout, arm)
     held = stiff(nominal, masses_of(chain.robot, LEAST_MASS))
     arm = in_gravity(arm, chain.gravity) if arm else held
-    equip(layout, arm)
+    equip(layout, arm, driven=driven)
     if names:
         targets(layout, arm, names)
     lengthen_keys(given, tree, chain.model)

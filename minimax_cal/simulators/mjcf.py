@@ -66,8 +66,8 @@ def text_of(tree: ET.Element) -> bytes:
     return bytes(ET.tostring(tree, encoding="utf-8", xml_declaration=True)) + b"\n"
 
 
-def new_tree(arm: Arm, names: Sequence[str]) -> ET.Element:
-    """The whole file.  names: of the targets."""
+def new_tree(arm: Arm, names: Sequence[str], *, springs: bool = False) -> ET.Element:
+    """The whole file.  names: of the targets.  springs: as in `elements.equip`."""
     robot = arm.robot
     root = ET.Element("mujoco", {"model": robot.name})
     root.append(ET.Comment(" written by minimax-cal; world = base of the robot; m, rad "))
@@ -77,7 +77,7 @@ def new_tree(arm: Arm, names: Sequence[str]) -> ET.Element:
     part(custom, "text", name=ROBOT, data=json.dumps(robot.to_dict()))
     layout = skeleton(root, arm)
     part(root, "actuator")
-    equip(layout, arm)
+    equip(layout, arm, springs=springs)
     targets(layout, arm, names)
     return root
 

@@ -71,8 +71,11 @@ class Servos:
     kept: Array
 
 
-def choose_servos(arm: Arm, drives: Drives) -> Servos:
-    """Gains that settle within a rest of 1.5 s, and the share of gravity that makes them exact."""
+def choose_servos(arm: Arm, drives: Drives, *, springs: bool = False) -> Servos:
+    """Gains that settle within a rest of 1.5 s, and the share of gravity that makes them exact.
+
+    springs: whether springs of their own hold what joints give way, and no gain.
+    """
     inertia, torque = loads(arm)
     inertia = np.maximum(inertia, drives.inertia)
     needed = SETTLES**2 * inertia
@@ -85,7 +88,7 @@ def choose_servos(arm: Arm, drives: Drives) -> Servos:
     stiff = np.maximum(ordinary, share * torque * lever / SAG)
     gain = np.where(soft, share / compliance, stiff)
     sprung = np.zeros(len(gain), dtype=bool)
-    if gain.max() > WIDEST * ordinary.max():
+    if springs or gain.max() > WIDEST * ordinary.max():
         share, gain, sprung = 0.0, ordinary, soft
     critical = 2.0 * np.sqrt(gain * inertia)
     kept = np.isclose(gain, drives.gain, rtol=1e-9)

@@ -14,6 +14,7 @@ from minimax_cal.dynamics.regressor import link_parameters
 from tests.conftest import run
 from tests.dynamics.motions import three_joints
 from tests.problems_mjcf import drive_alone
+from tests.simulators.test_mjcf import in_base
 
 mujoco = pytest.importorskip("mujoco", reason="needs mujoco: pip install minimax-cal[mujoco]")
 
@@ -114,7 +115,8 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
     assert gap.to_dict() == content
     assert {e.name for e in gap.elements if e.held_by == "file"} == {
         "friction", "masses", "armature"}  # fmt: skip
-    (beside,) = [e for e in gap.elements if e.held_by == "module"]
+    others = [e for e in gap.elements if e.held_by == "module"]
+    beside = max(others, key=lambda e: max(a / b for a, b in e.worth.values()))
     assert "load" in beside.name
     assert "J2" in beside.attributes
     assert all(after < before for e in gap.elements for before, after in [max(
@@ -162,6 +164,66 @@ def test_torques_write_a_new_file_that_holds_still(made: SimpleNamespace, tmp_pa
     assert reached.limited < 0.01
 
 
+@pytest.mark.slow
+def test_a_static_calibration_goes_into_the_same_file(
+    made: SimpleNamespace, tmp_path: Path
+) -> None:
+    """Compliance in springs of its own, so that friction of the servos does not hold it."""
+    robot, runs = three_joints(), made.logs[-2:]
+    truth = mc.Truth(compliance=3e-6)
+    poses = mc.simulate(robot, 40, seed=3, truth=truth).data
+    fit = mc.calibrate(robot, poses, "sum", effects="joint_compliance:all")
+    (tmp_path / "robot.json").write_text(json.dumps(robot.to_dict()))
+    for model, name in ((tmp_path / "robot.json", "new.xml"), (made.model, "motors.xml")):
+        gap = mc.motion_gap(model, runs, fit=fit, driven=False, write=tmp_path / name)
+        assert [rung.name for rung in gap.rungs[:2]] == ["as given", "calibrated geometry"]
+        found = mujoco.MjModel.from_xml_path(str(tmp_path / name))
+        springs = [j for j in range(found.njnt) if found.joint(j).name.startswith("flex")]
+        assert len(springs) == 2
+        assert (found.jnt_stiffness[springs] < 1e6).all()
+        assert found.dof_frictionloss[0] == pytest.approx(LACKS.friction[0], rel=0.05)
+    assert found.actuator_gainprm[:, 0].max() == 1.0  # motors stay motors
+    q = np.random.default_rng(1).uniform(-1.0, 1.0, (3, 3))
+    reached = drive_alone(tmp_path / "new.xml", q, fit.cell.target_names)
+    wanted = in_base(fit.cell, q)[1:]
+    assert 1e3 * np.linalg.norm(reached.sites - wanted, axis=-1).max() < 0.02
+
+
+@pytest.mark.slow
+def test_logged_commands_drive_the_servos_of_the_model(tmp_path: Path) -> None:
+    """A real arm with the servos of its model, friction and late commands, driven by its log."""
+    robot = three_joints()
+    xml = with_motors(robot).decode().replace("<motor ", '<position kp="2000" kv="200" ')
+    path = tmp_path / "servos.xml"
+    path.write_text(xml)
+    real = mujoco.MjModel.from_xml_path(str(path))
+    real.dof_frictionloss[:] = LACKS.friction
+    arm = DrivenArm(robot, xml.encode(), LACKS, 3, STEP)
+    rows = []
+    for number in range(2):
+        at = commands(arm, number, 0.5 + 0.5 * number)(STEP * np.arange(4000))[0]
+        data = mujoco.MjData(real)
+        data.qpos[:] = at[0]
+        out = np.empty((len(at), 10))
+        for k, wanted in enumerate(at):
+            data.ctrl[:] = wanted
+            q = data.qpos.copy()
+            mujoco.mj_step(real, data)
+            out[k] = np.concatenate([[k * STEP], q, data.qfrc_actuator, wanted])
+        rows.append(out[500::2])
+    header = ["t_s", *(f"q{j}_rad" for j in (1, 2, 3)), *(f"tau{j}_Nm" for j in (1, 2, 3)),
+              *(f"q{j}_cmd_rad" for j in (1, 2, 3))]  # fmt: skip
+    files = []
+    for number, table in enumerate(rows):
+        files.append(tmp_path / f"log{number}.csv")
+        text = "\n".join(",".join(f"{v:.9g}" for v in row) for row in table)
+        files[-1].write_text(",".join(header) + "\n" + text + "\n")
+    gap = mc.motion_gap(path, files)
+    assert gap.drives == "its position servos and the logged commands"
+    first, last = (np.array(r.tracking_rms_mrad) for r in (gap.rungs[0], gap.rungs[-1]))
+    assert (last < 0.1 * first).all()
+
+
 def test_currents_need_drive_gains(made: SimpleNamespace, tmp_path: Path,
                                    capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     log = tmp_path / "currents.csv"
@@ -198,6 +260,14 @@ def about_of(values: dict[str, np.ndarray]) -> np.ndarray:
     mujoco.mju_quat2Mat(out, values["quat"])
     turn = out.reshape(3, 3)
     return turn @ np.diag(values["diaginertia"]) @ turn.T
+
+
+def test_a_body_as_thin_as_a_plate_is_one_that_mujoco_takes() -> None:
+    plate = bodies.of_body(2.0, np.zeros(3), np.diag([0.1, 0.2, 0.3]))  # no height at all
+    values = bodies.inertial(plate)
+    low, middle, high = np.sort(values["diaginertia"])
+    assert low + middle > high
+    assert_allclose(np.sort(values["diaginertia"]), [0.1, 0.2, 0.3], rtol=1e-5)
 
 
 def test_slopes_are_the_derivatives_of_the_links() -> None:

@@ -153,6 +153,7 @@ def inertial(pseudo: Array) -> dict[str, Array]:
     centre = pseudo[:3, 3] / mass
     second = pseudo[:3, :3] - mass * np.outer(centre, centre)
     size, axes = np.linalg.eigh(second)
+    size = np.maximum(size, THINNEST * size.max())  # else rounding makes it thinner than nothing
     axes = axes * np.linalg.det(axes)
     turn = Rotation.from_matrix(transform(axes, np.zeros(3))[:3, :3])
     return {

@@ -32,7 +32,7 @@ from minimax_cal.simulators.motion.module import HELD, installed, module_text
 from minimax_cal.simulators.motion.numbers import Numbers, has_powers
 from minimax_cal.simulators.motion.opened import Opened
 from minimax_cal.simulators.motion.result import MotionRung, WrittenElement
-from minimax_cal.simulators.motion.written import stiffen, unwritten, write_numbers, write_onset
+from minimax_cal.simulators.motion.written import SHORTEST, stiffen, unwritten, write_numbers
 
 ATTRIBUTES = {  # of the elements, in the order in which they are shown
     FRICTION: "frictionloss, damping",
@@ -43,8 +43,6 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     GAIN: "gear, gain",
     DELAY: "delay",
 }
-SETS_IN = (0.0005, 0.002, 0.005, 0.015)  # of the largest speed: where friction may have set in
-EARLIER = 0.01  # fall of the RMS of all rows by which friction sets in where the model has it not
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
 MODULE = 0.01  # the same, for a module beside the file
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
@@ -74,11 +72,6 @@ class Candidate:
         """Mean log RMS of the joints while they move."""
         return mean_log(self.missed.moving)
 
-    @property
-    def whole_score(self) -> float:
-        """The same of all rows, reversals and rest with them."""
-        return mean_log(self.missed.whole)
-
 
 def mean_log(values: Array) -> float:
     """Mean logarithm, in which a joint counts as any other."""
@@ -93,6 +86,7 @@ class Bench:
     opened: Opened
     study: Study
     made: dict[Asked, Candidate] = field(default_factory=dict)
+    followed: dict[Asked, float] = field(default_factory=dict)
 
     def candidate(self, asked: Asked) -> Candidate:
         """The model with what is asked for, fitted to the runs to learn from."""
@@ -105,16 +99,22 @@ class Bench:
             self.made[asked] = Candidate(asked, numbers, opened, missed, text)
         return self.made[asked]
 
+    def tracking(self, one: Candidate) -> float:
+        """Mean log joint error of a candidate under logged commands; 0 where none were logged."""
+        if not self.judge.commanded:
+            return 0.0
+        if one.asked not in self.followed:
+            with installed(one.module, one.opened.chain):
+                off = self.judge.tracking(one.opened.chain, one.numbers)
+            self.followed[one.asked] = mean_log(off)
+        return self.followed[one.asked]
+
     def written(self, numbers: Numbers) -> Opened:
         """The model with numbers in it."""
         document = self.opened.given.document.copy()
         write_numbers(document, self.opened.chain, self.study.given, numbers)
         if self.opened.new:
             stiffen(document.root, self.opened.chain, numbers)
-        found = self.opened.again(document)
-        if not numbers.sets_in.any():
-            return found
-        write_onset(document, found.chain, numbers)
         return self.opened.again(document)
 
     def module(self, opened: Opened, numbers: Numbers) -> str:
@@ -146,6 +146,8 @@ def asked_of(found: MotionDiagnosis, bench: Bench) -> tuple[Asked, tuple[Term, .
     late = found.models[-1].delay + sum(
         float(v[0]) for t, v in zip(terms, found.models[-1].value, strict=True)
         if t.effect == "delay")  # fmt: skip
+    if abs(late) < SHORTEST * float(model.opt.timestep):
+        late = 0.0
     curved = joints(terms, LEVELS) if has_powers(model) else ()
     elements = {FRICTION, MASSES, ARMATURE}
     for name, some in ((CURVE, curved), (SPRINGS, joints(terms, SPRUNG)),
@@ -179,10 +181,7 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
 
 
 def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidate:
-    """All elements and laws: with the masses of all links or of the one that changed.
-
-    Friction sets in as the model has it, unless another speed fits a joint better.
-    """
+    """All elements and laws: with the masses of all links or of the one that changed."""
     if any(term.law.family == SPEED_CURVE for term in laws):
         whole = replace(whole, elements=whole.elements - {CURVE})  # the laws say it better
     whole = replace(whole, laws=laws)
@@ -190,24 +189,7 @@ def first_choice(bench: Bench, whole: Asked, laws: tuple[Term, ...]) -> Candidat
     if whole.link >= 0:
         one = bench.candidate(whole)
         best = one if one.score < best.score + STAYS else best
-    return with_onset(bench, best)
-
-
-def with_onset(bench: Bench, best: Candidate) -> Candidate:
-    """With friction that sets in, joint by joint, where all rows are predicted best."""
-    fastest = bench.judge.arm.fastest
-    every = [np.zeros(len(fastest)), *(share * fastest for share in SETS_IN)]
-    made = [best, *(bench.candidate(at_speeds(best.asked, speeds)) for speeds in every[1:])]
-    missed = np.array([one.missed.whole for one in made])
-    missed[1:] *= 1.0 + EARLIER
-    chosen = np.take_along_axis(np.array(every), missed.argmin(axis=0)[None], axis=0)[0]
-    mixed = bench.candidate(at_speeds(best.asked, chosen)) if chosen.any() else best
-    return mixed if mixed.whole_score < best.whole_score - STAYS else best
-
-
-def at_speeds(asked: Asked, speeds: Array) -> Asked:
-    """The same, with friction that sets in at speeds (n,)."""
-    return replace(asked, sets_in=tuple(map(float, speeds)))
+    return best
 
 
 def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
@@ -220,15 +202,22 @@ def by_elements(bench: Bench, full: Candidate, whole: Asked) -> Candidate:
 
 
 def without_idle(bench: Bench, best: Candidate) -> Candidate:
-    """Without elements and laws that do not make held-out motion better."""
+    """Without elements and laws that do not make held-out motion better.
+
+    Where commands were logged, the joint error under them has a say: what lowers the torque's error
+    alone may be the simulator's own, as a damper that acts within its step.
+    """
     fewer: list[Callable[[Asked], Asked]] = [
         partial(without_law, effect=effect) for effect in effects_of(best.asked.laws)
     ]
     fewer += [partial(Asked.without, element=name) for name in reversed(ATTRIBUTES)
               if name in best.asked.elements]  # fmt: skip
+    fewer.append(lambda asked: asked.without(ARMATURE).without(MASSES))
     for less in fewer:
         bare = bench.candidate(less(best.asked))
-        best = bare if bare.score < best.score + STAYS else best
+        idle = bare.score < best.score + STAYS
+        harms = bench.tracking(bare) < bench.tracking(best) - STAYS
+        best = bare if idle or harms else best
     return best
 
 

@@ -20,7 +20,7 @@ from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, generous
 from minimax_cal.ground.arrays import Array
 from minimax_cal.simulators.chain import Chain, mujoco
-from minimax_cal.simulators.motion.bodies import Bodies, inertial
+from minimax_cal.simulators.motion.bodies import Bodies, inertial, physical
 from minimax_cal.simulators.motion.numbers import POWERS, Numbers, given_numbers
 
 PRIOR = 0.5  # standard deviation of a body's log-Cholesky coordinates about the model's
@@ -32,7 +32,6 @@ STEPS = 60  # of a fit, and trials of a step
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9  # of the normal matrix with a unit diagonal
 CLOSE = 1e-7  # relative fall of the squares that ends a fit
 IMPEDANCES = (1e-4, 0.9999)  # least and largest that MuJoCo takes [mjMINIMP, mjMAXIMP]
-USUAL_TIME = 0.02  # of a constraint, where the speed at which friction sets in is chosen [s]
 LEAST_FRICTION = 1e-6  # of a joint's largest torque: a smaller one has no say
 DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction")  # with its sense
 
@@ -47,8 +46,7 @@ class Asked:
     elements: of those above.  link: the only one whose masses change, -1 for all.
     behind: laws with which masses and armature are fitted first, and kept.
     curved: joints whose damping levels off.  sprung, geared: joints with a spring, or whose drive
-    gain is off.  laws: that no element holds.  sets_in: speed at which friction has set in, of each
-    joint, 0 as the model has it [rad/s, m/s]; empty for all as it has.
+    gain is off.  laws: that no element holds.
     """
 
     elements: frozenset[str]
@@ -58,7 +56,6 @@ class Asked:
     geared: tuple[int, ...] = ()
     laws: tuple[Term, ...] = ()
     behind: tuple[Term, ...] = ()
-    sets_in: tuple[float, ...] = ()
     late: float = 0.0
 
     def without(self, element: str) -> Asked:
@@ -119,9 +116,10 @@ class Study:
 
     def with_masses(self, found: Numbers) -> Study:
         """The same logs, for a model that has masses and armature already."""
-        bodies = replace(self.bodies, drawn=found.bodies)
-        given = self.given.put(bodies=found.bodies, armature=found.armature)
-        scene = self.scene.with_body(of_all(bodies.links(found.bodies)), self.scene.friction)
+        own = np.array([physical(body) for body in found.bodies])
+        bodies = replace(self.bodies, drawn=own)
+        given = self.given.put(bodies=own, armature=found.armature)
+        scene = self.scene.with_body(of_all(bodies.links(own)), self.scene.friction)
         return replace(self, bodies=bodies, given=given, scene=scene)
 
 
@@ -136,8 +134,7 @@ def fit_numbers(study: Study, asked: Asked) -> Numbers:
         whole = replace(asked, laws=asked.behind, behind=())
         study = study.with_masses(fit_numbers(study, whole))
         asked = replace(asked, behind=(), elements=asked.elements - {MASSES, ARMATURE})
-    sets_in = np.array(asked.sets_in or [0.0] * study.given.joints)
-    scene, numbers = study.scene, study.given.put(sets_in=sets_in, fastest=study.scene.arm.fastest)
+    scene, numbers = study.scene, study.given.put(fastest=study.scene.arm.fastest)
     late = asked.late if DELAY in asked.elements else 0.0
     error = study.error(late)
     for _ in range(ROUNDS):
@@ -396,8 +393,7 @@ def sense_of(study: Study, scene: Scene, numbers: Numbers) -> Array:
             amount = (term.columns(sliding) @ value) * scene.divisor[term.joint]
             whole[:, term.joint] = np.maximum(whole[:, term.joint] + amount, least[term.joint])
     stiffness, rate = softness(study.chain, numbers)
-    soft = np.where(numbers.sets_in > 0.0, rate * numbers.sets_in, whole / stiffness)
-    return np.asarray(np.clip((motion.qdd + rate * motion.qd) / soft, -1.0, 1.0))
+    return np.asarray(np.clip(stiffness * (motion.qdd + rate * motion.qd) / whole, -1.0, 1.0))
 
 
 def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
@@ -408,7 +404,6 @@ def softness(chain: Chain, numbers: Numbers) -> tuple[Array, Array]:
     start, end = np.clip(impedance[:, :2].T, *IMPEDANCES)
     time = np.maximum(reference[:, 0], 2.0 * float(model.opt.timestep))
     rate = np.where(reference[:, 0] > 0.0, 2.0 / (end * time), -reference[:, 1] / end)
-    rate = np.where(numbers.sets_in > 0.0, 2.0 / (IMPEDANCES[1] * USUAL_TIME), rate)
     return start / (1.0 - start) / weights(chain, numbers), rate
 
 

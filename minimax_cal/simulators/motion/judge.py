@@ -107,6 +107,11 @@ class Judge:
         served = OWN_SERVOS if own and gains is None else GIVEN_GAINS if gains else TORQUES
         return replace(self, drives=served if commanded else TORQUES, hold=hold)
 
+    @property
+    def commanded(self) -> bool:
+        """Whether logged commands drive the arm."""
+        return self.drives in (OWN_SERVOS, GIVEN_GAINS)
+
     def of_model(self, opened: Opened) -> Judge:
         """The same runs and drives, for another model of the arm."""
         return replace(self, arm=replace(self.arm, robot=in_its_gravity(opened.chain)))

@@ -23,8 +23,7 @@ class Numbers:
     armature: (n,) [kg m^2].  friction: (n,) [N m].  damping: (n, 3) of v, v |v|, v^3.
     stiffness: (n, 3) of x, x^2, x^3, x from rest: (n,) [rad].
     gain: (n,) torque of the log per torque of the joint.  late: by which torques are logged after
-    the motion [s].  sets_in: (n,) speed at which friction has set in, 0 where it is as in
-    the model [rad/s, m/s].
+    the motion [s].
     laws, value: what no element holds, in the unit of the log; fastest, soft: (n,) speeds by which
     these count.
     """
@@ -36,7 +35,6 @@ class Numbers:
     stiffness: Array
     rest: Array
     gain: Array
-    sets_in: Array
     late: float = 0.0
     laws: tuple[Term, ...] = ()
     value: tuple[Array, ...] = ()
@@ -70,7 +68,6 @@ def given_numbers(chain: Chain, bodies: Bodies) -> Numbers:
         stiffness=spring,
         rest=np.array(model.qpos_spring[places]),
         gain=np.ones(len(dofs)),
-        sets_in=np.zeros(len(dofs)),
     )
 
 

@@ -12,7 +12,7 @@ from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.robots.urdf import is_urdf
 from minimax_cal.simulators.arm import arm_of, assumed
-from minimax_cal.simulators.chain import Chain, chain_of, mujoco
+from minimax_cal.simulators.chain import Chain, chain_along, chain_of, mujoco
 from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.given import (
     Given,
@@ -40,6 +40,13 @@ class Opened:
         given = replace(self.given, document=document)
         model = given.compiled()
         return replace(self, given=given, chain=self.chain_in(model))
+
+    def rebuilt(self, given: Given) -> Opened:
+        """The arm of the same joints, whose bodies may stand elsewhere."""
+        model = given.compiled()
+        joints = tuple(int(model.joint(name).id) for name in self.chain.names)
+        chain = chain_along(model, joints, given.source, unknown=given.assumed)
+        return replace(self, given=given, chain=chain)
 
     def chain_in(self, model: Any) -> Chain:
         """The same joints in another compiled model."""
@@ -80,18 +87,20 @@ def calibrated(opened: Opened, fit: Fit) -> tuple[Opened, tuple[str, ...]]:
     names = fit.cell.target_names
     if opened.new:
         arm = arm_of(fit.cell, fit.train.q, masses_of(fit.cell.robot, LEAST_MASS))
-        document = Document(new_tree(arm, names))
+        document = Document(new_tree(arm, names, springs=True))
         weigh_drawn(document.root, fit.cell.robot)
         given = replace(opened.given, document=document)
-        chain = chain_of(given.compiled(), fit.cell.robot.joints, given.source)
-        return Opened(given, chain, new=True), ()
+        return opened.rebuilt(given), ()
     nominal = fit.before.robot
     own = None if assumed(opened.chain.robot) else told_masses(opened.chain, nominal)
     arm = arm_of(fit.cell, fit.train.q, own)
-    document, notices = corrected(opened.given, opened.chain, nominal, arm, names)
-    given = replace(opened.given, document=document)
-    chain = chain_of(given.compiled(), opened.chain.robot.joints, given.source)
-    return Opened(given, chain, new=False), notices
+    driven = any(opened.chain.servo(joint) >= 0 for joint in opened.chain.joints)
+    document, notices = corrected(opened.given, opened.chain, nominal, arm, names, driven=driven)
+    if not driven and (arm.gain.any() or arm.coupled):
+        notices += (
+            "not in the model: encoder gains and couplings, which only position servos hold",
+        )
+    return opened.rebuilt(replace(opened.given, document=document)), notices
 
 
 def in_its_gravity(chain: Chain) -> Robot:

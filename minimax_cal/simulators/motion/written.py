@@ -19,14 +19,12 @@ from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.elements import known, numbers, section, tune
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
-from minimax_cal.simulators.motion.fit import IMPEDANCES, USUAL_TIME, weights
 from minimax_cal.simulators.motion.numbers import Numbers
 from minimax_cal.simulators.servos import STEPS, carried
 
 SAME = 1e-12  # relative change of a number that is none
 TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
-NARROW = 1e-3  # width of an impedance: friction has no distance to grow with [rad, m]
 HISTORY = 2  # samples of a delayed signal beyond those of the delay
 SHORTEST = 0.5  # of a timestep: a shorter delay is none
 
@@ -47,20 +45,6 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
             joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
     write_gains(document.root, chain, found)
     write_delay(document.root, chain, found)
-
-
-def write_onset(document: Document, chain: Chain, found: Numbers) -> None:
-    """Let friction set in at a speed.  chain: of the model with all else in it.
-
-    MuJoCo's friction is D b qd up to its largest, with D = d / (1 - d) / weight of the impedance d.
-    """
-    joints, _ = elements_of(document.root, chain)
-    rate, weight = 2.0 / (IMPEDANCES[1] * USUAL_TIME), weights(chain, found)
-    for i in np.flatnonzero((found.sets_in > 0.0) & (found.friction > 0.0)):
-        size = found.friction[i] * weight[i] / (rate * found.sets_in[i])
-        impedance = np.clip(size / (1.0 + size), *IMPEDANCES)
-        joints[i].set("solreffriction", numbers([USUAL_TIME, 1.0]))
-        joints[i].set("solimpfriction", numbers([impedance, IMPEDANCES[1], NARROW]))
 
 
 def elements_of(root: ET.Element, chain: Chain) -> tuple[list[ET.Element], list[ET.Element]]:
