@@ -125,6 +125,16 @@ def test_the_ladder_says_so(made: SimpleNamespace) -> None:
     assert any(text.startswith("not in the file") for text in gap.sentences())
 
 
+def test_a_report_has_it_beside_a_calibration(made: SimpleNamespace, tmp_path: Path) -> None:
+    poses = mc.simulate(three_joints(), 30, seed=1).data
+    mc.calibrate(three_joints(), poses, "sum").save(tmp_path / "fit.json")
+    page = tmp_path / "report.html"
+    assert run("report", tmp_path / "fit.json", made.text, "-o", page, "-q") == 0
+    text = page.read_text()
+    assert "held out (run2)" in text
+    assert "friction in proportion to the load" in text
+
+
 def test_the_text_stays_but_for_what_changes(made: SimpleNamespace) -> None:
     before, after = (path.read_text().splitlines() for path in (made.model, made.out))
     assert len(before) == len(after)

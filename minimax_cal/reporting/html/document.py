@@ -103,7 +103,7 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
     sections = (
         Section(name, title, tuple(made(sources)))
         for name, title, made in parts
-        if name != "simulator" or sources.simulator
+        if name != "simulator" or sources.simulator or sources.motion
     )
     found = found or wording.judge(sources)
     first = Section("verdict", "Requirement and result", page_blocks(sources, found))

@@ -10,18 +10,30 @@ import numpy as np
 from minimax_cal.reporting.html.charts import axis, figure, frame, line, log_axis
 from minimax_cal.reporting.html.content import Block, Blocks, Figure, caveat, label, text
 from minimax_cal.reporting.html.sources import Sources
+from minimax_cal.simulators.motion.result import MotionGap
 from minimax_cal.simulators.result import SimulatorGap
 
 
 def blocks(sources: Sources) -> Blocks:
-    """The ladder as a chart and a table, and in words."""
+    """The ladder as a chart and a table, and in words; the same along trajectories."""
+    along = [] if sources.motion is None else motion_blocks(sources.motion)
     gap = sources.simulator
     if gap is None:
-        return []
+        return along
     out: list[Block] = [ladder_chart(gap), gap.table(), text(gap.headline())]
     out += [caveat(f"Not in the model: {said}.") for said in gap.left_out]
     if gap.written:
         out.append(text(f"The corrected model is {gap.written}; the last figures are of it."))
+    return [*out, *along]
+
+
+def motion_blocks(gap: MotionGap) -> Blocks:
+    """How far the model moves as the arm does, and what it could not hold."""
+    out: list[Block] = [gap.table(), text(gap.headline())]
+    out += [gap.tracking_table()] if gap.rungs[0].tracking_rms_mrad else []
+    out += [text(f"{said[0].upper()}{said[1:]}.") for said in gap.sentences()]
+    if gap.written:
+        out.append(text(f"The corrected model is {gap.written}."))
     return out
 
 

@@ -24,11 +24,14 @@ from minimax_cal.ground.words import visible
 from minimax_cal.measuring.history import numbered, visits
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.simulators.motion.result import MotionGap
 from minimax_cal.simulators.result import KIND, SimulatorGap
 
 AGAIN = "write it again with minimax-cal"
 
-Result = Fit | Diagnosis | RelativeCalibration | SimulatorGap | MotionDiagnosis | Path | str
+Result = (
+    Fit | Diagnosis | RelativeCalibration | SimulatorGap | MotionDiagnosis | MotionGap | Path | str
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,7 @@ class Sources:
     notices: tuple[str, ...] = ()
     simulator: SimulatorGap | None = None
     relative: RelativeCalibration | None = None
+    motion: MotionGap | None = None
 
     @property
     def results(self) -> tuple[Fit | Diagnosis, ...]:
@@ -128,6 +132,7 @@ def read_sources(results: Sequence[Result]) -> Sources:
     fits: list[Fit] = []
     gaps: list[Diagnosis] = []
     arms: list[SimulatorGap] = []
+    moving: list[MotionGap] = []
     files = []
     for result in results:
         content, path, digest = content_of(result)
@@ -142,6 +147,8 @@ def read_sources(results: Sequence[Result]) -> Sources:
             fits.append(Fit.from_dict(content, path))
         elif kind == "diagnosis":
             gaps.append(Diagnosis.from_dict(content, path))
+        elif kind == KIND and "along" in content:
+            moving.append(MotionGap.from_dict(content, path))
         elif kind == KIND:
             arms.append(SimulatorGap.from_dict(content, path))
         else:
@@ -155,7 +162,7 @@ def read_sources(results: Sequence[Result]) -> Sources:
     ):
         if count > 1:
             raise CalibrationError(f"{path}: is a second {kind}; give one and one {other}")
-    if len(arms) > 1 or not (fits or gaps):
+    if len(arms) > 1 or len(moving) > 1 or not (fits or gaps):
         raise CalibrationError(
             f"{path}: a report is of a calibration or a diagnosis: give one as well, and at most "
             "one gap in a simulator"
@@ -164,7 +171,8 @@ def read_sources(results: Sequence[Result]) -> Sources:
     fit, gap = fits[0] if fits else None, gaps[0] if gaps else None
     arm = arms[0] if arms else None
     notices = [*together(fit, gap, files), *simulated(arm, fit, gap)]
-    return Sources(fit, gap, tuple(files), tuple(notices), arm)
+    motion = moving[0] if moving else None
+    return Sources(fit, gap, tuple(files), tuple(notices), arm, motion=motion)
 
 
 def simulated(arm: SimulatorGap | None, fit: Fit | None, gap: Diagnosis | None) -> tuple[str, ...]:
