@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from minimax_cal.fitting import identify
 from minimax_cal.fitting.between_sessions import between_sessions
 from minimax_cal.fitting.checks import (
-    LEAST_SCALE,
     POOR_FIT,
     check_plausible,
     coarse_joints,
@@ -29,6 +28,7 @@ from minimax_cal.fitting.claims import (
     unjudged,
     unseen_suspects,
 )
+from minimax_cal.fitting.common_scale import common_share
 from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
 from minimax_cal.fitting.fit import (
     Fit,
@@ -89,8 +89,6 @@ from minimax_cal.solvers.status import Status
 JUMP = (SESSION_JUMP.name, f"{SESSION_JUMP.name}:frame")  # without its moment
 TOLD = 1e-6  # a point of a smaller multiplier does not decide
 ACTIVE = 1e-6  # a function equals the largest, relative
-LEAST_LENGTH, LEAST_LENGTHS = 0.05, 4  # of lengths that tell a common share: size [m] and number
-SAME_SHARE = 0.15  # of that share, by which they may differ
 ENDED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
 
 
@@ -430,28 +428,19 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         )
     if share := same_share(solved):
         yield (
-            f"all lengths changed by the same share, {100.0 * share:+.3f} %: check the scale, the "
-            "units and the temperature compensation of the instrument"
+            f"all lengths changed by the same share, {100.0 * share:+.3f} %, as no error of links "
+            "does: check the scale, the units and the temperature compensation of the instrument; "
+            f"minimax-cal import DATA --mend scale={1.0 / (1.0 + share):.6g} corrects the points"
         )
     if named := wild(solved.names, links_of(solved.state.mdh - solved.nominal.mdh), reach):
         yield f"implausibly large changes: {named}; is the robot file the right one?"
 
 
 def same_share(solved: Solved) -> float:
-    """The share by which all identified lengths of the arm changed, 0 where they did not.
-
-    Warmth of an arm below `LEAST_SCALE` does so too.
-    """
-    n = 2 * len(solved.nominal.mdh)
-    drawn = links_of(solved.nominal.mdh)[:n]
-    change = links_of(solved.state.mdh)[:n] - drawn
-    told = solved.identification.active[:n] & (np.abs(drawn) > LEAST_LENGTH)
-    if told.sum() < LEAST_LENGTHS:
-        return 0.0
-    drawn, change = drawn[told], change[told]
-    share = float(drawn @ change / (drawn @ drawn))
-    off = np.linalg.norm(change - share * drawn) / np.linalg.norm(share * drawn)
-    return share if abs(share) > LEAST_SCALE and off < SAME_SHARE else 0.0
+    """The share by which all identified lengths of the arm changed, 0 where they did not."""
+    drawn, n = solved.nominal.mdh, len(solved.nominal.mdh)
+    found = solved.identification.active[: 5 * n].reshape(5, n).T  # in the order of `links_of`
+    return common_share(drawn, solved.state.mdh - drawn, found)
 
 
 def parameters_of(robot: Robot, solved: Solved) -> Parameters:

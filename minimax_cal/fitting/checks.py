@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from minimax_cal.fitting.common_scale import scale_of
+from minimax_cal.fitting.common_scale import LEAST_SHARE, scale_of
 from minimax_cal.fitting.start import BaseFit, fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -39,7 +39,6 @@ LEAST_HEAD = 8  # rows that place a base well enough to judge others
 LEAST_PLACED = 10  # rows at the start that may be right before a break
 CLOSE_BY = 3  # rows at either end that no break is looked for in
 FEW_CLIPPED = 3  # rows at the end of a joint's values that are no chance
-LEAST_SCALE = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
 MOST_SCALE = 0.05  # a larger one is another unit, or another arm
 SURE = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
 LEAST_MOVING = 5  # joints whose links have ways enough to differ from a common factor
@@ -124,7 +123,7 @@ def check_scale(robot: Robot, data: Measurements, given: BaseFit) -> None:
         return
     found = scale_of(robot, data, given)
     change = found.factor - 1.0
-    if found.gain >= SURE and LEAST_SCALE < abs(change) < MOST_SCALE:
+    if found.gain >= SURE and LEAST_SHARE < abs(change) < MOST_SCALE:
         raise DataError(
             f"{data.source}: all points lie {found.factor:.5g} times as far apart as {robot.name} "
             "is drawn, as no error of links does: check the instrument's scale, units and "

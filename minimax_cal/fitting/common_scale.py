@@ -1,5 +1,7 @@
 """Whether all points are longer or shorter by one factor than errors of links would have them.
 
+After the fit, by how its lengths changed: all by one share, beyond what its angles let expect.
+
 Before the fit, by the drawn arm alone: errors e of its points are A x + c s + noise, A the links'
 columns and c that of a scale, both without what base and targets take.  Links are off by what arms
 are, times an unknown factor; the evidence for s is the gain in marginal likelihood over s = 0.
@@ -10,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtr
 
 from minimax_cal.fitting.start import BaseFit
 from minimax_cal.ground.arrays import Array
@@ -19,9 +22,37 @@ from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 OFF_LENGTH, OFF_ANGLE = 0.3e-3, 0.5e-3  # how well arms are drawn; times FACTORS [m, rad]
+LEAST_SHARE = 7e-4  # a smaller common factor may be the warmth of the arm: aluminium by 30 K
 FACTORS = np.geomspace(0.1, 30.0, 26)  # of the links' errors
 NOISES = np.geomspace(2e-6, 2e-2, 30)  # of a coordinate, with what no link explains [m]
 POSES = 60  # that tell a scale
+LEAST_LENGTH, FEWEST = 0.05, 4  # of lengths that tell a common share: size [m]; their number
+CHANCE, DOUBTFUL = 0.003, 0.05  # that lengths which are off at random agree so well on a share
+CLEAR = 3.0  # sigmas of what the angles let expect, beside which doubtful agreement is enough
+MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
+
+
+def common_share(drawn: Array, change: Array, found: Array) -> float:
+    """The share by which the lengths of a fit changed together, 0 where that may be chance.
+
+    The lengths must agree on it, or nearly so where it is more than the angles let expect: of arms
+    that are drawn to OFF_LENGTH and OFF_ANGLE, times one factor.  A share that a warm arm may have
+    is none.  drawn, change: (n, 5) rows [m, rad].  found: (n, 5) True where identified.
+    """
+    lengths = found[:, :2] & (np.abs(drawn[:, :2]) > LEAST_LENGTH)
+    angles = np.abs(change[:, 2:][found[:, 2:]])
+    if lengths.sum() < FEWEST or len(angles) < FEWEST:
+        return 0.0
+    length, more = drawn[:, :2][lengths], change[:, :2][lengths]
+    size = float(length @ length)
+    share = float(length @ more) / size
+    spare = len(length) - 1
+    apart = max(float(np.sqrt(((more - share * length) ** 2).sum() / spare)), 1e-12)
+    stretch = abs(share) * np.sqrt(size)
+    chance = 2.0 * float(stdtr(spare, -stretch / apart))
+    usual = float(np.median(angles)) / MEDIAN / OFF_ANGLE * OFF_LENGTH
+    clear = chance < CHANCE or (chance < DOUBTFUL and stretch > CLEAR * usual)
+    return share if clear and abs(share) > LEAST_SHARE else 0.0
 
 
 @dataclass(frozen=True)

@@ -51,12 +51,19 @@ class Notation:
     def told(self, mdh: Array, prismatic: Array) -> Array:
         """(n, 5) the engine's rows with the values that the file's convention has for them."""
         out = np.array(mdh)
+        out *= self.sense(len(out))
         if self.half_turn:
-            out[0, [THETA, D]] *= -1.0
             out[0, ALPHA] -= np.pi
         if len(self.offset):
             own = np.where(prismatic, D, THETA)
             out[np.arange(len(out)), own] -= self.offset
+        return out
+
+    def sense(self, joints: int) -> Array:
+        """(n, 5) -1 where the file's value falls as the engine's grows, else 1."""
+        out = np.ones((joints, 5))
+        if self.half_turn:
+            out[0, [THETA, D]] = -1.0
         return out
 
     def written(self, mdh: Array, prismatic: Array) -> tuple[Array, Array]:

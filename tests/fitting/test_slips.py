@@ -2,6 +2,7 @@
 
 import re
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import run, shared
+from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.fitting.checks import check_plausible, coarse_joints, fitted
-from minimax_cal.fitting.common_scale import scale_of
+from minimax_cal.fitting.common_scale import common_share, scale_of
 from minimax_cal.measuring import slips
 from minimax_cal.measuring.mending import mended
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
@@ -120,6 +122,38 @@ def test_a_fit_that_stretches_every_length_alike_says_so(robot: mc.Robot) -> Non
     stretched = made.data.with_y(1.001 * made.data.y)
     with pytest.warns(mc.CalibrationWarning, match=r"changed by the same share, \+0\.(09|1)"):
         mc.calibrate(robot, stretched, "sum")
+
+
+@pytest.mark.parametrize("arm", ["irb2600", "ur10"])
+def test_a_common_scale_of_a_part_in_a_thousand_is_named_before_or_by_the_fit(arm: str) -> None:
+    drawn = Truth(length=0.1e-3, angle=0.2e-3, compliance=0.0)
+    made = simulate(arm, 50, 1, seed=2, truth=drawn)
+    plain = mc.calibrate(arm, made.data, "sum")
+    assert not any("same share" in text for text in plain.notices)
+    stretched = made.data.with_y(1.001 * made.data.y)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            mc.calibrate(arm, stretched, "sum")
+        except mc.DataError as error:
+            warnings.warn(str(error), mc.CalibrationWarning, stacklevel=1)
+    text = " ".join(str(one.message) for one in said)
+    assert re.search(r"same share, \+0\.[01]|1\.00[01]\d* times as far apart", text)
+    assert "--mend scale=0.99" in text
+
+
+def test_lengths_that_are_off_at_random_have_no_common_share() -> None:
+    rng = np.random.default_rng(0)
+    drawn = mc.load_robot("irb2600").mdh
+    found = np.ones(drawn.shape, dtype=bool)
+    named = 0
+    for _ in range(1000):
+        change = rng.normal(size=drawn.shape) * ([0.5e-3] * 2 + [1e-3] * 3)
+        named += common_share(drawn, change, found) != 0.0
+    assert named < 10  # one in a hundred
+    stretched = 1e-3 * drawn * ([1.0] * 2 + [0.0] * 3)
+    assert_allclose(common_share(drawn, stretched, found), 1e-3, rtol=1e-9)
+    assert common_share(drawn, 0.5 * stretched, found) == 0.0  # a warm arm does so
 
 
 def test_rounded_joints_are_noticed_where_rounding_can_cost_what_is_missing(

@@ -17,6 +17,7 @@ from experiments.watch import run as trial
 from minimax_cal.judging.watching import moved
 from minimax_cal.modelling.effects import EFFECTS
 from minimax_cal.modelling.simulate import Simulation, Truth, gravity, simulate
+from minimax_cal.robots.robot import robot_from_dict
 from minimax_cal.robots.sampling import random_poses
 
 TRUTH = Truth(compliance=0.0)
@@ -117,6 +118,26 @@ def test_a_known_frame_tells_joint_one(fit: mc.Fit, made: Simulation) -> None:
     alone = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame")
     assert [m.parameter for m in alone.moved] == ["theta1"]
     assert [h.parameter for h in alone.hidden] == ["theta6"]
+
+
+def test_what_moved_has_the_sign_of_the_file() -> None:
+    """A first row of modified DH that turns by 180 degrees turns the sense of joint 1 around."""
+    rows = [(0, -675, 0, 180), (350, 0, 0, 90), (1150, 0, -90, 0), (41, -1200, 0, 90),
+            (0, 0, 0, -90), (0, -215, 180, 90)]  # fmt: skip
+    keys = ("a", "d", "theta", "alpha")
+    content = {
+        "name": "turned", "convention": "modified", "units": {"length": "mm", "angle": "deg"},
+        "joints": [dict(zip(keys, row, strict=True), lower=-120, upper=120) for row in rows],
+    }  # fmt: skip
+    made = simulate(robot_from_dict(content, "turned"), 50, 3, 3, TRUTH)
+    fit = mc.calibrate(made.cell.robot, made.data, "sum")
+    rng = np.random.default_rng(4)
+    q = random_poses(made.cell.robot, 10, rng)
+    moved = q + SHIFT * np.eye(6)[0]  # the file's joint 1 has sign +1: its theta1 grows
+    y = made.cell.predict(moved) + 15e-6 * rng.normal(size=(10, 3, 3))
+    (found,) = mc.check(fit, mc.measurements(q, y), "rms 0.5", known="frame,targets").moved
+    assert found.parameter == "theta1"
+    assert abs(found.by - SHIFT) < SIGMAS * found.sigma < 0.5 * SHIFT
 
 
 FOOT = np.array([[0.3, 0.3, 0.0], [-0.3, 0.3, 0.0], [0.0, -0.4, 0.1]])
@@ -227,14 +248,15 @@ CUTS = [("irb120", 7, "2"), ("ur10", 8, "2"), ("irb2600", 12, "3"), ("irb120", 2
 def test_halves_of_a_session_whose_model_lacks_something_do_not_differ(
     arm: str, seed: int, way: str
 ) -> None:
-    found = one_session.run(Job(arm, seed, way))
+    found = one_session.run(Job(arm, seed, way, commands=("compare", "check")))
     assert found.compared == ()
     assert found.checked == ()
 
 
 @pytest.mark.parametrize(("arm", "seed", "way"), [("irb2600", 0, "1"), ("irb120", 4, "time")])
 def test_a_joint_that_moved_between_halves_is_named_alone(arm: str, seed: int, way: str) -> None:
-    found = one_session.run(Job(arm, seed, way, one_session.DRAWN))
+    job = Job(arm, seed, way, one_session.DRAWN, commands=("compare", "check"))
+    found = one_session.run(job)
     assert found.joint
     assert found.compared == (found.joint,)
     assert found.checked == (found.joint,)

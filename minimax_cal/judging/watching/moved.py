@@ -210,14 +210,20 @@ def search(watched: Watched, links: Array) -> Search:
         active[looked.column[chosen]] = True
         rows = watched.rows(active, rows.state)
         both = both.again(joined(watched, rows, looked.column))
-    change = links_of(rows.state.mdh - watched.cell.robot.mdh)
+    change, sense = links_of(rows.state.mdh - watched.cell.robot.mdh), in_file(watched)
     more, sigma = both.change(chosen)
     named = tuple(
-        Moved(names.all[i], float(change[i] + by), float(sure), names.units[i], *said)
+        Moved(names.all[i], float(sense[i] * (change[i] + by)), float(sure), names.units[i], *said)
         for i, by, sure, said in zip(looked.column[chosen], more, sigma, told, strict=True)
     )
     before, after = (Placing(informed(watched, one, first)) for one in (first_rows, rows))
     return Search(named, first, before, after, looked, looked.same(first))
+
+
+def in_file(watched: Watched) -> Array:
+    """(5n,) the sign that a change of each link parameter has in the robot's file."""
+    robot = watched.cell.robot
+    return links_of(robot.notation.sense(robot.joints))
 
 
 def informed(watched: Watched, rows: Rows, both: Both) -> Rows:
@@ -233,7 +239,7 @@ def informed(watched: Watched, rows: Rows, both: Both) -> Rows:
 def sized(watched: Watched, placed: Placing, found: Sequence[Moved]) -> tuple[Moved, ...]:
     """The same with how far each moved as placed, all of them together, and how sure that is."""
     names = watched.names
-    change = links_of(placed.state.mdh - watched.cell.robot.mdh)
+    change = in_file(watched) * links_of(placed.state.mdh - watched.cell.robot.mdh)
     sigma = np.linalg.norm(placed.factor(np.zeros_like(watched.root)), axis=1)
     at = [names.index(each.parameter) for each in found]
     return tuple(

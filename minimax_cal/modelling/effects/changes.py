@@ -16,6 +16,7 @@ from minimax_cal.modelling.effects.scene import (
     joint_of,
     one_joint,
 )
+from minimax_cal.robots.kinematics import THETA, D
 
 STEPS = 12  # moments at which something may have changed
 NEARBY = 24  # moments before one that was chosen, and after it
@@ -71,14 +72,16 @@ def zero(scene: Scene, place: str, choice: Choice) -> Columns:
     """A joint's zero is another from then on.
 
     Geometry is that of the last rows: what was before, or what was in between, is turned from it.
+    The zero grows as theta (of a slide d) of the robot's file does.
     """
     joint = joint_of(place)
     after = is_after(scene, choice)
     if "alone" not in choice:
         timed = "session" in choice or {"order", "time"} & scene.data.columns.keys()
         after = after - 1.0 if timed else 0.0 * after  # an arm at rest is as it was last
-    unit = "m" if scene.robot.prismatic[joint] else "rad"
-    turn = one_joint(scene, joint, after[None])
+    is_slide = bool(scene.robot.prismatic[joint])
+    sense = scene.robot.notation.sense(scene.joints)[joint, D if is_slide else THETA]
+    unit, turn = "m" if is_slide else "rad", one_joint(scene, joint, sense * after[None])
     return Columns(("zero",), (unit,), turn=turn, fixed=dict(choice))
 
 
