@@ -75,7 +75,7 @@ class Job:
     arm: of `ARMS`, or of `REAL` where is_real.  way: time, or a joint's number from 1.  moved:
     how the lack of fit counts in the noncentrality of a joint's shift in the second half, or
     nothing where none is shifted.  flip: whether the second half comes first.  commands: that are
-    asked.
+    asked.  drift: whether the arm drifts all through the session.
     """
 
     arm: str
@@ -85,6 +85,7 @@ class Job:
     flip: bool = False
     is_real: bool = False
     commands: tuple[str, ...] = tuple(COMMANDS)
+    drift: bool = True
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,14 @@ class Lack:
     factor: Array
 
 
-def lack_of(robot_cell: Cell, q: Array, when: Array, rng: np.random.Generator) -> Lack:
-    """Compliance, gears, growth and drift, each of a random size.  when: (m,) 0 to 1."""
+def lack_of(
+    robot_cell: Cell, q: Array, when: Array, rng: np.random.Generator, drift: bool = True
+) -> Lack:
+    """Compliance, gears, growth and drift, each of a random size.  when: (m,) 0 to 1.
+
+    drift: whether zeros and lengths go on changing from the first pose to the last.
+    """
+    when = when * drift
     n, m = q.shape[1], len(q)
     turn: list[Array] = []
 
@@ -204,7 +211,7 @@ def simulated(job: Job) -> tuple[Measurements, Array, str, float]:
     made = simulate(robot, POSES, 3, job.seed, Truth(compliance=0.0))
     first = halves(made.data, job.way)
     when = np.arange(POSES) / (POSES - 1.0)
-    lack = lack_of(made.cell, made.data.q, when, rng)
+    lack = lack_of(made.cell, made.data.q, when, rng, job.drift)
     noise = NOISE * rng.normal(size=made.data.y.shape)
     joint = 1 + job.seed % (robot.joints - 2)
     still = measured(made, lack, joint, np.zeros(POSES), noise)
@@ -361,13 +368,14 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
 @study_options("one_session")
 @click.option("--arms", "count", type=int, default=200, show_default=True, help="Simulated ones.")
 @click.option("--real/--no-real", "with_real", default=True, help="Whether real arms, too.")
+@click.option("--drift/--no-drift", default=True, help="Whether zeros and lengths drift.")
 @click.option("--command", "commands", type=click.Choice(list(COMMANDS)), multiple=True,
               default=tuple(COMMANDS), help="Ask these alone.")  # fmt: skip
-def main(study: Study, count: int, with_real: bool, commands: tuple[str, ...]) -> None:
+def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple[str, ...]) -> None:
     """Rates at which halves of one session are said to differ, and at which a move is found."""
     jobs = list(simulated_jobs(study.seed, 4 if study.quick else count))
     jobs += list(real_jobs(study.seed)) if with_real and not study.quick else []
-    jobs = [replace(job, commands=commands) for job in jobs]
+    jobs = [replace(job, commands=commands, drift=drift) for job in jobs]
     results = study.sweep(run, jobs, "halves of a session")
     table = Table(
         f"halves of one session; a joint moved has a noncentrality of {LAMBDA:g}",
