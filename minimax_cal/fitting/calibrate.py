@@ -430,7 +430,7 @@ def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
         yield (
             f"all lengths changed by the same share, {100.0 * share:+.3f} %, as no error of links "
             "does: check the scale, the units and the temperature compensation of the instrument; "
-            f"minimax-cal import DATA --mend scale={1.0 / (1.0 + share):.6g} corrects the points"
+            f"points scaled by {1.0 / (1.0 + share):.6g} have the drawn lengths"
         )
     if named := wild(solved.names, links_of(solved.state.mdh - solved.nominal.mdh), reach):
         yield f"implausibly large changes: {named}; is the robot file the right one?"
