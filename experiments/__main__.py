@@ -95,6 +95,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.relative",
         "What lengths, closures and poses tell beside a tracker, and how true their positions are",
     ),
+    "pixels": (
+        "experiments.pixels",
+        "What cameras tell of an arm: lenses that are wrong, bad starts, pixels that are too weak",
+    ),
     "worst_point": (
         "experiments.worst_point",
         "The worst point as objective: gain, three solvers, time and its growth",

@@ -34,6 +34,7 @@ LOOSE = 300.0  # times its doubt: what is then known of such a lens
 DEPTH_ROUNDS = 2  # in which depths follow the lengths
 COARSE = Limits(step=1e-2, iterations=40)  # of a fit that another follows [px]
 FINE = Limits(step=1e-7, iterations=100, damping=1e-9)
+ANY = 0.0  # resolution at which everything counts that any pixels could tell
 METHOD, AFFINE = METHODS["nllm"], METHODS["snllm-kaufman"]
 
 
@@ -154,16 +155,18 @@ def fit_pixels(
     sigma = options.lens_sigma(model.intrinsic)
     allowed, wanted = wishes(model.names, lenses, options)
     nominal = fit_drawn(model, x)
-    progress("identifiable parameters")
-    told = identified(robot, model, nominal, allowed, wanted, options.resolution)
-    known = told.identification
-    check_count(train, int(known.active.sum()))
-    beside = known_of(robot, model, sigma, by_drawing=told.by_drawing)
     progress("lengths and angles at given depths")
     lens = np.arange(model.names.count) >= model.names.count - lenses
-    near = replace(model, active=known.active & ~lens)
+    told = identified(robot, model, nominal, allowed, wanted, ANY)
+    beside = known_of(robot, model, sigma, by_drawing=told.by_drawing)
+    near = replace(model, active=told.identification.active & ~lens)
     near = replace(near, prior=beside.prior(sigma_of(model.errors(nominal))))
     x = by_depths(near, nominal, started)
+    progress("identifiable parameters")  # where the arm is, not where a bad drawing has it
+    known = identified(robot, model, x, allowed, wanted, options.resolution).identification
+    check_count(train, int(known.active.sum()))
+    told_links = known.active[: 5 * robot.joints].reshape(5, -1).T
+    x = replace(x, mdh=np.where(told_links, x.mdh, robot.mdh))
     progress("reprojection")
     model = replace(model, active=known.active)
     model, found, noise = reprojected(model, x, beside)
