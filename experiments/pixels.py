@@ -28,7 +28,6 @@ from experiments.pixel_cells import (
     board_points,
     data_of,
     make_cell,
-    off_drawing,
     projected,
 )
 from experiments.sweep import Study, study_options
@@ -39,7 +38,7 @@ from minimax_cal.fitting.pixels.fit import ANY, by_depths, fit_drawn, known_of, 
 from minimax_cal.fitting.pixels.identify import identified
 from minimax_cal.fitting.pixels.model import PixelModel
 from minimax_cal.fitting.pixels.options import PixelOptions
-from minimax_cal.fitting.pixels.start import directions, poses_of_images, start_scene
+from minimax_cal.fitting.pixels.start import directions, from_far, poses_of_images, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import plain
 from minimax_cal.ground.tables import Table
@@ -52,7 +51,7 @@ POSES, FEW_POSES = 60, 40
 SMALL, WIDE = (6, 5), 0.04  # a board with few corners, for a quick look
 OUTLIERS = 0.05  # share of the pixels
 GROSS = 30.0  # how far they are off, on average [px]
-BAD_ANGLE, BAD_LENGTH = 0.15, 0.05  # of starts that are far off [rad, m]
+BAD_ANGLE, BAD_LENGTH = 0.3, 0.05  # of starts that are far off: zeros, lengths [rad, m]
 REACHED = 0.1  # an arm so near to the true one has found its minimum [mm]
 WEAK_FOCAL, WEAK_DISTANCE = 8000.0, (1.8, 2.2)  # a tele lens: 0.25 mm a pixel [px], [m]
 WEAK_NOISES = (0.1, 0.3, 1.0)  # [px]
@@ -127,7 +126,7 @@ def resected(cell: Cell, data: PixelData, row: int, start: Array) -> Array:
 
     def errors(x: Array) -> Array:
         seen = projected(view, point @ rotation(x[:3]).T + x[3:])
-        return (np.nan_to_num(seen, nan=1e4) - pixel).reshape(-1)
+        return np.asarray((np.nan_to_num(seen, nan=1e4) - pixel).reshape(-1))
 
     begin = np.concatenate([rotation_vector(start[:3, :3]), start[:3, 3]])
     found = least_squares(errors, begin, method="lm").x
@@ -230,21 +229,23 @@ class Start:
 
 
 def reach(start: Start) -> tuple[float, float]:
-    """Arm errors from a bad start: by given depths and then pixels, and by pixels alone [mm]."""
+    """Arm errors from a bad start: by the images' poses first, and by pixels alone [mm]."""
     cell = cell_of(Job("", 0, start.small))
     rng = np.random.default_rng(start.seed)
-    drawn = off_drawing(cell.drawn, rng, BAD_LENGTH, BAD_ANGLE)
-    data = data_of(cell)
-    begun = start_scene(drawn, data, on_flange=True)
+    mdh = cell.drawn.mdh.copy()
+    mdh[:, :2] += BAD_LENGTH * rng.normal(size=(len(mdh), 2))
+    mdh[:, 2] += BAD_ANGLE * rng.normal(size=len(mdh))
+    drawn, data = cell.drawn.with_mdh(mdh), data_of(cell)
+    begun = from_far(drawn, data, start_scene(drawn, data, on_flange=True))
     model = PixelModel.of(drawn, data, on_flange=True)
     scene, lenses = fit_drawn(model, begun.scene), begun.scene.lens[0].size
     allowed = np.ones(model.names.count, dtype=bool)
     allowed[-lenses:] = False
-    told = identified(drawn, model, scene, allowed, ~allowed, ANY)
+    told = identified(drawn, model, begun.begin or scene, allowed, ~allowed, ANY)
     model = replace(model, active=told.identification.active)
     beside = known_of(drawn, model, PixelOptions().lens_sigma(model.intrinsic), by_drawing=False)
     errors = []
-    for x in (by_depths(model, scene, begun), scene):
+    for x in (by_depths(model, begun.begin or scene, begun), scene):
         found = reprojected(model, x, beside)[1].x
         errors.append(arm_error(cell, drawn.with_mdh(found.mdh[0])))
     return errors[0], errors[1]
@@ -252,11 +253,11 @@ def reach(start: Start) -> tuple[float, float]:
 
 def starts_table(found: Sequence[tuple[float, float]]) -> Table:
     """How many starts reach the arm."""
-    names = ("given depths (separable), then pixels", "pixels alone (bundle adjustment)")
+    names = ("image poses, given depths, pixels", "pixels alone (bundle adjustment)")
     rows = tuple(
         (name, sum(each[i] < REACHED for each in found), len(found)) for i, name in enumerate(names)
     )
-    title = f"starts off by {BAD_ANGLE:g} rad and {1e3 * BAD_LENGTH:g} mm (sigma of each link)"
+    title = f"starts off by {BAD_ANGLE:g} rad (each zero) and {1e3 * BAD_LENGTH:g} mm (each length)"
     return Table(title, ("way", "reach the arm", "of"), rows, ("", "d", "d"))
 
 

@@ -17,7 +17,13 @@ from minimax_cal.fitting.instruments.options import Progress, silent
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.pixels.camera import INTRINSICS, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
-from minimax_cal.fitting.pixels.fit import PixelFit, covariance_of, fit_pixels, right
+from minimax_cal.fitting.pixels.fit import (
+    PixelFit,
+    covariance_of,
+    fit_pixels,
+    link_covariance,
+    right,
+)
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
 from minimax_cal.fitting.pixels.model import FLANGE, GROUND, PixelModel, Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
@@ -28,7 +34,7 @@ from minimax_cal.fitting.pixels.plausible import (
     outlier_notices,
 )
 from minimax_cal.fitting.pixels.result import PIXELS, PixelCalibration
-from minimax_cal.fitting.pixels.start import start_scene
+from minimax_cal.fitting.pixels.start import from_far, start_scene
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
@@ -114,9 +120,11 @@ def fitted(
     _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
     covariance = covariance_of(fit, group.reshape(-1))
     seen = judged_pixels(robot, data, held, fit)
-    arm, links = robot.with_mdh(fit.scene.mdh[0]), 5 * robot.joints
+    arm = robot.with_mdh(fit.scene.mdh[0])
     claim = Claim(
-        position_sigma(arm, covariance[:links, :links]), drawn_sigma(robot), arms_apart(robot, arm)
+        position_sigma(arm, link_covariance(robot, fit, covariance)),
+        drawn_sigma(robot),
+        arms_apart(robot, arm),
     )
     status = fit.found.status[0]
     wrong = contradiction(robot, train, fit, options)
@@ -187,7 +195,8 @@ def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Pr
     both = [one for one, each in zip(both, miss, strict=True) if CLEARLY * each <= miss[0]]
     for started in both:
         check_start(robot, data, started)
-    fits = [fit_pixels(robot, data, started, options, progress) for started in both]
+    begun = [from_far(robot, data, started) for started in both]
+    fits = [fit_pixels(robot, data, started, options, progress) for started in begun]
     return min(fits, key=lambda fit: fit.noise)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.options import Progress
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.identify import identified, lengths_of
+from minimax_cal.fitting.pixels.identify import gram_of_pixels, identified, lengths_of
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started
@@ -157,11 +157,12 @@ def fit_pixels(
     nominal = fit_drawn(model, x)
     progress("lengths and angles at given depths")
     lens = np.arange(model.names.count) >= model.names.count - lenses
-    told = identified(robot, model, nominal, allowed, wanted, ANY)
+    first = nominal if started.begin is None else started.begin
+    told = identified(robot, model, first, allowed, wanted, ANY)
     beside = known_of(robot, model, sigma, by_drawing=told.by_drawing)
     near = replace(model, active=told.identification.active & ~lens)
-    near = replace(near, prior=beside.prior(sigma_of(model.errors(nominal))))
-    x = by_depths(near, nominal, started)
+    near = replace(near, prior=beside.prior(sigma_of(model.errors(first))))
+    x = by_depths(near, first, started)
     progress("identifiable parameters")  # where the arm is, not where a bad drawing has it
     known = identified(robot, model, x, allowed, wanted, options.resolution).identification
     check_count(train, int(known.active.sum()))
@@ -292,19 +293,39 @@ def covariance_of(fit: PixelFit, group: Array) -> Array:
     change = np.stack([solve_normal(bread - gram[i], gradient[i][:, None])[:, 0] for i in counted])
     share = (len(counted) - 1) / len(counted)
     found = share * change.T @ change + cover @ np.diag(fit.noise**2 * prior) @ cover
+    lens = np.arange(len(active)) >= len(active) - x.lens[0].size
     if fit.held:
-        found = found + of_held_lenses(fit, cover)
+        shift = shift_by(fit, lens, fit.lens_sigma.reshape(-1))
+        found = found + shift @ shift.T
     covariance = np.full((len(active),) * 2, np.nan)
     covariance[np.ix_(active, active)] = found
     return covariance
 
 
-def of_held_lenses(fit: PixelFit, cover: Array) -> Array:
-    """What lenses that are held, and may be wrong, add to the covariance.  cover: H^-1."""
-    model, x = fit.model, fit.scene
-    lens = np.arange(model.names.count) >= model.names.count - x.lens[0].size
-    _, rows = model.rows(x, fit.active | lens)
-    rows = (rows * np.sqrt(model.weight)).reshape(len(rows), -1)
-    split = int(fit.active.sum())
-    shift = cover @ (rows[:split] @ rows[split:].T) * fit.lens_sigma.reshape(-1)
-    return np.asarray(shift @ shift.T)
+def shift_by(fit: PixelFit, held: Array, sigma: Array) -> Array:
+    """(free, h) how far the parameters go when each of the held ones is wrong by its sigma.
+
+    held: (p,) mask of h that were not fitted.  sigma: (h,).
+    """
+    model = fit.model
+    gram = gram_of_pixels(model, fit.scene, fit.active | held)
+    bread = gram + np.diag(np.where(fit.active, model.prior.weight, 0.0))
+    mixed = gram[np.ix_(fit.active, held)]
+    return np.asarray(-solve_normal(bread[np.ix_(fit.active, fit.active)], mixed) * sigma)
+
+
+def link_covariance(robot: Robot, fit: PixelFit, covariance: Array) -> Array:
+    """Covariance (5n, 5n) of all links: those that were not fitted are off as drawings are.
+
+    What pixels take for others moves these along; where it moves no position, it counts for none.
+    covariance: (p, p), NaN where not fitted.
+    """
+    links = fit.model.names.links
+    held = links & ~fit.active
+    length = lengths_of(fit.model.names)[held]
+    sigma = np.where(length, *robot.drawn_within)
+    off = np.zeros((len(links), int(held.sum())))
+    off[fit.active] = shift_by(fit, held, sigma)
+    off[held] = np.diag(sigma)
+    whole = np.nan_to_num(covariance) + off @ off.T
+    return np.asarray(whole[np.ix_(links, links)])

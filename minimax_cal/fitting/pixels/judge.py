@@ -46,12 +46,10 @@ def position_rows(robot: Robot, tool: Array = TOOL) -> Array:
 def position_sigma(robot: Robot, covariance: Array) -> float:
     """RMS over the joints' range of a position's standard deviation [m].
 
-    covariance: (5n, 5n) of the links, NaN where these are as drawn.
+    covariance: (5n, 5n) of the links.
     """
-    known = np.isfinite(np.diag(covariance))
-    rows = position_rows(robot)[known]
-    mean = rows @ rows.T / POSES
-    return float(np.sqrt(max(np.trace(mean @ covariance[np.ix_(known, known)]), 0.0)))
+    rows = position_rows(robot)
+    return float(np.sqrt(max(np.trace(rows @ rows.T @ covariance) / POSES, 0.0)))
 
 
 def drawn_sigma(robot: Robot) -> float:

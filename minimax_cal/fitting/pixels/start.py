@@ -7,6 +7,7 @@ rotation does: everything else is then linear.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from minimax_cal.fitting.calibrate import calibrate
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.poses import poses_as_targets, spots_of, tool_of
 from minimax_cal.fitting.pixels.camera import undistorted
@@ -21,6 +23,7 @@ from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import CalibrationError, CalibrationWarning
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.model import model_of
@@ -52,7 +55,7 @@ class Started:
 
     on_flange: whether the cameras ride on it.  direction: (2, N) that was seen, in the plane at
     depth one.  depth: (N,) of each target as its image tells it alone, 0 where it does not [m].
-    nearest: least depth of a target [m].
+    nearest: least depth of a target [m].  begin: where a fit begins, None for the drawn arm.
     """
 
     scene: Scene
@@ -60,6 +63,7 @@ class Started:
     direction: Array
     depth: Array
     nearest: float = NEARBY
+    begin: Scene | None = None
 
     def miss(self, robot: Robot, data: PixelData) -> float:
         """Typical error at the targets, infinite where most lie behind a camera [m]."""
@@ -80,6 +84,37 @@ def start_scene(robot: Robot, data: PixelData, on_flange: bool) -> Started:
     if len(found) < len(told):
         found = [by_rotations(robot, data, model, seen, camera) for camera in every]
     return Started(merged(robot, data, found), on_flange, seen, depths(data, image))
+
+
+def from_far(robot: Robot, data: PixelData, started: Started) -> Started:
+    """The same where the drawn arm is far off: a fit begins at what the images' poses alone tell.
+
+    A pose from each image is what a tracker of whole poses sees: `calibrate` finds the arm from
+    any start.
+    """
+    model = PixelModel.of(robot, data, started.on_flange)
+    image = poses_of_images(data, started.direction) if is_flat(data.board) else {}
+    first = int(np.bincount(data.camera).argmax())
+    rows = np.array([pose for camera, pose in image if camera == first], dtype=int)
+    if len(rows) < IMAGES:
+        return started
+    pose = np.stack([image[first, row] for row in rows])
+    targets = reflectors(data, rows, np.linalg.inv(pose) if started.on_flange else pose)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        try:
+            fit = calibrate(
+                replace(robot, rough=True), targets, "sum", holdout=0.0, simulated=True,
+                allow_large_changes=True,
+            )  # fmt: skip
+        except CalibrationError:  # too few poses for all parameters, say
+            return started
+    arm = robot.with_mdh(fit.cell.robot.mdh)
+    told = [by_poses(arm, data, model, image, camera) for camera in range(len(data.cameras))]
+    found = [each for each in told if each is not None]
+    if len(found) < len(told):
+        return started
+    return replace(started, begin=merged(arm, data, found))
 
 
 def depths(data: PixelData, image: dict[tuple[int, int], Array]) -> Array:
