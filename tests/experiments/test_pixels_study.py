@@ -33,7 +33,7 @@ def test_reprojection_is_better_than_poses_and_than_the_drawing() -> None:
 
 
 def test_a_bad_start_is_reached_from_the_poses_of_images() -> None:
-    depths, pixels = reach(Start(0, True))
+    depths, pixels = reach(Start(3, True))
     assert depths < REACHED < pixels
     assert [row[1] for row in starts_table([(depths, pixels)]).rows] == [1, 0]
 
