@@ -165,7 +165,7 @@ def fit_pixels(
     x = by_depths(near, first, started)
     progress("identifiable parameters")  # where the arm is, not where a bad drawing has it
     known = identified(robot, model, x, allowed, wanted, options.resolution).identification
-    check_count(train, int(known.active.sum()))
+    check_count(train, int(known.active.sum()), int(known.active[model.names.links].sum()))
     told_links = known.active[: 5 * robot.joints].reshape(5, -1).T
     x = replace(x, mdh=np.where(told_links, x.mdh, robot.mdh))
     progress("reprojection")
@@ -247,16 +247,19 @@ def spread_of(model: PixelModel, x: Scene) -> float:
     return max(float(np.sqrt((model.errors(x)[:, counted] ** 2).sum() / freedom)), FINEST)
 
 
-def check_count(train: PixelData, unknowns: int) -> None:
-    """Raise DataError if the training pixels cannot determine the unknowns."""
+def check_count(train: PixelData, unknowns: int, links: int) -> None:
+    """Raise DataError if the training pixels cannot determine the unknowns, links among them.
+
+    Many targets in one image are no more than one pose of a camera, which has six numbers.
+    """
     poses = len(np.unique(groups(train.at)[np.unique(train.pose)]))
     seen = min(2.0 * train.count / max(poses, 1), 6.0 * len(train.cameras))
-    needed = int(np.ceil(unknowns / max(seen, 1.0))) + 1
+    needed = int(np.ceil((links + 6 * len(train.cameras)) / max(seen, 1.0))) + 1
     if poses < needed or 2 * train.count <= unknowns:
         raise DataError(
             f"{train.source}: {poses} poses with {2 * train.count} numbers for the fit, but "
-            f"{unknowns} unknown parameters need at least {needed} poses; take more images, hold "
-            "out fewer or fix parameters (fix)"
+            f"{unknowns} unknown parameters, {links} of links, need at least {needed} poses; take "
+            "more images, hold out fewer or fix parameters (fix)"
         )
 
 
