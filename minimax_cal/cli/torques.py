@@ -12,12 +12,13 @@ from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options
 from minimax_cal.cli.options import PATH, InGroups, Output, options_of, result_options
 from minimax_cal.dynamics.diagnose import diagnose_motion
+from minimax_cal.dynamics.given import runs_of, torque_gains
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.ground.files import check_writable, json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.stages import Progress
 from minimax_cal.reporting.plots.motion import save_motion
-from minimax_cal.robots.robot import Robot
+from minimax_cal.robots.robot import Robot, load_robot
 
 if TYPE_CHECKING:
     from minimax_cal.simulators.motion.result import MotionGap
@@ -92,10 +93,13 @@ def torques_command(
     MODEL is a URDF, an MJCF or a robot file with masses.  One LOG is one trajectory: time, joint
     values and torques or currents, as CSV of this project, RTDE, ROS or LeRobot.
     """
-    if write is not None:
+    arm = model_of(model, logs)
+    if write is not None:  # before what takes long
         check_writable(write, MODELS)
+        drawn = arm if isinstance(arm, Robot) else load_robot(arm)
+        torque_gains(drawn, runs_of(arm, drawn, logs[:1]), chosen["drive_gain"])
     with to.stages() as progress:
-        found = diagnose_motion(model_of(model, logs), list(logs), progress=progress, **chosen)
+        found = diagnose_motion(arm, list(logs), progress=progress, **chosen)
         made = written(model, logs, write, found, chosen, progress) if write else None
     to.notice(*found.notices)
     if made is not None:

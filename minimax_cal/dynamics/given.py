@@ -79,6 +79,17 @@ def gains_of(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -
     return gain if gain.size and np.isfinite(gain).all() else np.zeros(0)
 
 
+def torque_gains(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -> Array:
+    """(n,) torque per unit of the log, for a simulator.  Raises OptionError where none is known."""
+    gains = gains_of(robot, runs, given)
+    if not len(gains):
+        raise OptionError(
+            f"{runs[0].source}: holds currents; give drive_gain=, the torque for one ampere of "
+            "each joint: a simulator counts in N m"
+        )
+    return gains
+
+
 def ratios_of(robot: Robot, given: float | Sequence[float] | None) -> Array:
     """(n,) gear ratios.  Raises OptionError."""
     if given is None:

@@ -12,6 +12,7 @@ from dynamics.motions import Extra, simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
+from minimax_cal.cli import torques
 from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
 from minimax_cal.dynamics.rows import ROW_HZ
 from minimax_cal.ground.arrays import Array
@@ -226,6 +227,21 @@ def test_the_command_says_what_an_option_must_be(capsys: pytest.CaptureFixture[s
     ):
         assert run("torques", "ur10", "run.csv", option, value) == 2
         assert said.split("'")[0].strip() in capsys.readouterr().err
+
+
+def test_currents_without_a_gain_are_refused_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A simulator counts in N m: said at once, not after minutes."""
+    ARM.save(tmp_path / "arm.json")
+    time = np.arange(0.0, 4.0, 0.02)
+    rows = ["t_s,q1_rad,q2_rad,q3_rad,i1_A,i2_A,i3_A"]
+    rows += [f"{t:.2f},{np.sin(t):.6f},{np.cos(t):.6f},{t / 9:.6f},0.1,0.2,{t:.3f}" for t in time]
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    monkeypatch.setattr(torques, "diagnose_motion", None)
+    ways = (tmp_path / "arm.json", tmp_path / "run.csv", "--write", tmp_path / "out.xml")
+    assert run("torques", *ways) == 2
+    assert "run.csv: holds currents; give --drive-gain" in capsys.readouterr().err
 
 
 def test_the_picture_shows_every_joint() -> None:

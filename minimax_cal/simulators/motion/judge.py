@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from minimax_cal.dynamics.diagnose import named_runs
-from minimax_cal.dynamics.given import Payload, gains_of, known_of, ratios_of, with_payload
+from minimax_cal.dynamics.given import Payload, known_of, ratios_of, torque_gains, with_payload
 from minimax_cal.dynamics.rows import Logs, prepare
 from minimax_cal.dynamics.run import Run
 from minimax_cal.dynamics.scene import Arm, Scene
@@ -77,12 +77,7 @@ class Judge:
     ) -> Judge:
         """Of logs of the arm of a model.  Raises CalibrationError."""
         robot = in_its_gravity(opened.chain)
-        gains = gains_of(robot, runs, drive_gain)
-        if not len(gains):
-            raise OptionError(
-                f"{runs[0].source}: holds currents; give drive_gain=, the torque for one ampere of "
-                "each joint: a simulator counts in N m"
-            )
+        gains = torque_gains(robot, runs, drive_gain)
         learning, held = divided(with_payload(runs, payload), *holdout)
         logs = prepare([*learning, *held])
         arm = Arm.of(robot, gains, ratios_of(robot, ratio), known_of(payload), logs)
