@@ -236,7 +236,8 @@ def test_currents_without_a_gain_are_refused_before_the_search(
     ARM.save(tmp_path / "arm.json")
     time = np.arange(0.0, 4.0, 0.02)
     rows = ["t_s,q1_rad,q2_rad,q3_rad,i1_A,i2_A,i3_A"]
-    rows += [f"{t:.2f},{np.sin(t):.6f},{np.cos(t):.6f},{t / 9:.6f},{t:.2f},{-t:.2f},{t:.3f}" for t in time]
+    both = np.array([time, np.sin(time), np.cos(time), time / 9, time, -time, np.sqrt(time)]).T
+    rows += [",".join(f"{value:.6f}" for value in row) for row in both]
     (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
     monkeypatch.setattr(torques, "diagnose_motion", None)
     ways = (tmp_path / "arm.json", tmp_path / "run.csv", "--write", tmp_path / "out.xml")
