@@ -50,7 +50,7 @@ def test_nothing_is_named_on_a_sound_arm() -> None:
     assert found.verdict == "none"
     assert found.findings == ()
     assert abs(found.floor.value / (1e3 * made.floor) - 1.0) < 0.1
-    assert "Nothing beyond geometry and noise" in found.headline()
+    assert "No cause beyond geometry" in found.headline()
 
 
 def test_a_plain_effect_is_named_with_its_size(plain: mc.Diagnosis) -> None:
@@ -317,7 +317,7 @@ def test_the_whole_law_is_told_and_a_point_that_the_gap_hid() -> None:
     assert [term.text for term in gear.shown] == ["gear_error:J3:turns=1.0"]
     assert len(gear.names) == len(gear.values) == len(gear.sigmas) == 4
     assert all(sigma > 0.0 for sigma in gear.sigmas)
-    (said,) = [notice for notice in found.notices if "beside all that was found" in notice]
+    (said,) = [notice for notice in found.notices if "that no effect found explains" in notice]
     assert f"line {held[3]} smr1" in said
     last = found.ladder[-1]
     assert sum(last.holdout.counts) - sum(last.trusted.counts) == len(made.data.target_names)
