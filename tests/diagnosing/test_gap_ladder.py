@@ -285,7 +285,7 @@ def test_a_nest_that_moved_makes_no_points_stand_out(column: str) -> None:
     y[60:, 1] += 1e-3 * away / np.linalg.norm(away, axis=1, keepdims=True)  # on the flange
     data = replace(made.with_y(y), columns={column: np.arange(120.0)})
     found = mc.diagnose("irb2600", data, quick=True)
-    assert not [notice for notice in found.notices if "beside all that was found" in notice]
+    assert not [notice for notice in found.notices if "that no effect found explains" in notice]
     assert found.ladder[-1].trusted.counts == found.ladder[-1].holdout.counts
 
 
