@@ -385,7 +385,7 @@ def first_screen(
         console.print(table.rich())
     for purpose, command in advice:
         console.print(Text(visible(f"{purpose}:")))
-        console.print(Text(visible(f"  {command}")))
+        whole.print(Text(visible(f"  {command}")), soft_wrap=True)  # to be copied in one piece
 
 
 def terminal() -> Console:

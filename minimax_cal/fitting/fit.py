@@ -685,7 +685,8 @@ class Fit:
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
             self.aside_sentence() if self.set_aside else "",
             self.beyond.sentence(),
-            f"{identified} of {len(self.parameters)} parameters identified; {self.status}.",
+            f"{identified} of {len(self.parameters)} parameters identified; {self.status}"
+            f"{self.answered_by()}.",
             f"{advice}." if advice else "",
         )
         return tuple(sentence for sentence in every if sentence)
@@ -705,14 +706,23 @@ class Fit:
         """Who answered the quadratic programs, after a space; empty where there were none."""
         if not self.answered:
             return ""
+        work = self.work
+        steps = f"{work.steps} steps of least squares ({work.least_squares})"
+        warm = f"({work.warm_starts} warm-started)"
+        return f" QPs: {self.answerers()} {warm}, after {steps}."
+
+    def answered_by(self) -> str:
+        """Who answered the quadratic programs, as a clause; empty where there were none."""
+        return f"; QPs: {self.answerers()}" if self.answered else ""
+
+    def answerers(self) -> str:
+        """Backends with the number of QPs they answered, and how rough the answers were."""
         most_first = sorted(self.answered.items(), key=lambda item: -item[1])
         who = ", ".join(f"{count} by {name}" for name, count in most_first)
-        work = self.work
-        how = f"{work.warm_starts} warm-started"
-        if work.qp_residual > ROUGH:
-            how = f"used as they are, relative residual up to {work.qp_residual:.1g}"
-        steps = f"{work.steps} steps of least squares ({work.least_squares})"
-        return f" QPs: {who} ({how}), after {steps}."
+        residual = self.work.qp_residual
+        if residual > ROUGH:
+            who += f" (used as they are, relative residual up to {residual:.1g})"
+        return who
 
     def aside_sentence(self) -> str:
         """How many points were set aside, by whom, and the error with them."""

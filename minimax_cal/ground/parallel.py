@@ -32,6 +32,8 @@ ONE_THREAD = dict.fromkeys(
 JOBLIB = "minimax-cal[experiments]"
 DISTRIBUTED = "minimax-cal[distributed]"
 
+PLAIN: list[Any] = []  # the pool of this process that `beside` made last, which stays for the next
+
 Numbered = Generator[tuple[int, Any], None, None]
 Work = Sequence[tuple[Callable[..., Any], int, tuple[Any, ...]]]  # what `numbered` takes
 Queue = deque[tuple[Callable[..., Any], int, tuple[Any, ...]]]
@@ -74,6 +76,8 @@ def here(work: Work, processes: int) -> Numbered:
     if processes == 0:
         raise OptionError("0 processes: give their number, or -1 for one a core")
     joblib = optional("joblib", "work in several processes", JOBLIB)
+    while PLAIN:  # joblib would take it for a pool of its own
+        PLAIN.pop().shutdown(wait=True)
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         pool = joblib.Parallel(n_jobs=processes, return_as="generator_unordered")
         arriving = pool(joblib.delayed(numbered)(*each) for each in work)
@@ -158,6 +162,7 @@ def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
     loky = import_module("joblib.externals.loky")
     broken = import_module("joblib.externals.loky.process_executor").BrokenProcessPool
     pool = loky.get_reusable_executor(max_workers=count - 1, env=ONE_THREAD)
+    PLAIN[:] = [pool]
     flying: set[Future[list[tuple[int, Any]]]] = set()
     try:
         while waiting or flying:

@@ -224,7 +224,7 @@ def test_frames_that_the_run_writes_are_refused(
     """Nobody knows where the points are then; a correction would be wrong in silence."""
     text = module(robot).replace("  PROC main()", f"  PROC main()\r\n    {change}")
     (tmp_path / "a.mod").write_bytes(text.encode("latin-1"))
-    with pytest.raises(DataError, match=r"a\.mod:10: the run writes (tGrip|wTable)"):
+    with pytest.raises(DataError, match=r"a\.mod:10: the program changes (tGrip|wTable)"):
         read_program(tmp_path / "a.mod", robot, "tGrip", "wTable")
     other = text.replace(change, change.replace("tGrip", "tOther").replace("wTable", "wOther"))
     (tmp_path / "a.mod").write_bytes(other.encode("latin-1"))

@@ -41,7 +41,7 @@ def test_the_frequency_decides_what_is_established_and_what_is_in_the_model() ->
     assert often([unasked]) == [unasked]
     assert not asked([unasked])
     assert not unasked.established
-    assert unasked.evidence == "tentative"
+    assert unasked.evidence == "possible"
 
 
 def test_one_joint_and_all_of_them_stand_for_each_other() -> None:

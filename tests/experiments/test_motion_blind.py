@@ -140,7 +140,7 @@ def test_answers_are_judged_by_the_truth() -> None:
     counts = {row[0]: row[1:3] for row in questions_table(answers).rows}
     assert counts["sound: a cause named or doubted"] == (2, 1)
     assert counts["single: right"] == (6, 1)
-    assert counts["single: right, its family, or not to be told from it"] == (6, 4)
+    assert counts["single: right, its family, or not distinguishable from it"] == (6, 4)
     assert counts["single: sure and wrong"] == (6, 1)
     assert counts["outside: unexplained said"] == (2, 1)
     assert counts["outside: sure and wrong"] == (2, 1)

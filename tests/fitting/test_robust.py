@@ -320,7 +320,7 @@ def test_parameters_that_only_suspects_tell_are_named(robot: mc.Robot) -> None:
         case = few_that_tell_the_wrist(robot, wrist, wrong, 0.05, 0, 3)
         for found in (case.robust("tukey"), case.robust(trim=0.1)):
             assert (case.listed(found) == case.bad).all()
-            told = [note for note in found.notices if "hardly tell" in note]
+            told = [note for note in found.notices if "hardly determine" in note]
             assert len(told) == (wrong == 3)
             assert all("alpha5" in note for note in told)
 

@@ -272,7 +272,7 @@ def test_progress_is_told(fit: mc.Fit) -> None:
         ("sum", {"replicates": 1}, "give 2 to 100000"),
         ("sum", {"replicates": 10**6}, "give 2 to 100000"),
         ("sum", {"seed": -1}, "seed -1"),
-        ("point", {}, "objective point rests on the few worst points"),
+        ("point", {}, "objective point depends on the few worst points"),
     ],
 )
 def test_wrong_choices_are_refused(

@@ -89,7 +89,7 @@ def test_people_read_a_distance_that_is_the_norm_in_json(
 ) -> None:
     mc.write_measurements(tmp_path / "poses.csv", noisy.data)
     out, page = tmp_path / "fit.json", tmp_path / "report.html"
-    assert run("calibrate", "irb2600", tmp_path / "poses.csv", "-o", out) == 0
+    assert run("calibrate", "irb2600", tmp_path / "poses.csv", "-o", out, "--details") == 0
     told = capsys.readouterr().out
     frames = json.loads(out.read_text())["frames"]
     away = np.linalg.norm(frames["base"]["xyz_mm"])
