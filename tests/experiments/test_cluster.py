@@ -78,6 +78,7 @@ def test_calibrate_many_is_what_one_process_finds(cluster: str) -> None:
         assert_array_equal(fit.robot.mdh, mc.calibrate("irb120", sheet).robot.mdh)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_what_one_process_finds(cluster: str) -> None:
     data = mc.simulate("irb120", 60, 1, 1, truth=mc.Truth(compliance=3e-6)).data
     alone, found = mc.diagnose("irb120", data), mc.diagnose("irb120", data, cluster=cluster)

@@ -5,6 +5,7 @@ from experiments.external import SIMULATED, asked_for
 from experiments.ten_splits import Named, Split, Told, arms_table, names_table, run
 
 
+@pytest.mark.slow
 def test_play_is_established_whichever_poses_are_held_out() -> None:
     told = [run(Split(SIMULATED[0], seed)) for seed in (0, 1)]
     for one in told:

@@ -273,6 +273,7 @@ def test_a_diagnosis_claims_nothing_outside_either(robot: mc.Robot) -> None:
     assert mc.Diagnosis.from_dict(found.to_dict()).beyond == found.beyond
 
 
+@pytest.mark.slow
 def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
     made = with_spans(robot, (0, 1, 2), 0.0)
     fit = mc.calibrate(robot, made.data, "sum")

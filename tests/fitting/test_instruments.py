@@ -545,6 +545,7 @@ def test_poses_tell_the_turn_of_the_tool_and_more() -> None:
     assert any("beyond what one reflector" in notice for notice in centred.notices)
 
 
+@pytest.mark.slow
 def test_the_tool_and_its_sigma_are_found() -> None:
     _, fit = fitted("irb2600", "poses", noise=NOISE)
     told = {p.name: p for p in fit.parameters}

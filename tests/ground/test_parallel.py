@@ -6,7 +6,7 @@ import time
 import pytest
 
 from minimax_cal.ground.errors import OptionError
-from minimax_cal.ground.parallel import START, WorkersLost, chunked, deque, share
+from minimax_cal.ground.parallel import START, WorkersLost, chunked, deque, in_parallel, share
 
 pytest.importorskip("joblib", reason="several processes need pip install minimax-cal[experiments]")
 LONG = 0.1  # seconds of a call
@@ -33,6 +33,16 @@ def test_every_call_is_made_once(processes: int) -> None:
     pids = {pid for _, (_, pid) in found}
     assert os.getpid() in pids  # this one works, too
     assert len(pids) <= processes
+
+
+def test_both_ways_work_in_one_process() -> None:
+    """The pool of the first is none of joblib's, which would lack what joblib gives its own."""
+    brief = int(1.5 * START / LONG)
+    for _ in range(2):
+        found = list(share(squared, [(n, LONG) for n in range(brief)], processes=2))
+        assert len({pid for _, (_, pid) in found}) == 2
+        whole = dict(in_parallel(squared, [(n,) for n in range(4)], processes=2))
+        assert [whole[n][0] for n in range(4)] == [0, 1, 4, 9]
 
 
 def test_brief_work_starts_no_process() -> None:

@@ -180,6 +180,7 @@ def stiffening(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_an_effect_without_an_element_is_no_rung_and_what_was_fitted_beside_it_is_not_used(
     stiffening: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
