@@ -373,7 +373,7 @@ def rows_of(jobs: Sequence[Job], results: Sequence[Found]) -> Iterator[tuple[Tab
               default=tuple(COMMANDS), help="Ask these alone.")  # fmt: skip
 def main(study: Study, count: int, with_real: bool, drift: bool, commands: tuple[str, ...]) -> None:
     """Rates at which halves of one session are said to differ, and at which a move is found."""
-    jobs = list(simulated_jobs(study.seed, 4 if study.quick else count))
+    jobs = list(simulated_jobs(study.seed, 2 if study.quick else count))
     jobs += list(real_jobs(study.seed)) if with_real and not study.quick else []
     jobs = [replace(job, commands=commands, drift=drift) for job in jobs]
     results = study.sweep(run, jobs, "halves of a session")
