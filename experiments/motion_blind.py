@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import click
 import numpy as np
@@ -43,6 +44,7 @@ from minimax_cal.dynamics.scene import Arm, Scene
 from minimax_cal.dynamics.search import Columns, dictionary_of
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
 
 VISIBLE = 50.0  # squared size, over the noise, from which a cause must be seen
@@ -338,6 +340,13 @@ def record(one: Told) -> dict[str, object]:
     }  # fmt: skip
 
 
+def asked(row: Sequence[Cell]) -> dict[str, Any]:
+    """A row of the questions for JSON; a share of no cases is null."""
+    names = ("question", "cases", "yes", "percent", "interval", "asked")
+    plain = [finite(value) if isinstance(value, float) else value for value in row]
+    return dict(zip(names, plain, strict=True))
+
+
 @click.command()
 @study_options("motion_blind")
 @click.option("--arms", type=int, default=ARMS, show_default=True, help="Sound arms.")
@@ -350,8 +359,7 @@ def main(study: Study, arms: int, cases: int) -> None:
     told = study.sweep(run, plan(study.seed, arms, cases), "diagnoses")
     tables = [questions_table(told), causes_table(told), time_table(told)]
     study.save(tables, {
-        "questions": [dict(zip(("question", "cases", "yes", "percent", "interval", "asked"), row,
-                               strict=True)) for row in tables[0].rows],
+        "questions": [asked(row) for row in tables[0].rows],
         "cases": [record(one) for one in told],
     })  # fmt: skip
 
