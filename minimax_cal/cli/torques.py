@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,9 @@ from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options
 from minimax_cal.cli.options import PATH, InGroups, Output, options_of, result_options
 from minimax_cal.dynamics.diagnose import diagnose_motion
-from minimax_cal.dynamics.given import runs_of, torque_gains
+from minimax_cal.dynamics.given import read_logs, runs_of, torque_gains
 from minimax_cal.dynamics.result import MotionDiagnosis
+from minimax_cal.dynamics.run import Run
 from minimax_cal.ground.files import check_writable, json_text
 from minimax_cal.ground.options import Option
 from minimax_cal.ground.stages import Progress
@@ -28,21 +29,19 @@ JUDGED = "What judges"
 MODELS = (".xml", ".mjcf")  # of MuJoCo
 
 
-def model_of(name: str, logs: tuple[Path, ...]) -> Robot | str:
+def model_of(name: str, runs: Sequence[Run]) -> Robot | str:
     """The arm of a model: a robot file or URDF as it is, an MJCF through MuJoCo."""
     if Path(name).suffix.lower() not in MODELS:
         return name
-    from minimax_cal.dynamics.logs import read_runs
     from minimax_cal.simulators.chain import chain_of
     from minimax_cal.simulators.given import read_model
 
-    joints = read_runs(logs[:1])[0].joints
-    return chain_of(read_model(name).compiled(), joints, name).robot
+    return chain_of(read_model(name).compiled(), runs[0].joints, name).robot
 
 
 def written(
     model: str,
-    logs: tuple[Path, ...],
+    runs: Sequence[Run],
     path: Path,
     found: MotionDiagnosis,
     chosen: Mapping[str, Any],
@@ -53,7 +52,7 @@ def written(
 
     names = ("holdout", "holdout_run", "payload", "drive_gain", "ratio")
     known = {name: chosen[name] for name in names}
-    return motion_gap(model, list(logs), diagnosis=found, write=path, driven=False,
+    return motion_gap(model, runs, diagnosis=found, write=path, driven=False,
                       progress=progress, **known)  # fmt: skip
 
 
@@ -93,14 +92,16 @@ def torques_command(
     MODEL is a URDF, an MJCF or a robot file with masses.  One LOG is one trajectory: time, joint
     values and torques or currents, as CSV of this project, RTDE, ROS or LeRobot.
     """
-    arm = model_of(model, logs)
-    if write is not None:  # before what takes long
+    if write is not None:
         check_writable(write, MODELS)
+    runs = read_logs(model, logs)
+    arm = model_of(model, runs)
+    if write is not None:  # before what takes long
         drawn = arm if isinstance(arm, Robot) else load_robot(arm)
-        torque_gains(drawn, runs_of(arm, drawn, logs[:1]), chosen["drive_gain"])
+        torque_gains(drawn, runs_of(arm, drawn, runs), chosen["drive_gain"])
     with to.stages() as progress:
-        found = diagnose_motion(arm, list(logs), progress=progress, **chosen)
-        made = written(model, logs, write, found, chosen, progress) if write else None
+        found = diagnose_motion(arm, runs, progress=progress, **chosen)
+        made = written(model, runs, write, found, chosen, progress) if write else None
     to.notice(*found.notices)
     if made is not None:
         to.wrote(write, Path(made.module) if made.module else None)

@@ -8,8 +8,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.fitting.between_sessions import amounts, frame_changes
-from minimax_cal.fitting.changed import Change
+from minimax_cal.fitting.between_sessions import amounts, change_of, frame_changes
 from minimax_cal.fitting.uncertainty import quantile
 
 
@@ -20,20 +19,12 @@ def session_notices(study: Study, findings: Sequence[Finding]) -> Iterator[str]:
     """
     names = list(study.data.frames)
     for finding in findings:
-        choice = finding.term.choice
-        if "session" not in choice:
+        if "session" not in finding.term.choice:
             continue
         value, sigma = np.array(finding.values), np.array(finding.sigmas)
         half = quantile(0.95, study.fit.uncertainty.dof) * sigma
-        change = Change(
-            finding.term.effect,
-            finding.term.place,
-            names[int(choice["session"]) - 1],
-            "alone" in choice,
-            amounts(finding.names, finding.units, value, sigma, half),
-            finding.p_value,
-            finding.term.text,
-        )
+        found = amounts(finding.names, finding.units, value, sigma, half)
+        change = change_of(finding.term, names, found, finding.p_value)
         yield f"{change.effect} {change.place}: {change.when} by {change.sizes}"
     if len(names) > 1:
         yield from (frame.sentence for frame in frame_changes(study.geometric, study.fit))

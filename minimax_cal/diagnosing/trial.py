@@ -7,6 +7,7 @@ would change is of second order in the effects; the fits that are kept are exact
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,13 +28,13 @@ from minimax_cal.solvers.least_squares import solve_normal
 MAX_RISE = 1e-3  # of the training error, relative: more is worse
 
 
-class Predicting:
+class Predicting(ABC):
     """A linearised fit that predicts groups of poses, each without that group."""
 
     @property
+    @abstractmethod
     def poses(self) -> Linearised:
         """Where the fit ended."""
-        raise NotImplementedError
 
     @cached_property
     def needs(self) -> dict[bytes, bool]:
@@ -144,7 +145,7 @@ class Trials:
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class Linear(Linearised):
     """Some of the columns, after a step of their parameters.
 
     index: (p,) of all columns.  step: (p,).  weight: (p,) of priors of mean 0 besides the model's.
@@ -188,30 +189,11 @@ class Linear:
         """(k, m) which points were measured."""
         return self.trials.whole.seen
 
-    @cached_property
-    def sums(self) -> tuple[Array, Array]:
-        """`sums_of` all poses."""
-        return self.sums_of(np.ones(len(self.trials.error), dtype=bool))
-
-    @cached_property
-    def bread(self) -> Array:
-        """(q, q) normal matrix."""
-        return np.asarray(self.sums[0] + np.diag(self.prior))
-
-    @property
-    def pull(self) -> Array:
-        """(q,) J'e of all poses."""
-        return self.sums[1]
-
     def sums_of(self, part: Array) -> tuple[Array, Array]:
         """J'J (q, q) and J'e (q,) of some poses.  part: mask (m,)."""
         gram, pull = self.trials.sums_of(part)
         own = self.index[self.free]
         return gram[np.ix_(own, own)], pull[own] - gram[np.ix_(own, self.index)] @ self.step
-
-    def gram_of(self, part: Array) -> Array:
-        """(q, q) J'J of some poses.  part: mask (m,)."""
-        return self.sums_of(part)[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,15 +26,21 @@ def joint_names(robot: Robot | str | Path) -> tuple[str, ...]:
     return tuple(joint.name for joint in load_urdf(robot).chain if joint.moves)
 
 
+def read_logs(
+    given: Robot | str | Path, logs: Sequence[Run | str | Path] | str | Path
+) -> tuple[Run, ...]:
+    """The runs of an arm, those of files read.  Raises CalibrationError."""
+    listed = [logs] if isinstance(logs, str | Path) else list(logs)
+    paths = [one for one in listed if not isinstance(one, Run)]
+    runs = [one for one in listed if isinstance(one, Run)]
+    return (*runs, *(read_runs(paths, joint_names(given)) if paths else ()))
+
+
 def runs_of(
     given: Robot | str | Path, robot: Robot, logs: Sequence[Run | str | Path] | str | Path
 ) -> tuple[Run, ...]:
     """The runs, of this robot and of one unit.  Raises CalibrationError."""
-    listed = [logs] if isinstance(logs, str | Path) else list(logs)
-    paths = [one for one in listed if not isinstance(one, Run)]
-    runs = [one for one in listed if isinstance(one, Run)]
-    if paths:
-        runs += read_runs(paths, joint_names(given))
+    runs = read_logs(given, logs)
     if not runs:
         raise OptionError("logs: name a file or more; each is a trajectory")
     for run in runs:
@@ -48,7 +54,7 @@ def runs_of(
                 f"{run.source}: is in {run.unit}, {runs[0].source} in {runs[0].unit}; diagnose "
                 "currents and torques apart"
             )
-    return tuple(runs)
+    return runs
 
 
 def with_payload(runs: Sequence[Run], payload: Payload | None) -> list[Run]:

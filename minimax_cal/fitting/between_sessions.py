@@ -81,18 +81,24 @@ def changes(robot: Robot, data: Measurements, solved: Solved) -> tuple[Change, .
             continue
         columns = term.columns(scene)
         half = quantile(0.95, table.dof) * one.sigma
-        out.append(
-            Change(
-                term.effect,
-                term.place,
-                names[int(term.choice["session"]) - 1],
-                "alone" in term.choice,
-                amounts(columns.names, columns.units, one.value, one.sigma, half),
-                table.p_value(one),
-                term.text,
-            )
-        )
+        found = amounts(columns.names, columns.units, one.value, one.sigma, half)
+        out.append(change_of(term, names, found, table.p_value(one)))
     return tuple(sorted(out, key=lambda change: change.p_value))
+
+
+def change_of(
+    term: Term, sessions: Sequence[str], found: tuple[Amount, ...], p_value: float
+) -> Change:
+    """The change that a law of the sessions is.  sessions: their names."""
+    return Change(
+        term.effect,
+        term.place,
+        sessions[int(term.choice["session"]) - 1],
+        "alone" in term.choice,
+        found,
+        p_value,
+        term.text,
+    )
 
 
 def amounts(

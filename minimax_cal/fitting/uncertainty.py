@@ -9,10 +9,11 @@ all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv, stdtrit
@@ -101,46 +102,60 @@ def point_share(mu: Array, seen: Array) -> Array:
     return out
 
 
-class Linearised(Protocol):
+class Linearised(ABC):
     """A fit at its solution: p free parameters, r coordinates a pose, of m poses."""
 
     @property
+    @abstractmethod
     def error(self) -> Array:
         """(m, r) errors."""
 
     @property
+    @abstractmethod
     def jacobian(self) -> Array:
         """(m, r, p) derivative by the free parameters."""
 
     @property
+    @abstractmethod
     def seen(self) -> Array:
         """(k, m) which points were measured."""
 
     @property
+    @abstractmethod
     def prior(self) -> Array:
         """(p,) weights of a prior."""
 
     @property
+    @abstractmethod
     def off(self) -> Array:
         """(p,) how far the parameters are from the prior's mean."""
 
-    @property
+    @abstractmethod
+    def sums_of(self, part: Array) -> tuple[Array, Array]:
+        """J'A J (p, p) and J'A e (p,) of some poses, A the weights.  part: mask (m,)."""
+
+    def gram_of(self, part: Array) -> Array:
+        """(p, p) J'A J of some poses.  part: mask (m,)."""
+        return self.sums_of(part)[0]
+
+    @cached_property
+    def sums(self) -> tuple[Array, Array]:
+        """`sums_of` all poses."""
+        return self.sums_of(np.ones(self.seen.shape[1], dtype=bool))
+
+    @cached_property
     def bread(self) -> Array:
         """(p, p) normal matrix, the prior in it."""
+        return np.asarray(self.sums[0] + np.diag(self.prior))
 
     @property
     def pull(self) -> Array:
-        """(p,) J'e of all poses."""
-
-    def sums_of(self, part: Array) -> tuple[Array, Array]:
-        """Normal matrix (p, p), without the prior, and J'e (p,) of some poses.  part: mask (m,)."""
-
-    def gram_of(self, part: Array) -> Array:
-        """(p, p) normal matrix of some poses, without the prior.  part: mask (m,)."""
+        """(p,) J'A e of all poses."""
+        return self.sums[1]
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class Poses(Linearised):
     """A linearised fit pose by pose, points in units of the instrument's noise.
 
     With r = 3k coordinates a pose, of m poses.
@@ -221,21 +236,6 @@ class Poses:
         return prior.beside[active] if len(prior.beside) else np.zeros(np.count_nonzero(active))
 
     @cached_property
-    def sums(self) -> tuple[Array, Array]:
-        """`sums_of` all poses."""
-        return self.sums_of(np.ones(self.seen.shape[1], dtype=bool))
-
-    @cached_property
-    def bread(self) -> Array:
-        """(p, p) H."""
-        return np.asarray(self.sums[0] + np.diag(self.prior))
-
-    @property
-    def pull(self) -> Array:
-        """(p,) J'A e of all poses."""
-        return self.sums[1]
-
-    @cached_property
     def left_free(self) -> float:
         """Degrees of freedom of the errors: coordinates less parameters that the data pay for."""
         paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
@@ -266,10 +266,6 @@ class Poses:
         whole = self.estimator.whole
         found = (whole if part.all() else whole.take(part)).normal(self.state, whole.active)
         return found.gram.sum(axis=0), found.gradient.sum(axis=0)
-
-    def gram_of(self, part: Array) -> Array:
-        """(p, p) J'A J of some poses.  part: mask (m,)."""
-        return self.sums_of(part)[0]
 
     @cached_property
     def score(self) -> Array:

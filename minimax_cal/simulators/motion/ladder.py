@@ -11,8 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from minimax_cal.dynamics.diagnose import diagnose_motion
-from minimax_cal.dynamics.given import Payload, joint_names, runs_of
-from minimax_cal.dynamics.logs import read_runs
+from minimax_cal.dynamics.given import Payload, read_logs, runs_of
 from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
 from minimax_cal.dynamics.run import CURRENT, Run
 from minimax_cal.fitting.fit import Fit, load_fit
@@ -92,10 +91,7 @@ def motion_gap(
         check_writable(write, MODELS)
     mujoco()
     progress("reading the model and the logs")
-    listed = [logs] if isinstance(logs, str | Path) else list(logs)
-    paths = [one for one in listed if not isinstance(one, Run)]
-    read = read_runs(paths, joint_names(model)) if paths else ()
-    runs = [*read, *(one for one in listed if isinstance(one, Run))]
+    runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
     runs_of(model, opened.chain.robot, runs)
     with threadpool_limits(limits=1, user_api="blas"):
