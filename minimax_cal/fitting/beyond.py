@@ -16,7 +16,7 @@ import numpy as np
 
 from minimax_cal.fitting.identify import redundant
 from minimax_cal.fitting.intervals import max_interval, rms_interval, told
-from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
+from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.files import finite
 from minimax_cal.ground.tables import Cell, Table
@@ -271,23 +271,24 @@ def pooled(every: Sequence[Accuracy]) -> float:
     return math.sqrt(total / count) if count else math.nan
 
 
-def needed(poses: Linearised, part: Array, of: Array | None = None) -> bool:
-    """Whether a fit loses parameters, or much sureness, without some poses.
+def needed(poses: Linearised, part: Array) -> bool:
+    """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,)."""
+    return bool(are_needed(poses.bread, poses.gram_of(part)[None])[0])
 
-    part: mask (m,).  of: (p,) True for the parameters asked about, the others left out; all unless
-    given.  What all poses hardly tell, as a gear's curve beside the joint's compliance, no part
-    costs.
+
+def are_needed(gram: Array, parts: Array) -> Array:
+    """(f,) whether parameters are lost, or much sureness, without each of some parts of a sum.
+
+    gram: J'J (p, p) of all poses.  parts: (f, p, p) of each part.  What all poses hardly tell, as
+    a gear's curve beside the joint's compliance, no part costs.
     """
-    gram, less = poses.bread, poses.gram_of(part)
-    if of is not None:
-        gram, less = gram[np.ix_(of, of)], less[np.ix_(of, of)]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    whole, rest = (
-        np.sqrt(np.maximum(np.linalg.eigvalsh(one / np.outer(scale, scale)), 0.0))
-        for one in (gram, gram - less)
-    )
-    had, kept = (int((one > RANK * one[-1]).sum()) for one in (whole, rest))
-    return bool(kept < had or rest[-1] * whole[-had] > WORSE * whole[-1] * rest[-had])
+    alike = np.concatenate([gram[None], gram - parts]) / np.outer(scale, scale)
+    size = np.sqrt(np.maximum(np.linalg.eigvalsh(alike), 0.0))
+    kept = (size > RANK * size[:, -1:]).sum(axis=1)
+    whole, rest, had = size[0], size[1:], int(kept[0])
+    wider = rest[:, -1] * whole[-had] > WORSE * whole[-1] * rest[:, -had]
+    return np.asarray((kept[1:] < had) | wider)
 
 
 def step_without(poses: Linearised, part: Array) -> Array:
@@ -311,31 +312,63 @@ def without(
     parts: masks (m,) of the fit's poses.  frames: how many of the effects' parameters, the first,
     are those of the frames.
     """
+    if not parts:
+        return []
     poses, model = Poses.of(estimator, state), estimator.model
-    geometry = np.flatnonzero(model.active) < model.names.geometric + frames
-    out: list[State | None] = []
-    for part in parts:
-        if not part.any():
-            out.append(state)
-        elif needed(poses, part, geometry):
-            out.append(None)
-        else:
-            out.append(fit_of_rest(poses, part, untold(poses, part, ~geometry)))
-    return out
+    free = np.flatnonzero(model.active) < model.names.geometric + frames
+    every = poses.sums_by_part(parts)
+    lost = are_needed(poses.bread[np.ix_(free, free)], every.gram[:, free][:, :, free])
+    lost &= np.array([part.any() for part in parts])
+    gone = np.array([untold(poses, gram, ~free) for gram in every.gram])
+    near = one_step(poses, parts, every, ~lost & ~gone.any(axis=1))
+    return [
+        None if lost[i] else near.get(i) or fit_of_rest(poses, part, gone[i])
+        for i, part in enumerate(parts)
+    ]
 
 
 def untold(poses: Poses, part: Array, asked: Array) -> Array:
     """(p,) True for parameters that poses outside a part do not tell, as `identify.identify` asks.
 
-    part: mask (m,).  asked: (p,) those that may be given up.
+    part: its J'AJ (p, p).  asked: (p,) those that may be given up.
     """
     out = np.zeros(len(asked), dtype=bool)
     if asked.any():
-        gram = poses.bread - np.diag(poses.prior) - poses.gram_of(part)
+        gram = poses.bread - np.diag(poses.prior) - part
         own = np.maximum(np.diag(gram), 0.0)
         gram[np.diag_indices_from(gram)] = np.where(poses.prior > 0.0, 2.0 * own, own)
         out[redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK)] = True
     return out
+
+
+def one_step(
+    poses: Poses, parts: Sequence[Array], every: PartSums, allowed: Array
+) -> dict[int, State]:
+    """Where one step leads without a part, for parts after which a second would hardly matter.
+
+    It would where it moved the part's points by a share NEAR of their error in the whole fit; the
+    pull on it is that at the first step's end, the normal matrix that of the whole fit.
+
+    parts: masks (m,), every: their sums.  allowed: (f,) False for parts that are not to be tried.
+    Returns states by the number of the part.
+    """
+    model, whole, which = poses.estimator.model, poses.estimator.whole, np.flatnonzero(allowed)
+    rest, held = poses.bread - every.gram[which], poses.prior * poses.off
+    first = solve_normal(rest, (poses.pull - every.pull[which] + held)[..., None])[..., 0]
+    near = [moved(poses.estimator, poses.state, step) for step in first]
+    pull = np.zeros(first.shape)
+    for i, at in enumerate(near):
+        left = whole.take(~parts[which[i]])
+        off = (model.prior.mean - model.values(at))[model.active]
+        pull[i] = left.normal(at, model.active).gradient.sum(axis=0) + poses.prior * off
+    more = solve_normal(rest, pull[..., None])
+    motion = (np.swapaxes(more, 1, 2) @ every.gram[which] @ more)[:, 0, 0]
+    arrived = motion <= NEAR**2 * every.square[which]  # not so where the step is no number
+    return {
+        int(i): at
+        for i, at, done in zip(which, near, arrived, strict=True)
+        if done and is_kept(at, model.room)
+    }
 
 
 def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
@@ -344,10 +377,6 @@ def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
     part: mask (m,).  gone: (p,) True for free parameters that then keep their nominal value.
     """
     estimator, state = poses.estimator, poses.state
-    if not gone.any():
-        near = moved(estimator, state, step_without(poses, part))
-        if is_kept(near, estimator.model.room) and arrived(poses, near, part):
-            return near
     rest = estimator.at(np.flatnonzero(~part)).whole
     active, free = rest.active.copy(), np.flatnonzero(rest.active)
     active[free[gone]] = False
@@ -356,20 +385,6 @@ def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
     effects[dropped] = nominal[dropped]
     found = nearby(rest.only(active), replace(state, effects=effects))
     return found.x.take(np.array(0)) if found.status[0] is Status.CONVERGED else None
-
-
-def arrived(poses: Poses, near: State, part: Array) -> bool:
-    """Whether a further step of the fit without a part hardly moves the part's points.
-
-    poses: at the whole fit, whose error there is what counts.  near: a step from it.  part: (m,).
-    """
-    there, whole = Poses.of(poses.estimator, near), poses.estimator.whole
-    own, (gram, pull) = whole.take(part), there.sums_of(~part)
-    left = pull + there.prior * there.off
-    step = solve_normal(gram + np.diag(there.prior), left[:, None])[:, 0]
-    motion = float(step @ own.normal(near, whole.active).gram.sum(axis=0) @ step)
-    error = float(own.cost(poses.state).sum())
-    return motion <= NEAR**2 * error  # not so where the step is no number
 
 
 def moved(estimator: Estimator, state: State, step: Array) -> State:

@@ -123,12 +123,18 @@ def too_far(
 
 
 def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[State, Array], Array]:
-    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m]."""
+    """Errors (k, r, 3) of a state near the solution at some rows of all poses [m].
+
+    data: in the first frame of the fit's sessions (`Cell.placed`).
+    """
     every, free = solved.effects.terms, of_sessions(data.frames)
     names, sessions = data.target_names, Sessions.of(data)
-    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data)
+    scene = Cell.of(robot, solved.state, names, NOTHING, sessions).scene(data) if every else None
+    model = model_of(robot, data)
 
     def error_of(state: State, rows: Array) -> Array:
+        if scene is None:
+            return np.asarray(model.take(rows).error(state) @ state.rotation.T)
         terms = free if len(state.effects) == steps_of(data.frames) else every
         effects = fitted(terms, scene, state.effects)
         return Cell.of(robot, state, names, effects, sessions).error(data.take(rows))

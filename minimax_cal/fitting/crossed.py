@@ -65,7 +65,7 @@ def crossed(
     fold = np.where(held, -1, drawn[np.minimum(np.searchsorted(names, group), len(names) - 1)])
     masks = [fold == number for number in range(int(drawn.max(initial=-1)) + 1)]
     fits = without(estimator, state, [mask[~held] for mask in masks], frames)
-    out = np.full_like(error_of(state, np.arange(len(held))), np.nan)
+    out = np.full((len(estimator.model.y), len(held), 3), np.nan)
     for mask, fit in zip([held, *masks], [state, *fits], strict=True):
         if fit:
             out[:, mask] = error_of(fit, mask)

@@ -10,7 +10,7 @@ all targets of a pose together (`noise`); the sandwich is H^-1 (sum J'A V A J) H
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -155,6 +155,15 @@ class Linearised(ABC):
 
 
 @dataclass(frozen=True, eq=False)
+class PartSums:
+    """Sums over each of some parts of the poses: J'AJ (f, p, p), J'Ae (f, p), e'Ae (f,)."""
+
+    gram: Array
+    pull: Array
+    square: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Poses(Linearised):
     """A linearised fit pose by pose, points in units of the instrument's noise.
 
@@ -266,6 +275,21 @@ class Poses(Linearised):
         whole = self.estimator.whole
         found = (whole if part.all() else whole.take(part)).normal(self.state, whole.active)
         return found.gram.sum(axis=0), found.gradient.sum(axis=0)
+
+    def sums_by_part(self, parts: Sequence[Array]) -> PartSums:
+        """The sums over each part, the poses linearised once.  parts: masks (m,)."""
+        f, p, whole = len(parts), int(self.estimator.model.active.sum()), self.estimator.whole
+        out = PartSums(np.zeros((f, p, p)), np.zeros((f, p)), np.zeros(f))
+        for rows, *found in whole.rows(self.state):
+            error, jacobian = by_pose(*found)
+            for i, part in enumerate(parts):
+                some = part[rows]
+                if some.any():
+                    e, j = error[some].ravel(), jacobian[some].reshape(-1, p)
+                    out.gram[i] += j.T @ j
+                    out.pull[i] += j.T @ e
+                    out.square[i] += e @ e
+        return out
 
     @cached_property
     def score(self) -> Array:

@@ -10,9 +10,9 @@ import minimax_cal as mc
 from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
     RANK,
-    arrived,
     moved,
     needed,
+    one_step,
     step_without,
     untold,
     without,
@@ -122,7 +122,10 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
     effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
     for part in (part.rows[~fit.held] for part in parts(fit.data)):
         near = moved(estimator, state, step_without(poses, part))
-        if untold(poses, part, effects_of).any() or arrived(poses, near, part):
+        sums = poses.sums_by_part([part])
+        if untold(poses, sums.gram[0], effects_of).any():
+            continue
+        if one_step(poses, [part], sums, np.ones(1, dtype=bool)):
             continue
         far += 1
         (found,) = without(estimator, state, [part], 0)
@@ -286,3 +289,15 @@ def test_the_plan_that_is_offered_mends_it(robot: mc.Robot) -> None:
     assert mended.beyond.worst is not None
     anywhere = simulate(robot, 200, seed=2).data.q
     assert rms_mm(mended, made, anywhere) < mended.beyond.worst_mm
+
+
+def test_sums_by_part_are_those_of_each_part(robot: mc.Robot, noisy: Simulation) -> None:
+    fit = mc.calibrate(robot, noisy.data, "sum")
+    poses = Poses.of(fit.estimator, fit.cell.state)
+    masks = [np.arange(poses.seen.shape[1]) % 4 == number for number in range(4)]
+    every = poses.sums_by_part(masks)
+    for i, mask in enumerate(masks):
+        gram, pull = poses.sums_of(mask)
+        assert_allclose(every.gram[i], gram, rtol=0, atol=1e-12 * np.abs(gram).max())
+        assert_allclose(every.pull[i], pull, rtol=0, atol=1e-12 * np.abs(poses.error).sum())
+    assert_allclose(every.square.sum(), poses.estimator.whole.cost(poses.state).sum(), rtol=1e-12)
