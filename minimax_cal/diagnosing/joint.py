@@ -18,7 +18,6 @@ import numpy as np
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.trial import Predicting
-from minimax_cal.fitting.beyond import moved
 from minimax_cal.fitting.uncertainty import Estimator, Poses, Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
@@ -28,7 +27,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.bounds import at_bounds, bounds, settled
 from minimax_cal.modelling.effects.table import NOTHING, Term, names_of
 from minimax_cal.modelling.joint_fit import extended, fitted
-from minimax_cal.modelling.model import Model
+from minimax_cal.modelling.model import Model, moved
 from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.bounded import bounded
 
@@ -113,7 +112,7 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
         step = bounded(bread, pull, *room.T)
         gain = float(2.0 * step @ pull - step @ bread @ step)
         square = float((poses.error**2).sum())
-        state = moved(Estimator(model, np.ones(len(model.y))), state, step)
+        state = moved(model, state, step)
         if gain <= SETTLED * square:
             break
     state = replace(state, effects=settled(state.effects, allowed))

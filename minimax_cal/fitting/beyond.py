@@ -24,6 +24,7 @@ from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import Region, groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.spans import Span, narrow, plan_that_mends, spans_in_words, spans_of
+from minimax_cal.modelling.model import moved
 from minimax_cal.modelling.near import is_kept, nearby
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
@@ -355,7 +356,7 @@ def one_step(
     model, whole, which = poses.estimator.model, poses.estimator.whole, np.flatnonzero(allowed)
     rest, held = poses.bread - every.gram[which], poses.prior * poses.off
     first = solve_normal(rest, (poses.pull - every.pull[which] + held)[..., None])[..., 0]
-    near = [moved(poses.estimator, poses.state, step) for step in first]
+    near = [moved(model, poses.state, step) for step in first]
     pull = np.zeros(first.shape)
     for i, at in enumerate(near):
         left = whole.take(~parts[which[i]])
@@ -385,13 +386,6 @@ def fit_of_rest(poses: Poses, part: Array, gone: Array) -> State | None:
     effects[dropped] = nominal[dropped]
     found = nearby(rest.only(active), replace(state, effects=effects))
     return found.x.take(np.array(0)) if found.status[0] is Status.CONVERGED else None
-
-
-def moved(estimator: Estimator, state: State, step: Array) -> State:
-    """A state after a step of the free parameters."""
-    full = np.zeros(estimator.model.names.count)
-    full[estimator.model.active] = step
-    return state.step(full)
 
 
 def left_out(

@@ -74,39 +74,31 @@ def scale_of(robot: Robot, data: Measurements, given: BaseFit) -> Scale:
     links_at = kinematics.chain(given.state.mdh, model.q, model.prismatic)
     drawn = kinematics.points(links_at, given.state.target_positions)  # measured ones hold error
     points = np.swapaxes(drawn, -1, -2).reshape(-1)[seen]
-    taken, _ = np.linalg.qr(every[:, n:])
     sigma = np.repeat([OFF_LENGTH, OFF_ANGLE], [2 * robot.joints, 3 * robot.joints])
-    links, stretch, left = (
-        part - taken @ (taken.T @ part) for part in (every[:, :n] * sigma, points, error)
-    )
-    u, size, _ = np.linalg.svd(links, full_matrices=False)
+    columns = np.column_stack([every[:, n:], every[:, :n] * sigma, points, error])
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    reduced = triangle[p - n :, p - n :]  # beside base and targets
+    u, size, _ = np.linalg.svd(reduced[:, :n], full_matrices=False)
+    stretch, left = reduced[:, n], reduced[:, n + 1]
     inside = np.array([u.T @ left, u.T @ stretch])
     outside = np.array([left - u @ inside[0], stretch - u @ inside[1]])
-    free = max(len(left) - p, 1) - len(size)
-    without, _ = best(size, inside, outside, free, scaled=False)
-    with_it, change = best(size, inside, outside, free, scaled=True)
+    free = max(len(error) - p, 1) - len(size)
+    without, with_it, change = best(size, inside, outside, free)
     return Scale(1.0 + change, 2.0 * (with_it - without))
 
 
-def best(
-    size: Array, inside: Array, outside: Array, free: int, *, scaled: bool
-) -> tuple[float, float]:
-    """The largest log likelihood over factors and noises, and the scale there.
+def best(size: Array, inside: Array, outside: Array, free: int) -> tuple[float, float, float]:
+    """The largest log likelihood over factors and noises, without a scale and with it; the scale.
 
     size: singular values of the links' columns.  inside, outside: error and stretch along these
     columns, and beside them.  free: numbers beside them.
     """
     variance = (FACTORS[:, None, None] * size) ** 2 + NOISES[:, None] ** 2  # (f, v, r)
+    noise, beside = NOISES**2, outside @ outside.T
     e, c = inside
-    beside = outside @ outside.T
-    noise = NOISES**2
-    scale = np.zeros(variance.shape[:2])
-    if scaled:
-        scale = ((e * c / variance).sum(-1) + beside[0, 1] / noise) / (
-            (c * c / variance).sum(-1) + beside[1, 1] / noise
-        )
-    square = ((e - scale[..., None] * c) ** 2 / variance).sum(-1)
-    rest = beside[0, 0] - 2.0 * scale * beside[0, 1] + scale**2 * beside[1, 1]
-    likely = -0.5 * (square + np.log(variance).sum(-1) + rest / noise + free * np.log(noise))
+    ee, ec, cc = np.moveaxis((1.0 / variance) @ np.array([e * e, e * c, c * c]).T, -1, 0)
+    ee, ec, cc = ee + beside[0, 0] / noise, ec + beside[0, 1] / noise, cc + beside[1, 1] / noise
+    sizes = np.log(variance).sum(-1) + free * np.log(noise)
+    likely = -0.5 * (ee - ec**2 / cc + sizes)
     at = np.unravel_index(int(np.argmax(likely)), likely.shape)
-    return float(likely[at]), float(scale[at])
+    return float(np.max(-0.5 * (ee + sizes))), float(likely[at]), float(ec[at] / cc[at])

@@ -30,6 +30,7 @@ RESOLUTION = 1e-3
 SHOWN = 4  # names in a reason
 SAME_MOTION = "same motion as {}"
 NOT_TOLD = "these poses do not tell it from {}"
+TOGETHER = "all targets moved together"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,18 +143,40 @@ def identify(
     what these poses do not.  known: (p,) True where a prior stands in for poses.  resolution:
     relative singular value that counts as not measured.
     """
+    kept, gram, scale = determined(model, state, order, allowed, reference, known, resolution)
+    held = known & ~geometric(model.names)  # a prior holds curves
+    curves = gram + np.diag(np.where(held, np.diag(gram), 0.0))
+    return kept.identification(curves, scale, model.names.target_names, TOGETHER)
+
+
+def determined(
+    model: Model,
+    state: State,
+    order: Array,
+    allowed: Array,
+    reference: Model,
+    known: Array,
+    resolution: float = RESOLUTION,
+) -> tuple[Kept, Array, Array]:
+    """What `identify` keeps, its reasons not yet in words; the Gram matrix, and the scale of each.
+
+    Arguments as of `identify`; scale as `Identification.scale`.
+    """
     names, gram = model.names, gram_of(model, state)
     scale = np.sqrt(np.diag(gram) / max(int(model.counts.sum()), 1))
     kept = Kept(names, allowed, {}).without(~allowed, "fixed by the user")
     kept = kept.without(kept.active & (scale <= 1e-12), "moves no measured point")
-    geometric = np.arange(names.count) < names.geometric
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
     plain = np.pad(plain, (0, names.count - len(plain)))
-    kept = kept.without(redundant(plain, kept.active & geometric, order, RANK), SAME_MOTION)
+    gone = redundant(plain, kept.active & geometric(names), order, RANK)
+    kept = kept.without(gone, SAME_MOTION)
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
-    kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
-    curves = gram + np.diag(np.where(known & ~geometric, np.diag(gram), 0.0))  # a prior holds them
-    return kept.identification(curves, scale, names.target_names, "all targets moved together")
+    return kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD), gram, scale
+
+
+def geometric(names: Names) -> Array:
+    """(p,) True for parameters that are not of effects."""
+    return np.asarray(np.arange(names.count) < names.geometric)
 
 
 def gram_of(model: Model, state: State) -> Array:

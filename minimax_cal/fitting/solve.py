@@ -178,17 +178,13 @@ class Task:
         if not (self.allowed & ~known.active).any():
             return None
         stays = known.active[self.order]
-        found = identify.identify(
-            model,
-            state,
-            np.concatenate([self.order[~stays], self.order[stays]]),
-            allowed=self.allowed,
-            reference=self.reference,
-            known=np.isfinite(self.sigma),
-            resolution=max(self.options.resolution, least),
-        )
-        more = found.active.sum() > known.active.sum()
-        return found if more and found.active[known.active].all() else None
+        order = np.concatenate([self.order[~stays], self.order[stays]])
+        sure, least = np.isfinite(self.sigma), max(self.options.resolution, least)
+        asked = (self.allowed, self.reference, sure, least)
+        kept, gram, scale = identify.determined(model, state, order, *asked)
+        if kept.active.sum() <= known.active.sum() or not kept.active[known.active].all():
+            return None
+        return kept.identification(gram, scale, model.names.target_names, identify.TOGETHER)
 
     def squares(self, model: Model, begin: State) -> tuple[Model, LeastSquares[State]]:
         """Least squares; with priors, weighed against the noise that remains."""

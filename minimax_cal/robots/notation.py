@@ -10,6 +10,7 @@ through the first joint: ``Rx(pi) Rz(t) Tz(d) = Rz(-t) Tz(-d) Rx(pi)``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -23,6 +24,17 @@ FORMULAS = {
 }
 TAIL = [A, ALPHA, BETA]  # what Craig's row i + 1 holds of the engine's row i
 SAME = 1e-9  # of an angle or a length that rounding changes [rad, m]
+
+
+@cache
+def names_of(joints: int, *, modified: bool) -> tuple[str, ...]:
+    """See `Notation.names`."""
+    later = modified * np.isin(np.arange(5), TAIL)
+    return tuple(
+        f"{kind}{i + 1 + more}"
+        for kind, more in zip(MDH_NAMES, later, strict=True)
+        for i in range(joints)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +53,7 @@ class Notation:
 
         What follows the last joint of Craig's rows is of no row: its number is n + 1.
         """
-        later = self.modified * np.isin(np.arange(5), TAIL)
-        return tuple(
-            f"{kind}{i + 1 + more}"
-            for kind, more in zip(MDH_NAMES, later, strict=True)
-            for i in range(joints)
-        )
+        return names_of(joints, modified=self.modified)
 
     def told(self, mdh: Array, prismatic: Array) -> Array:
         """(n, 5) the engine's rows with the values that the file's convention has for them."""

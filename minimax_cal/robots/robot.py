@@ -9,7 +9,7 @@ import tomllib
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -510,6 +510,7 @@ def explain(error: ValidationError) -> str:
     return message + (f" (and {more} more)" if more else "")
 
 
+@cache
 def builtin_robots() -> tuple[str, ...]:
     """Names of the robots that come with the package.
 
@@ -518,6 +519,17 @@ def builtin_robots() -> tuple[str, ...]:
     """
     folder = resources.files("minimax_cal.robots") / "builtin"
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json")))
+
+
+@cache
+def builtin_robot(name: str) -> Robot:
+    """A built-in robot, read once: its arrays cannot be changed."""
+    builtin = resources.files("minimax_cal.robots") / "builtin" / f"{name}.json"
+    robot = robot_from_dict(json.loads(builtin.read_text("utf-8")), name)
+    for part in (*vars(robot).values(), robot.notation.offset):
+        if isinstance(part, np.ndarray):
+            part.flags.writeable = False
+    return robot
 
 
 def written_out(text: str) -> Any:
@@ -545,9 +557,7 @@ def load_robot(source: Path | str) -> Robot:
     """
     path = Path(source)
     if str(source) in builtin_robots():
-        builtin = resources.files("minimax_cal.robots") / "builtin" / f"{source}.json"
-        text = builtin.read_text("utf-8")
-        return robot_from_dict(json.loads(text), str(source))
+        return builtin_robot(str(source))
     from minimax_cal.robots.urdf import is_urdf, load_urdf  # not for a built-in robot
 
     if is_urdf(source):

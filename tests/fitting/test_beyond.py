@@ -10,7 +10,6 @@ import minimax_cal as mc
 from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
     RANK,
-    moved,
     needed,
     one_step,
     step_without,
@@ -21,6 +20,7 @@ from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.measurements import Measurements, measurements
+from minimax_cal.modelling.model import moved
 from minimax_cal.modelling.simulate import Simulation, Truth, simulate
 
 
@@ -121,7 +121,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
     poses, far = Poses.of(estimator, state), 0
     effects_of = np.flatnonzero(estimator.model.active) >= estimator.model.names.geometric
     for part in (part.rows[~fit.held] for part in parts(fit.data)):
-        near = moved(estimator, state, step_without(poses, part))
+        near = moved(estimator.model, state, step_without(poses, part))
         sums = poses.sums_by_part([part])
         if untold(poses, sums.gram[0], effects_of).any():
             continue
@@ -189,7 +189,7 @@ def test_no_part_left_out_makes_a_joint_yield_upwards(
 
     def looked(poses: Poses, part: Array, gone: Array) -> Any:
         found.append(plain(poses, part, gone))
-        steps.append(moved(poses.estimator, poses.state, step_without(poses, part)))
+        steps.append(moved(poses.estimator.model, poses.state, step_without(poses, part)))
         return found[-1]
 
     monkeypatch.setattr(beyond, "fit_of_rest", looked)

@@ -72,12 +72,12 @@ def find_step(off: Array, apart: Between, matters: float) -> Step | None:
     of a distance that a step is at least.
     """
     pairs, m = off.shape
-    best, place = np.zeros(pairs), np.zeros(pairs, dtype=int)
-    for pair in range(pairs):
-        known = np.flatnonzero(np.isfinite(off[pair]))
-        if len(known) >= 2 * SHORTEST:
-            best[pair], first = scan(off[pair, known])
-            place[pair] = known[first]
+    best, place, known = np.zeros(pairs), np.zeros(pairs, dtype=int), np.isfinite(off)
+    for pattern in {row.tobytes(): row for row in known}.values():
+        alike, visited = (known == pattern).all(axis=1), np.flatnonzero(pattern)
+        if len(visited) >= 2 * SHORTEST:
+            best[alike], first = scan(off[alike][:, visited])
+            place[alike] = visited[first]
     limit = float(chdtri(1.0, FALSE_ALARM / max(2 * pairs * m, 1)))
     if not pairs or best.max() < limit:
         return None
@@ -123,61 +123,67 @@ def place_of(off: Array, change: Array, sigma: Array, at: int) -> int:
     return low + int(before[low - 1 : high].argmin())
 
 
-def scan(value: Array) -> tuple[float, int]:
-    """Largest squared standard score of a step in a series, and the first entry after it.
+def scan(values: Array) -> tuple[Array, Array]:
+    """Largest squared standard score of a step in each series, and the first entry after it.
 
     By ranks, so that no outlier counts for more than one visit; and by clipped standard scores,
-    which show a large step of few visits that ranks cannot.  value: (m,).
+    which show a large step of few visits that ranks cannot.  values: (p, m).
     """
-    return max((strength_of(score) for score in (ranked(value), clipped(value))), key=first_of)
+    (strength, first), (other, late) = (strength_of(f(values)) for f in (ranked, clipped))
+    return np.maximum(strength, other), np.where(strength >= other, first, late)
 
 
-def first_of(found: tuple[float, int]) -> float:
-    """The strength of a step."""
-    return found[0]
+def ranked(values: Array) -> Array:
+    """(..., m) normal scores of the ranks of each series, of mean 0 and variance 1."""
+    m = values.shape[-1]
+    order = np.argsort(values, axis=-1, kind="stable")
+    rank = np.empty(values.shape)
+    np.put_along_axis(rank, order, np.broadcast_to(np.arange(1.0, m + 1.0), values.shape), -1)
+    if not np.diff(np.take_along_axis(values, order, -1), axis=-1).all():
+        rank = np.apply_along_axis(mean_ranks, -1, values)
+    score = ndtri((rank - 0.5) / m)
+    spread = np.maximum(score.std(axis=-1, keepdims=True), 1e-12)
+    return np.asarray((score - score.mean(axis=-1, keepdims=True)) / spread)
 
 
-def ranked(value: Array) -> Array:
-    """(m,) normal scores of the ranks, of mean 0 and variance 1."""
-    # as scipy.stats.rankdata gives them, of ties the mean
+def mean_ranks(value: Array) -> Array:
+    """(m,) ranks as scipy.stats.rankdata gives them, of ties the mean."""
     _, place, alike = np.unique(value, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(alike) - 0.5 * (alike - 1))[place]
-    score = ndtri((rank - 0.5) / len(value))
-    return np.asarray((score - score.mean()) / max(float(score.std()), 1e-12))
+    return np.asarray((np.cumsum(alike) - 0.5 * (alike - 1))[place])
 
 
-def clipped(value: Array) -> Array:
-    """(m,) standard scores about the median, clipped, of mean 0; sigma by neighbours.
+def clipped(values: Array) -> Array:
+    """(p, m) standard scores about the median of each series, clipped, of mean 0.
 
-    The scatter of neighbours' differences knows no step, however many visits are after it; it is
-    widened by what it may be wrong.
+    Sigma by neighbours: the scatter of their differences knows no step, however many visits are
+    after it; it is widened by what it may be wrong.
     """
-    m = len(value)
-    sigma = float(scatter(np.diff(value)[None])[0]) / np.sqrt(2.0)
-    score = (value - np.median(value)) / (sigma * (1.0 + WIDER / np.sqrt(m)))
+    sigma = scatter(np.diff(values, axis=1)) / np.sqrt(2.0)
+    wider = sigma * (1.0 + WIDER / np.sqrt(values.shape[1]))
+    score = (values - np.median(values, axis=1, keepdims=True)) / wider[:, None]
     score = np.clip(score, -CLIP, CLIP)
-    return np.asarray(score - score.mean())
+    return np.asarray(score - score.mean(axis=1, keepdims=True))
 
 
-def strength_of(score: Array) -> tuple[float, int]:
-    """Squared standard score of the best step in scores (m,), and the first entry after it.
+def strength_of(score: Array) -> tuple[Array, Array]:
+    """(p,) squared standard score of the best step in scores (p, m), and the first entry after it.
 
     Less where neighbours are alike; 0 where a steady drift explains the series as well.
     """
-    m = len(score)
+    m = score.shape[1]
     count = np.arange(SHORTEST, m - SHORTEST + 1)
-    total = np.cumsum(score)[count - 1]
-    gain = total**2 * m / (count * (m - count))
-    first = int(count[gain.argmax()])
-    inside = score - np.where(np.arange(m) < first, score[:first].mean(), score[first:].mean())
-    alike = float(inside[1:] @ inside[:-1] / max(inside @ inside, 1e-12))
-    wider = (1.0 + max(alike, 0.0)) / max(1.0 - max(alike, 0.0), 1e-3)
+    gain = np.cumsum(score, axis=1)[:, count - 1] ** 2 * m / (count * (m - count))
+    first = count[gain.argmax(axis=1)]
+    late = np.arange(m) >= first[:, None]
+    before = np.where(late, 0.0, score).sum(axis=1) / first
+    after = np.where(late, score, 0.0).sum(axis=1) / (m - first)
+    inside = score - np.where(late, after[:, None], before[:, None])
+    alike = (inside[:, 1:] * inside[:, :-1]).sum(axis=1)
+    alike = np.maximum(alike / np.maximum((inside**2).sum(axis=1), 1e-12), 0.0)
+    wider = (1.0 + alike) / np.maximum(1.0 - alike, 1e-3)
     time = np.linspace(-1.0, 1.0, m)
-    drift = (score @ time) ** 2 / (time @ time)
-    strength = float(gain.max())
-    if strength - drift < 0.1 * strength:
-        return 0.0, first
-    return strength / wider, first
+    drift, strength = (score @ time) ** 2 / (time @ time), gain.max(axis=1)
+    return np.where(strength - drift < 0.1 * strength, 0.0, strength / wider), first
 
 
 def shift_of(data: Measurements, order: Array, apart: Between, step: Step, effect: str) -> Fault:

@@ -73,7 +73,7 @@ def mahalanobis(z: Array, m: int) -> Array:
     correlation = np.clip(correlation / size[:, None] / size, -0.9, 0.9)
     np.fill_diagonal(correlation, 1.0)
     out = np.zeros(z.shape[1])
-    for pattern in np.unique(known, axis=1).T:
+    for pattern in {column.tobytes(): column for column in known.T}.values():
         rows = (known == pattern[:, None]).all(axis=0)
         count = int(pattern.sum())
         if count:
