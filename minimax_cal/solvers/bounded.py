@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import lsq_linear
+import scipy
 
 from minimax_cal.ground.arrays import Array
 
@@ -25,7 +25,9 @@ def bounded(gram: Array, pull: Array, low: Array, high: Array) -> Array:
     root = np.sqrt(np.maximum(values, RIDGE))  # columns that are the same leave rounding
     target = vectors.T @ ((pull * scale)[~free] - across.T @ (pull * scale)[free]) / root
     room = (low / scale)[~free], (high / scale)[~free]
-    held = lsq_linear(root[:, None] * vectors.T, target, room, method="bvls", tol=1e-12).x
+    held = scipy.optimize.lsq_linear(
+        root[:, None] * vectors.T, target, room, method="bvls", tol=1e-12
+    ).x
     x[free] += across @ (x[~free] - held)
     x[~free] = held
     return np.asarray(scale * x)

@@ -15,7 +15,7 @@ from minimax_cal.fitting.fit import Parameter, Provenance, link_by_link
 from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.options import Progress, silent
 from minimax_cal.fitting.options import listed
-from minimax_cal.fitting.pixels.camera import INTRINSICS, read_camera
+from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
 from minimax_cal.fitting.pixels.fit import (
     PixelFit,
@@ -25,7 +25,7 @@ from minimax_cal.fitting.pixels.fit import (
     right,
 )
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
-from minimax_cal.fitting.pixels.model import FLANGE, GROUND, PixelModel, Scene, units_of
+from minimax_cal.fitting.pixels.model import PixelModel, Scene, units_of
 from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import (
     check_start,

@@ -18,6 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import read_text
 
+FLANGE, GROUND = "flange", "ground"  # what a camera is fixed to
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # those that can be fitted
 HELD = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")  # of the rational and the thin prism model
 LENGTHS = (0, 4, 5, 8, 12, 14)  # of OpenCV's list of distortion coefficients

@@ -27,7 +27,6 @@ from minimax_cal.solvers.least_squares import solve_normal
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 LENS = len(INTRINSICS)
-FLANGE, GROUND = "flange", "ground"  # what a camera is fixed to
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.fitting.options import Options
-from minimax_cal.fitting.pixels.camera import INTRINSICS
-from minimax_cal.fitting.pixels.model import FLANGE, GROUND
+from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
