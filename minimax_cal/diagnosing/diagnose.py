@@ -47,11 +47,11 @@ from minimax_cal.diagnosing.verdict import judged
 from minimax_cal.diagnosing.where import Where, where
 from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.fitting.beyond import Beyond
-from minimax_cal.fitting.calibrate import doubts
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.claims import too_far
 from minimax_cal.fitting.crossed import FEW
 from minimax_cal.fitting.fit import Provenance
+from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
 from minimax_cal.fitting.second_visits import contradictions
 from minimax_cal.fitting.solve import Solved, fit_cell

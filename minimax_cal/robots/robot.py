@@ -395,36 +395,11 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     metre, radian = METRES[schema.units.length], RADIANS[schema.units.angle]
     joints = schema.joints
     prismatic = np.array([joint.type == "prismatic" for joint in joints])
-    unit = np.where(prismatic, metre, radian)
-
-    def optional(values: list[float | None], default: float) -> Array:
-        return np.array([default if value is None else value for value in values], dtype=float)
-
-    def where_given(values: list[Any], unknown: Any) -> Array:
-        width = np.shape(unknown)
-        if all(value is None for value in values):
-            return np.zeros((0, *width))
-        return np.array([unknown if value is None else value for value in values], dtype=float)
-
-    angles = np.array([[j.theta, j.alpha, j.beta] for j in joints])
-    lower = optional([j.lower for j in joints], -np.inf)
-    upper = optional([j.upper for j in joints], np.inf)
-    check_angles(angles, schema.units.angle, source)
-    check_limits(lower, upper, prismatic, schema.units.angle, source)
-    lower, upper = lower * unit, upper * unit
+    unit, scale = np.where(prismatic, metre, radian), np.array([metre, metre, *[radian] * 3])
+    mdh = rows_of(schema, scale, source)
+    lower, upper = limits_of(schema, prismatic, unit, source)
     coupling = couplings.read(schema.coupling, [j.name for j in joints], source)
     passive = ~coupling.any(axis=0) if len(coupling) else np.zeros(len(joints), dtype=bool)
-    if np.any(lower >= upper):
-        number = int(np.argmax(lower >= upper)) + 1
-        raise RobotError(f"{source}: joint {number}: lower must be less than upper")
-    scale = np.array([metre, metre, radian, radian, radian])
-    mdh = np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in joints]) * scale
-    huge = np.abs(mdh) > [LONGEST, LONGEST, TURNED, TURNED, TURNED]
-    if huge.any():
-        joint, column = np.argwhere(huge)[0]
-        raise RobotError(
-            f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
-        )
     sign = np.array([float(j.sign) for j in joints])
     offset = np.array([j.offset for j in joints]) * unit
     offset = offset if offset.any() else np.zeros(0)
@@ -441,10 +416,6 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
     else:
         mdh, sign = notation.straight(mdh, sign, prismatic, offset, False)
         said = Notation(offset=offset) if len(offset) else PLAIN
-    up = np.array(schema.up)
-    up = up / max(1.0, float(np.abs(up).max()))  # the squares of huge numbers are none
-    if np.linalg.norm(up) < 1e-9:
-        raise RobotError(f"{source}: up: is a zero vector; give the vertical, e.g. [0, 0, 1]")
     return Robot(
         name=schema.name,
         mdh=mdh,
@@ -455,7 +426,7 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         ratio=optional([j.ratio for j in joints], np.nan),
         mass=optional([j.mass_kg for j in joints], np.nan),
         com=com,
-        up=up / np.linalg.norm(up),
+        up=vertical(schema, source),
         repeatability=1e-3 * (schema.repeatability_mm or math.nan),
         rough=schema.nominal == "rough",
         drawn_within=(1e-3 * schema.drawn_within.mm, 1e-3 * schema.drawn_within.mrad),
@@ -464,6 +435,54 @@ def robot_from_dict(content: Mapping[str, Any], source: str = "robot") -> Robot:
         coupling=coupling,
         notation=said,
     )
+
+
+def optional(values: list[float | None], default: float) -> Array:
+    """Numbers (n,), a default where there is none."""
+    return np.array([default if value is None else value for value in values], dtype=float)
+
+
+def where_given(values: list[Any], unknown: Any) -> Array:
+    """Numbers or rows (n, ...), `unknown` where there is none; (0, ...) where there are none."""
+    if all(value is None for value in values):
+        return np.zeros((0, *np.shape(unknown)))
+    return np.array([unknown if value is None else value for value in values], dtype=float)
+
+
+def rows_of(schema: RobotSchema, scale: Array, source: str) -> Array:
+    """The links (n, 5) as a file has them.  scale: (5,) its units [m, rad].  Raises RobotError."""
+    mdh = np.array([[j.a, j.d, j.theta, j.alpha, j.beta] for j in schema.joints])
+    check_angles(mdh[:, 2:], schema.units.angle, source)
+    mdh = mdh * scale
+    huge = np.abs(mdh) > [LONGEST, LONGEST, TURNED, TURNED, TURNED]
+    if huge.any():
+        joint, column = np.argwhere(huge)[0]
+        raise RobotError(
+            f"{source}: joints[{joint}].{MDH_NAMES[column]}: is over 1 km or 1000 rad; check units"
+        )
+    return np.asarray(mdh)
+
+
+def limits_of(
+    schema: RobotSchema, prismatic: Array, unit: Array, source: str
+) -> tuple[Array, Array]:
+    """Lower and upper limits (n,), infinite where unknown [rad, m].  Raises RobotError."""
+    lower = optional([j.lower for j in schema.joints], -np.inf)
+    upper = optional([j.upper for j in schema.joints], np.inf)
+    check_limits(lower, upper, prismatic, schema.units.angle, source)
+    if np.any(lower >= upper):
+        number = int(np.argmax(lower >= upper)) + 1
+        raise RobotError(f"{source}: joint {number}: lower must be less than upper")
+    return lower * unit, upper * unit
+
+
+def vertical(schema: RobotSchema, source: str) -> Array:
+    """(3,) the unit vector upwards in the base frame.  Raises RobotError."""
+    up = np.array(schema.up)
+    up = up / max(1.0, float(np.abs(up).max()))  # the squares of huge numbers are none
+    if np.linalg.norm(up) < 1e-9:
+        raise RobotError(f"{source}: up: is a zero vector; give the vertical, e.g. [0, 0, 1]")
+    return np.asarray(up / np.linalg.norm(up))
 
 
 def is_modified(schema: RobotSchema, source: str) -> bool:

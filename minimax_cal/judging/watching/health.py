@@ -61,14 +61,8 @@ def check(
 
     >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
     """
-    limits = limits_of(tolerance)
-    if not limits:
-        raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
+    limits, known = required(tolerance), checked_known(known)
     check_seed(seed)
-    known = tuple(listed(known))
-    for part in known:
-        if part not in KNOWN:
-            raise OptionError(f"known: {part!r} is none of {', '.join(KNOWN)}")
     fit = fit if isinstance(fit, Fit) else load_fit(fit)
     data = data if isinstance(data, Measurements) else read_measurements(data)
     watched, said = watched_of(fit, data, known)
@@ -76,18 +70,12 @@ def check(
     links = in_names(fit, watched, fit.identification.active)
     found = search(watched, links)
     error, after_it = (left(watched, placed) for placed in (found.before, found.after))
-    verdicts = tuple(
-        verdict(limit, error, watched.data, found.before.used, seed) for limit in limits
-    )
-    refused = REFUSED.get(fit.status, "") or computed(
-        replace(data, simulated=data.simulated or simulated),
-        residual(error, found.before.used),
-        (math.sqrt(3.0 * fit.known.noise.variance), "the calibration's noise"),
-        "the calibrated arm",
-    )
-    if refused:
+    used = found.before.used
+    verdicts = tuple(verdict(limit, error, watched.data, used, seed) for limit in limits)
+    exact = replace(data, simulated=data.simulated or simulated)
+    if why := refused(fit, exact, residual(error, used)):
         verdicts = tuple(
-            replace(one, valid=False, confidence=STATED[1], why=refused) for one in verdicts
+            replace(one, valid=False, confidence=STATED[1], why=why) for one in verdicts
         )
     after = refit(fit, watched, found)
     spread, enough, asked = prospects(watched, found)
@@ -114,6 +102,31 @@ def check(
         set_aside=data.set_aside,
         with_them=counting_all(watched, found.before, seed) if data.set_aside else None,
     )
+
+
+def required(tolerance: str) -> tuple[Limit, ...]:
+    """What is required.  Raises OptionError."""
+    limits = limits_of(tolerance)
+    if not limits:
+        raise OptionError(f"tolerance {tolerance!r}: write it in mm as rms 0.2, max 0.5")
+    return limits
+
+
+def checked_known(known: str | Sequence[str]) -> tuple[str, ...]:
+    """What is where it was.  Raises OptionError."""
+    for part in listed(known):
+        if part not in KNOWN:
+            raise OptionError(f"known: {part!r} is none of {', '.join(KNOWN)}")
+    return tuple(listed(known))
+
+
+def refused(fit: Fit, data: Measurements, missed: float) -> str:
+    """Why no verdict can be that the calibration is valid; empty where one can.
+
+    missed: `residual` of the new points [m].
+    """
+    noise = math.sqrt(3.0 * fit.known.noise.variance), "the calibration's noise"
+    return REFUSED.get(fit.status, "") or computed(data, missed, noise, "the calibrated arm")
 
 
 # ---- valid or not ------------------------------------------------------------------------------

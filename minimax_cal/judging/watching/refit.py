@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -31,20 +32,9 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
     cell = Cell.of(
         watched.cell.robot, state, names.target_names, watched.cell.effects, watched.cell.sessions
     )
-    drawn = fit.before.robot
-    nominal = place(drawn, data)
-    axes, blank = nominal.base[:3, :3], np.zeros(names.count - names.geometric)
-    drawn_at = replace(nominal.state, effects=blank).along(axes, drawn)
-    end = cell.state.along(axes, cell.robot)
-    every = link_by_link(names, sure.units, drawn_at, end, sure.sigma, known)
+    nominal = place(fit.before.robot, data)
     before, after = nominal.error(data), cell.error(data)
     nobody = np.zeros(data.poses, dtype=bool)
-    links = [names.all[i] for i in range(5 * fit.cell.robot.joints) if not rows.active[i]]
-    settings = {
-        **fit.options.settings(), "objective": "sum", "holdout": 0.0, "holdout_by": None,
-        "fix": links, "free": (), "priors": {}, "loss": "square", "trim": 0.0,
-        "after_check": True,
-    }  # fmt: skip
     told = ", ".join(m.parameter for m in found.named) or "nothing but frame and targets"
     return replace(
         fit,
@@ -53,7 +43,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         objective="sum",
         status=Status.CONVERGED,
         iterations=1,
-        parameters=Parameters(every, fit.known.dof),
+        parameters=parameters_of(fit, nominal, cell, sure, known),
         accuracy={
             "nominal": accuracy(before[:, nobody]),
             "train": accuracy(after),
@@ -76,7 +66,7 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         share=np.ones(len(names.target_names)),
         prior=np.zeros(names.count),
         widening=1.0,
-        provenance=Provenance.of(drawn, data, settings),
+        provenance=Provenance.of(fit.before.robot, data, settings_of(fit, rows, sure)),
         claim=partial(Beyond, reason="few poses after a check: nothing is left out"),
         stated=None,
         error_crossed=np.zeros((0, 0, 3)),
@@ -86,6 +76,28 @@ def refit(fit: Fit, watched: Watched, found: Search) -> Fit:
         set_aside=data.set_aside,
         with_them=None,
     )
+
+
+def parameters_of(
+    fit: Fit, nominal: Cell, cell: Cell, sure: Uncertainty, known: Identification
+) -> Parameters:
+    """Every parameter, as drawn and then."""
+    names, axes = sure.names, nominal.base[:3, :3]
+    blank = np.zeros(names.count - names.geometric)
+    drawn = replace(nominal.state, effects=blank).along(axes, nominal.robot)
+    end = cell.state.along(axes, cell.robot)
+    every = link_by_link(names, sure.units, drawn, end, sure.sigma, known)
+    return Parameters(every, fit.known.dof)
+
+
+def settings_of(fit: Fit, rows: Rows, sure: Uncertainty) -> dict[str, Any]:
+    """The options of a calibration that would end there."""
+    links = [sure.names.all[i] for i in range(5 * fit.cell.robot.joints) if not rows.active[i]]
+    return {
+        **fit.options.settings(), "objective": "sum", "holdout": 0.0, "holdout_by": None,
+        "fix": links, "free": (), "priors": {}, "loss": "square", "trim": 0.0,
+        "after_check": True,
+    }  # fmt: skip
 
 
 def geometric_of(fit: Fit, cell: Cell, data: Measurements) -> Cell:

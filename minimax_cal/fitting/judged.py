@@ -1,0 +1,384 @@
+"""A solved fit judged at all poses: its result, with accuracy, notices and what is alarming."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from minimax_cal.fitting.between_sessions import between_sessions
+from minimax_cal.fitting.changed import Change
+from minimax_cal.fitting.checks import (
+    POOR_FIT,
+)
+from minimax_cal.fitting.claims import (
+    bad_rows,
+    beyond_of,
+    crossed_of,
+    drawn_crossed_of,
+    is_crossed,
+    unjudged,
+    unseen_suspects,
+)
+from minimax_cal.fitting.common_scale import common_share
+from minimax_cal.fitting.crossed import NOT_CROSSED, few_poses
+from minimax_cal.fitting.fit import (
+    Fit,
+    KeptDistance,
+    Parameters,
+    Provenance,
+    Work,
+    WorstCase,
+    link_by_link,
+)
+from minimax_cal.fitting.improvement import Improvement, no_better, rms_of, said_without
+from minimax_cal.fitting.options import (
+    Options,
+    qp_name,
+)
+from minimax_cal.fitting.outcome import (
+    compared,
+    exchanged_rows,
+    hidden,
+    impossible,
+    said_of_exchanged,
+)
+from minimax_cal.fitting.same_arm import wild
+from minimax_cal.fitting.second_visits import contradictions
+from minimax_cal.fitting.set_aside import judged_with
+from minimax_cal.fitting.solve import PER, Solved
+from minimax_cal.fitting.start import EVERYWHERE
+from minimax_cal.fitting.stations import jumps
+from minimax_cal.fitting.suspects import Suspect
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring import checks, faults
+from minimax_cal.measuring.accuracy import accuracy
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.measuring.stations import Frames
+from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.parameters import State, links_of
+from minimax_cal.robots.robot import Robot
+from minimax_cal.solvers.least_squares import name_of
+from minimax_cal.solvers.status import Status
+
+MIN_MULTIPLIER = 1e-6  # a point of a smaller multiplier does not decide
+ACTIVE_TOLERANCE = 1e-6  # a function equals the largest, relative
+ENDED = (Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED)  # with an arm to compare
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Measurements as they are used: all poses, those of the fit, those held out; remarks.
+
+    near: (3, 3) rotation of the base that fits all poses best, where it was looked for.
+    """
+
+    data: Measurements
+    train: Measurements
+    held: Measurements
+    notices: tuple[str, ...]
+    near: Array = field(default_factory=lambda: EVERYWHERE)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A solved fit at all poses: errors of the drawn and the calibrated arm, and how it ended."""
+
+    robot: Robot
+    options: Options
+    poses: Parts
+    solved: Solved
+
+    @cached_property
+    def held(self) -> Array:
+        """(m,) True for poses that the fit has not seen."""
+        return np.isin(self.poses.data.line, self.poses.held.line)
+
+    @cached_property
+    def cell(self) -> Cell:
+        """The calibrated robot in its place."""
+        return self.solved.cell(self.robot, self.poses.data)
+
+    @cached_property
+    def nominal(self) -> Cell:
+        """The drawn robot in its place."""
+        return self.solved.nominal_cell(self.robot, self.poses.data, self.cell.sessions.clock)
+
+    @cached_property
+    def data(self) -> Measurements:
+        """All poses in the first frame of the fit's sessions."""
+        return self.cell.placed(self.poses.data)
+
+    @cached_property
+    def before(self) -> Array:
+        """(k, m, 3) errors of the drawn arm [m]."""
+        return self.nominal.error(self.data)
+
+    @cached_property
+    def after(self) -> Array:
+        """(k, m, 3) errors of the calibrated arm [m]."""
+        return self.cell.error(self.data)
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """The points that stand out, those of the fit first."""
+        unseen = unseen_suspects(self.robot, self.data, self.held, self.solved)
+        return (*self.solved.robust.suspects, *unseen)
+
+    @cached_property
+    def crossed(self) -> tuple[Array, Array]:
+        """(k, m, 3) errors of both arms by fits without each pose, where so judged [m]."""
+        if not is_crossed(self.options, self.poses.held):
+            return NOT_CROSSED, NOT_CROSSED
+        given = self.robot, self.options, self.data, self.held, self.solved
+        return drawn_crossed_of(*given), crossed_of(*given)
+
+    @cached_property
+    def unseen(self) -> tuple[Array, Array]:
+        """(k, m, 3) errors of both arms on poses that neither has seen, NaN elsewhere [m]."""
+        return self.crossed if self.crossed[1].size else hidden(self.before, self.after, ~self.held)
+
+    @cached_property
+    def swapped(self) -> Array:
+        """(b,) rows whose points belong to other rows."""
+        return exchanged_rows(self.robot, self.data, self.before)
+
+    @cached_property
+    def wrong(self) -> str:
+        """Why this is no calibration of this arm; empty where it is one."""
+        given = self.robot, self.options, self.solved, self.data, self.held
+        return impossible(*given, self.before, self.after, self.swapped, self.suspects)
+
+    @cached_property
+    def better(self) -> Improvement | None:
+        """Both arms on unseen poses."""
+        return compared(self.options, self.solved, self.data, self.unseen, self.suspects)
+
+    @cached_property
+    def ending(self) -> tuple[Status, str]:
+        """How it ended, and why where it is no calibration or no better than the drawn arm."""
+        status, better = self.solved.status, self.better
+        if self.wrong:
+            return Status.FAILED, self.wrong
+        if better and not better.is_better and status in ENDED:
+            return Status.NO_BETTER, no_better(better, self.suspects)
+        return status, ""
+
+    @cached_property
+    def moved(self) -> tuple[Change, ...]:
+        """What changed between sessions."""
+        if self.wrong:
+            return ()
+        return between_sessions(self.robot, self.poses.train, self.solved, self.cell)
+
+    @cached_property
+    def alarming(self) -> tuple[str, ...]:
+        """Why the result should not be used as it is."""
+        return tuple(alarms(self.robot, self.poses, self.solved, self.before[:, ~self.held]))
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What the reader should know."""
+        data, better, after = self.data, self.better, self.after
+        swapped = len(self.swapped) and not self.wrong
+        return (
+            *self.poses.notices,
+            *self.solved.notices,
+            *remarks(self.options, self.poses),
+            *checks.outliers(data, np.linalg.norm(after, axis=-1)),
+            *contradictions(data, after),
+            *(fault.text for fault in faults.session_jumps(data, after)),
+            *(change.sentence for change in self.moved),
+            *self.alarming,
+            *bad_rows(self.suspects, data.source),
+            *unjudged(data, self.crossed[1]),
+            *([said_of_exchanged(data, self.swapped)] if swapped else []),
+            *([said_without(better, rms_of(*self.unseen))] if better and better.wrong else []),
+            *filter(None, [self.ending[1]]),
+        )
+
+    def fit(self, began: float) -> Fit:
+        """The result.  began: the calibration, by `time.perf_counter`."""
+        solved, options, data, held = self.solved, self.options, self.data, self.held
+        before, after, (drawn_crossed, crossed) = self.before, self.after, self.crossed
+        gone, counted = judged_with(data, held, self.cell, after, crossed, solved, options)
+        status, reason = self.ending
+        given = self.robot, options, data, held, solved, self.suspects
+        return Fit(
+            cell=self.cell,
+            nominal=self.nominal,
+            objective=options.objective,
+            qp=qp_name(options.qp),
+            status=status,
+            iterations=solved.iterations,
+            parameters=parameters_of(self.robot, solved),
+            accuracy={
+                "nominal": accuracy(before[:, held]),
+                "train": accuracy(after[:, ~held]),
+                "holdout": accuracy(after[:, held]),
+                "nominal_train": accuracy(before[:, ~held]),
+                **({"holdout_with_them": counted.accuracy} if counted else {}),
+            },
+            identification=solved.identification,
+            uncertainty=solved.uncertainty,
+            minimax=worst_case(options.objective, solved, self.poses.train, after[:, ~held]),
+            certificate=solved.certificate,
+            trace=tuple(float(value) for value in solved.squares.trace[:, 0]),
+            data=data,
+            held=held,
+            error_nominal=before,
+            error=after,
+            notices=self.notices,
+            loss=options.loss,
+            suspects=self.suspects,
+            weights=solved.robust.weights,
+            share=solved.estimator.share,
+            prior=solved.estimator.model.prior.weight,
+            widening=solved.widening,
+            provenance=Provenance.of(self.robot, data, options.settings()),
+            claim=partial(beyond_of, *given),
+            error_crossed=crossed,
+            set_aside=gone,
+            with_them=counted,
+            answered=solved.optimum.answered if solved.optimum else {},
+            work=work_of(solved),
+            error_drawn_crossed=drawn_crossed,
+            reason=reason,
+            moved=self.moved,
+            seconds=time.perf_counter() - began,
+        )
+
+
+def work_of(solved: Solved) -> Work:
+    """What the solvers did."""
+    method, best = name_of(solved.squares.method), solved.optimum
+    plain = Work(method, int(solved.squares.iterations[0]))
+    if best is None:
+        return plain
+    qps = sum(best.answered.values())
+    return replace(plain, qps=qps, warm_starts=best.warm, qp_residual=best.qp_residual)
+
+
+def alarms(robot: Robot, poses: Parts, solved: Solved, nominal_error: Array) -> Iterator[str]:
+    """Why the result should not be used as it is.  nominal_error: (k, training poses, 3) [m]."""
+    free = solved.identification.active & (solved.estimator.model.prior.weight == 0.0)
+    if few := few_poses(poses.train, int(free.sum())):
+        yield few
+    yield from doubts(robot, solved, nominal_error)
+
+
+def remarks(options: Options, poses: Parts) -> Iterator[str]:
+    """What the reader should know about the data behind a result."""
+    if is_crossed(options, poses.held) and not options.cv:
+        yield (
+            f"only {poses.held.poses} poses are held out: the result is cross-validated, every "
+            "pose judged by a fit without it"
+        )
+    if not poses.held.poses:
+        yield "no pose is held out: nothing here says how the fit does on new poses"
+    if options.objective.startswith("smr:") and len(poses.data.target_names) > 1:
+        name = options.objective.replace(":", "")
+        others = ", ".join(other for other in poses.data.target_names if other != name)
+        yield f"objective {options.objective}: {name} alone is fitted; {others} took no part"
+    if options.objective == "minimax" and len(poses.data.target_names) == 1:
+        yield "there is one target: minimax and sum are the same"
+    if checks.collinear(poses.train):
+        yield (
+            "the targets lie nearly on a line: positions are fine, but orientations about that "
+            "line would not be determined"
+        )
+
+
+def doubts(robot: Robot, solved: Solved, nominal_error: Array) -> Iterator[str]:
+    """Notices where the result is no calibration of this robot but of another one."""
+    reach = robot.reach()
+    miss = float(np.sqrt(np.nanmean(np.nansum(nominal_error**2, axis=-1))))
+    if miss > POOR_FIT * reach:
+        yield (
+            f"the nominal robot misses by {1e3 * miss:.3g} mm: check that it is the robot of these "
+            "measurements, with their joint signs, zero positions and units"
+        )
+    if share := same_share(solved):
+        yield (
+            f"all lengths changed by the same share, {100.0 * share:+.3f} %, as no error of links "
+            "does: check the scale, the units and the temperature compensation of the instrument; "
+            f"points scaled by {1.0 / (1.0 + share):.6g} have the drawn lengths"
+        )
+    if named := wild(solved.names, links_of(solved.state.mdh - solved.nominal.mdh), reach):
+        yield f"implausibly large changes: {named}; is the robot file the right one?"
+
+
+def same_share(solved: Solved) -> float:
+    """The share by which all identified lengths of the arm changed, 0 where they did not."""
+    drawn, n = solved.nominal.mdh, len(solved.nominal.mdh)
+    found = solved.identification.active[: 5 * n].reshape(5, n).T  # in the order of `links_of`
+    return common_share(drawn, solved.state.mdh - drawn, found)
+
+
+def parameters_of(robot: Robot, solved: Solved) -> Parameters:
+    """Every parameter, link by link, in the convention of the robot's file.
+
+    Base entries are measured along the nominal base's own axes: its origin as seen from the
+    instrument, and its turn from the nominal orientation (the pose itself is `Cell.base`).
+    Those of `session_jump` tell where it stands in a further session (`stations.jumps`).
+    """
+    known, sure = solved.identification, solved.uncertainty
+
+    def values(x: State, frames: Frames) -> Array:
+        stood, effects = jumps(frames, x.base), np.zeros(len(solved.units))
+        effects[len(effects) - len(x.effects) :] = x.effects
+        effects[: len(stood)] = stood
+        return replace(x, effects=effects).along(solved.nominal.rotation, robot)
+
+    before = values(solved.nominal, solved.start)
+    found = known.active | (np.arange(solved.names.count) >= solved.names.geometric)
+    after = np.where(found, values(solved.state, solved.frames), before)
+    every = link_by_link(solved.names, sure.units, before, after, sure.sigma, known)
+    return Parameters(every, sure.dof)
+
+
+def worst_case(
+    objective: str, solved: Solved, train: Measurements, error: Array
+) -> WorstCase | None:
+    """What the minimax rests on: every target, or the points that decide.
+
+    error: (k, m, 3) of the training poses [m].
+    """
+    best, weights = solved.optimum, solved.robust.weights
+    if best is None:
+        return None
+    labels, size = (
+        train.target_names,
+        np.array(accuracy(np.sqrt(weights)[..., None] * error).sse_mm2),
+    )
+    chosen = np.arange(len(best.mu))
+    if PER[objective] == "point":
+        points = np.argwhere(weights > 0.0)
+        labels = tuple(f"{labels[target]} line {train.line[pose]}" for target, pose in points)
+        size = 1e3 * np.linalg.norm(error, axis=-1)[weights > 0.0]
+        chosen = np.argsort(-best.mu)
+        chosen = chosen[best.mu[chosen] > MIN_MULTIPLIER]
+    active = np.flatnonzero(best.f >= best.f.max() * (1 - ACTIVE_TOLERANCE))
+    kept, names = solved.distances, train.target_names
+    return WorstCase(
+        functions=tuple(labels[i] for i in chosen),
+        size=size[chosen],
+        multiplier=best.mu[chosen],
+        active=tuple(labels[i] for i in active),
+        distances=tuple(
+            KeptDistance((names[a], names[b]), float(mean), float(tolerance), float(lam))
+            for (a, b), mean, tolerance, lam in zip(
+                kept.pairs,
+                kept.mean,
+                kept.tolerance,
+                best.lam[: len(kept.mean)] if len(best.lam) else np.zeros(len(kept.mean)),
+                strict=True,
+            )
+        ),
+        kkt=best.kkt,
+        iterations=best.iterations,
+        trace=best.trace,
+    )
