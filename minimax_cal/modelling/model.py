@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -402,6 +402,7 @@ def in_base(state: State, y: Array) -> Array:
     return np.asarray(np.swapaxes(state.rotation, -1, -2)[..., None, :, :] @ centred)
 
 
+@cache
 def precedes(n: int, k: int, effects: int) -> Array:
     """(r, omega) True where turning angle omega turns the direction of length r.
 
