@@ -25,6 +25,7 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
 from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import check_joints, limit_notices
 from minimax_cal.measuring.history import ordered
 from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_columns
@@ -140,9 +141,8 @@ class Compensation:
         for kind in Outcome:
             lines = [int(n) for n, o in zip(self.line, self.outcome, strict=True) if o == kind]
             if lines and kind.failed:
-                more = f" and {len(lines) - 8} more" if len(lines) > 8 else ""
-                where = ", ".join(map(str, lines[:8]))
-                parts.append(f"{kind} at line {where}{more}: {kind.advice}")
+                where = name_first(list(map(str, lines)))
+                parts.append(f"{kind} at line {where}: {kind.advice}")
         count = int(self.failed.sum())
         return f"{count} of {len(self.q)} targets are missed: " + "; ".join(parts) if count else ""
 

@@ -59,6 +59,7 @@ from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.ground.stages import name_rung
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.campaigns import measured
 from minimax_cal.measuring.faults import (
@@ -69,7 +70,6 @@ from minimax_cal.measuring.faults import (
     session_jumps,
     standing_out,
 )
-from minimax_cal.measuring.faults.fault import listed
 from minimax_cal.measuring.faults.nests import RESEAT
 from minimax_cal.measuring.floor import DISTANCES, Floor, floor_of, instrument_noise, noise_at_most
 from minimax_cal.measuring.grouping import clusters, held_out, split, with_groups
@@ -211,7 +211,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     unread = filter(None, [study.scene.unused_torques])
     told = (*asked.data.notices, *notices, *clean.remarks, *unread)
     if late:
-        told = (*told, f"outliers that no effect found explains: {listed(late)}")
+        told = (*told, f"outliers that no effect found explains: {name_first(late)}")
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
     every = ladder.last.cell.placed(clean.given)
     told = (*told, *contradictions(every, ladder.last.cell.error(every)))

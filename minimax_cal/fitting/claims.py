@@ -15,6 +15,7 @@ from minimax_cal.fitting.stations import steps_of
 from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.floor import known_floor
 from minimax_cal.measuring.grouping import clusters, grouped, parts
@@ -52,13 +53,10 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
     """Notice of held-out points that stand out: they judge the fit."""
     held = [one for one in suspects if one.held]
     if held:
-        named = ", ".join(
-            f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held[:LISTED]
-        )
-        more = f" and {len(held) - LISTED} more" if len(held) > LISTED else ""
+        named = [f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held]
         yield (
-            f"{source}: outliers among the held-out points: {named}{more}; they count in the "
-            "held-out accuracy, which is also given without them"
+            f"{source}: outliers among the held-out points: {name_first(named, LISTED)}; they "
+            "count in the held-out accuracy, which is also given without them"
         )
 
 
@@ -70,11 +68,10 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
     if crossed.size:
         lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(0, 2))
         if lost.any():
-            named = ", ".join(str(line) for line in data.line[lost][:LISTED])
-            more = f" and {lost.sum() - LISTED} more" if lost.sum() > LISTED else ""
+            named = name_first([str(line) for line in data.line[lost]], LISTED)
             yield (
                 f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
-                f"that none without them judges them: line {named}{more}"
+                f"that none without them judges them: line {named}"
             )
 
 

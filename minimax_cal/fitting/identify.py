@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import Names, State
 from minimax_cal.robots import kinematics
@@ -103,8 +104,7 @@ class Kept:
         spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
         if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
             shown = [name for name in shown if name not in spots] + [whole]
-        more = len(shown) - SHOWN
-        return ", ".join(shown[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+        return name_first(shown, SHOWN)
 
 
 def drop_order(robot: Robot, names: Names) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from minimax_cal.fitting.suspects import Suspect, aside
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 
@@ -101,21 +102,18 @@ def improvement(
 
 def points_of(data: Measurements, which: Array, error: Array) -> str:
     """Points in words.  which: (k, m).  error: (k, m, 3) [m]."""
-    far = np.argwhere(which)
     size = 1e3 * np.linalg.norm(error, axis=-1)
     shown = [
         f"line {data.line[pose]} {data.target_names[target]} {size[target, pose]:.3g} mm"
-        for target, pose in far[:NAMED].tolist()
+        for target, pose in np.argwhere(which).tolist()
     ]
-    more = f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
-    return ", ".join(shown) + more
+    return name_first(shown, NAMED)
 
 
 def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
     off = [f"line {one.line} {one.target} {1e3 * one.distance:.3g} mm" for one in suspects]
-    more = f" and {len(off) - NAMED} more" if len(off) > NAMED else ""
-    rows = f"; check the outliers ({', '.join(off[:NAMED])}{more})" if off else ""
+    rows = f"; check the outliers ({name_first(off, NAMED)})" if off else ""
     return (
         f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "
         "the drawn arm, or calibrate again with more poses, joint values with all their digits "

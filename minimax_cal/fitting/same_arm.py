@@ -12,6 +12,7 @@ from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.joint_fit import refitted
@@ -58,17 +59,16 @@ def too_changed(robot: Robot, after: Robot, active: Array) -> str:
         return ""
     far = far[np.argsort(-np.abs(change[far]) / most[far])]
     names, lengths = Names.of(robot, ()).all, 2 * robot.joints
-    named = ", ".join(
+    named = [
         f"{names[i]} by {1e3 * change[i]:+.3g} mm" if i < lengths
         else f"{names[i]} by {math.degrees(change[i]):+.3g} degrees"
-        for i in far[:NAMED]
-    )  # fmt: skip
-    more = f" and {len(far) - NAMED} more" if len(far) > NAMED else ""
+        for i in far
+    ]  # fmt: skip
     return (
-        f"the measured arm is not the one that {robot.name} draws: {named}{more} (at most "
-        f"{1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of alpha and "
-        "beta, 30 of theta): check the robot file, joint signs and units; where the drawing is "
-        "rough, give allow_large_changes=True"
+        f"the measured arm is not the one that {robot.name} draws: {name_first(named, NAMED)} "
+        f"(at most {1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of "
+        "alpha and beta, 30 of theta): check the robot file, joint signs and units; where the "
+        "drawing is rough, give allow_large_changes=True"
     )
 
 

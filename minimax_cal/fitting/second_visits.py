@@ -12,6 +12,7 @@ import numpy as np
 
 from minimax_cal.fitting.suspects import Scores, spread_of
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.faults.distances import FAINT
 from minimax_cal.measuring.floor import FEWEST
 from minimax_cal.measuring.grouping import visits
@@ -53,12 +54,10 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
         guilty = size[target, pair[1]] > GUILTY * size[target, pair[0]]
         text = f"line {wrong} {name} is {off:.2g} mm from line {right}"
         told.setdefault((*sorted(pair), target), text + (", which fits" if guilty else ""))
-    shown = list(told.values())[:MOST]
-    more = f" and {len(told) - MOST} more" if len(told) > MOST else ""
     yield (
         f"{data.source}: visits to one pose that contradict each other; of each pair one point is "
         f"wrong, or something moved (95 % of the others come within {1e3 * usual:.2g} mm): "
-        f"{'; '.join(shown)}{more}"
+        f"{name_first(list(told.values()), MOST, '; ')}"
     )
 
 

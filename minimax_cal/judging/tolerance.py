@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.intervals import UNKNOWN, Interval, chance_of_larger
 from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.solvers.status import Status
 
@@ -165,9 +166,8 @@ def open_of(found: Beyond) -> str:
         return "an earlier version wrote this file and does not tell which parts were not judged"
     if not found.missed:
         return ""
-    named = ", ".join(found.missed[:NAMED])
-    more = f" and {len(found.missed) - NAMED} more" if len(found.missed) > NAMED else ""
-    return f"only {found.judged} could be judged, not {named}{more}, which the fit needs"
+    named = name_first(found.missed, NAMED)
+    return f"only {found.judged} could be judged, not {named}, which the fit needs"
 
 
 REFUSED = {  # ends of a calibration of which nothing is passed, whatever its numbers

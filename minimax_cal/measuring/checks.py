@@ -10,6 +10,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.columns import OF_JOINT
 from minimax_cal.measuring.grouping import mislabelled
 from minimax_cal.measuring.measurements import Measurements
@@ -142,13 +143,12 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
     found = np.argwhere(far)
     if not len(found):
         return []
-    worst = sorted(found, key=lambda at: -distance[tuple(at)])[:5]
-    named = ", ".join(
+    named = [
         f"line {data.line[pose]} {data.target_names[target]} {1e3 * distance[target, pose]:.3g} mm"
-        for target, pose in worst
-    )
-    more = f" and {len(found) - 5} more" if len(found) > 5 else ""
-    return [f"{data.source}: outliers (typical error {1e3 * usual:.3g} mm): {named}{more}"]
+        for target, pose in sorted(found, key=lambda at: -distance[tuple(at)])
+    ]
+    typical = f"outliers (typical error {1e3 * usual:.3g} mm)"
+    return [f"{data.source}: {typical}: {name_first(named, 5)}"]
 
 
 def check_spread(robot: Robot, data: Measurements) -> None:

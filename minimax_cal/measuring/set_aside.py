@@ -14,7 +14,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.words import one_line
+from minimax_cal.ground.words import name_first, one_line
 from minimax_cal.measuring.aside import FILE, TOOL, USER, SetAside
 from minimax_cal.measuring.measurements import Measurements
 
@@ -179,9 +179,8 @@ def left_out(data: Measurements, points: Iterable[str]) -> Measurements:
     new = data.set_aside[count:]
     if not new:
         return data
-    listed = " ".join(f"{point.row}:{point.target}" for point in new[:NAMED])
-    more = f" and {len(new) - NAMED} more" if len(new) > NAMED else ""
-    said = f"{len(new)} points set aside: {listed}{more}"
+    named = name_first([f"{point.row}:{point.target}" for point in new], NAMED, " ")
+    said = f"{len(new)} points set aside: {named}"
     return sound(replace(data, notices=(*data.notices, said)))
 
 

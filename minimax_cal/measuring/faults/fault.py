@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,9 +40,3 @@ class Fault:
     rows: Array = field(default_factory=lambda: NONE)
     targets: Array = field(default_factory=lambda: NONE)
     parameters: tuple[Amount, ...] = ()
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """Some names, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.ground.arrays import Array, known_median
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.faults.distances import FAINT, FEWEST, Between, between, scatter
-from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
+from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
 from minimax_cal.measuring.faults.limits import ALIKE
 from minimax_cal.measuring.faults.surprise import heights, unlikely
 from minimax_cal.measuring.measurements import Measurements
@@ -57,7 +58,9 @@ def told(data: Measurements, found: Mapping[tuple[int, int], str]) -> tuple[Faul
         return ()
     points = sorted(found)
     rows, targets = np.array(points).T
-    named = listed([f"line {data.line[row]} {data.target_names[target]}" for row, target in points])
+    named = name_first(
+        [f"line {data.line[row]} {data.target_names[target]}" for row, target in points]
+    )
     by = " and by ".join(sorted(set(found.values())))
     places = sorted({data.target_names[target] for target in targets})
     return (

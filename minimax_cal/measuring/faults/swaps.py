@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.checks import orders_of
 from minimax_cal.measuring.faults.distances import Between, between
-from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault, listed
+from minimax_cal.measuring.faults.fault import NO_ERROR, Amount, Fault
 from minimax_cal.measuring.faults.limits import outlier_limit
 from minimax_cal.measuring.measurements import Measurements
 
@@ -33,7 +34,7 @@ def swapped_rows(data: Measurements, error: Array = NO_ERROR) -> tuple[Fault, ..
             orders.append(order)
     if not rows:
         return ()
-    lines = listed([str(data.line[row]) for row in rows])
+    lines = name_first([str(data.line[row]) for row in rows])
     return (
         Fault(
             "swapped_rows",

@@ -9,6 +9,7 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
+from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.importers.names import Match, match_names, natural, parts_of
 from minimax_cal.measuring.importers.reading import Column, Reading
 
@@ -70,11 +71,10 @@ def by_name(points: Reading, joints: Reading, match: Match) -> tuple[Reading, Pl
     kept = np.flatnonzero(rows >= 0)
     if len(lost := np.flatnonzero(rows < 0)):
         key = points.column("pose")
-        named = ", ".join(f"{key.cells[i]} (line {points.line[i]})" for i in lost[:MOST_NAMED])
-        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        named = [f"{key.cells[i]} (line {points.line[i]})" for i in lost]
         points = points.saying(
             f"{len(lost)} points have no pose of their name in {joints.sheet.path} and are left "
-            f"out: {named}{more}"
+            f"out: {name_first(named, MOST_NAMED)}"
         )
     points, labels = points.take(kept), [match.label[i] for i in kept]
     own, slot = labels_of(points)
@@ -98,8 +98,7 @@ def gaps(joints: Reading, spot: Places) -> list[str]:
         out.append(names[pose] + ("" if whole else f" (target {', '.join(lacking)})"))
     if not out:
         return []
-    more = f" and {len(out) - MOST_NAMED} more" if len(out) > MOST_NAMED else ""
-    return [f"no point, left empty: {', '.join(out[:MOST_NAMED])}{more}"]
+    return [f"no point, left empty: {name_first(out, MOST_NAMED)}"]
 
 
 def settled(points: Reading, joints: Reading, layout: str) -> Reading:
