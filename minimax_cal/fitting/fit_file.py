@@ -31,6 +31,7 @@ from minimax_cal.fitting.fit import (
 )
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
+from minimax_cal.fitting.options import options_from
 from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
@@ -415,7 +416,7 @@ def assembled(
     after: Array,
 ) -> Fit:
     """The fit from what was read.  Raises one of FAULTS."""
-    check_settings(part.provenance.settings)
+    options_from(part.provenance.settings)  # what later work rests on
     known = uncertainty_of(content, source, cell, arrays)
     parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
     train = data.take(~held)
@@ -467,15 +468,6 @@ def with_them_of(scores: ScoresPart | None) -> WithThem | None:
     if scores is None:
         return None
     return WithThem(scores.accuracy(), scores.rms_ci95_mm, scores.max_ci95_mm)
-
-
-def check_settings(settings: Mapping[str, object]) -> None:
-    """Raise ValueError for settings that later work rests on and cannot."""
-    seed, by = settings.get("seed", 0), settings.get("holdout_by")
-    if not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"provenance.settings.seed: {seed!r} is no seed")
-    if not isinstance(by, str | None):
-        raise ValueError(f"provenance.settings.holdout_by: {by!r} is no column")
 
 
 def refined(cell: Cell, arrays: Mapping[str, Array], name: str) -> Cell:

@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.options import Options, options_from
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.stations import LEAST, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
@@ -234,13 +234,12 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     status = Status(content["status"]) if "status" in content else None
     spans = spans_of(first.robot, data.take(~held)) if first and data.poses else ()
     settings = content["provenance"].get("settings", {})
-    kept = {key: settings[key] for key in vars(Options()) if key in settings}
     last = rungs[-1].cell
     known = last.effects.causes if last else ()
     firm = {term.text for term in confirmed(content, known)}
     return Opened(
         source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
-        options=Options(**{**kept, "objective": "sum"}) if data.poses else None,
+        options=options_from(settings, objective="sum") if data.poses else None,
         outside=checked(BeyondPart, content["gap"].get("beyond", {}), source).beyond,
         possible=frozenset(term.text for term in known) - firm,
     )  # fmt: skip

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TypeVar
+from functools import cache, partial
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from minimax_cal.solvers.minimax import Solver, from_nothing
 from qp_backends import BackendError, Problem, Solution
 from qp_backends import solve as solve_qp
 from qp_backends.registry import backend
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 OFFSETS = "offsets"  # what `only` may ask for
 FALLBACK = "daqp"  # a required package
@@ -220,6 +223,29 @@ class Options:
         """For the record, effects in their written form."""
         effects = [e.text if isinstance(e, Term) else e for e in self.effects]
         return {**vars(self), "effects": effects, "qp": qp_name(self.qp)}
+
+
+def options_from(settings: Mapping[str, object], **given: object) -> Options:
+    """The options that a result's file holds, but for those given.  Raises ValueError."""
+    kept: dict[str, object] = {}
+    for name, reader in readers().items():
+        if name in settings and name not in given:
+            try:
+                kept[name] = reader.validate_python(settings[name])
+            except ValueError as error:
+                raise ValueError(f"provenance.settings.{name}: {settings[name]!r:.60}") from error
+    return Options(**{**kept, **given})  # type: ignore[arg-type]
+
+
+@cache
+def readers() -> dict[str, TypeAdapter[Any]]:
+    """What reads each option from a file; effects and a QP solver have names there."""
+    from pydantic import Field, TypeAdapter  # slow to load, and a fit needs none of it
+
+    kinds = {**get_type_hints(Options), "effects": tuple[str, ...], "qp": str}
+    kinds |= {"seed": Annotated[int, Field(ge=0)]}
+    tuples = dict.fromkeys(("fix", "free"), tuple[str, ...])
+    return {name: TypeAdapter(kind) for name, kind in (kinds | tuples).items()}
 
 
 def listed(names: str | Sequence[T]) -> Sequence[T | str]:

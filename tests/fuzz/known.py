@@ -178,8 +178,13 @@ def rodrigues(vector: Array) -> Array:
     return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
 
 
-def distances_mm(fit: dict[str, Any], rows: list[list[str]]) -> list[tuple[int, float]]:
-    """Line of the file and distance [mm] of each measured point from where a fit has it."""
+def distances_mm(
+    fit: dict[str, Any], rows: list[list[str]], moved: bool = False
+) -> list[tuple[int, float]]:
+    """Line of the file and distance [mm] of each measured point from where a fit has it.
+
+    moved: the instrument stood elsewhere, the points are first laid on the fit's as one rigid body.
+    """
     unit = {"rad": 1.0, "deg": math.pi / 180, "mm": 1e-3, "m": 1.0}
     at = {name: i for i, name in enumerate(rows[0])}
     base = rodrigues(np.array(fit["base"]["rotation_vector_rad"]))
@@ -187,7 +192,7 @@ def distances_mm(fit: dict[str, Any], rows: list[list[str]]) -> list[tuple[int, 
     joints = sorted(
         (n for n in at if n.startswith("q") and n[1].isdigit()), key=lambda n: int(n[1])
     )
-    out = []
+    lines, measured, expected = [], [], []
     for line, row in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in row):
             continue
@@ -197,10 +202,21 @@ def distances_mm(fit: dict[str, Any], rows: list[list[str]]) -> list[tuple[int, 
             cells = [row[at[f"{name}_{axis}_{length}"]] for axis in "xyz"]
             if not cells[0].strip():
                 continue
-            seen = np.array(cells, dtype=float) * unit[length]
-            there = origin + base @ (pose[:3, :3] @ (np.array(place) * 1e-3) + pose[:3, 3])
-            out.append((line, 1e3 * float(np.linalg.norm(seen - there))))
-    return out
+            lines.append(line)
+            measured.append(np.array(cells, dtype=float) * unit[length])
+            expected.append(origin + base @ (pose[:3, :3] @ (np.array(place) * 1e-3) + pose[:3, 3]))
+    there = np.array(expected)
+    if moved:
+        there = laid_on(there, np.array(measured))
+    return list(zip(lines, 1e3 * np.linalg.norm(measured - there, axis=1), strict=True))
+
+
+def laid_on(points: Array, others: Array) -> Array:
+    """(n, 3) points after the rigid motion that brings them nearest to others (n, 3), by Kabsch."""
+    middle, there = points.mean(axis=0), others.mean(axis=0)
+    u, _, vt = np.linalg.svd((points - middle).T @ (others - there))
+    vt[2] *= np.linalg.det(u @ vt)
+    return np.asarray((points - middle) @ u @ vt + there)
 
 
 def rms(values: list[float]) -> float:
@@ -208,11 +224,13 @@ def rms(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values) / len(values))
 
 
-def disagreement(answer: str, raw: bytes, fit_text: bytes | None, nominal: bool = False) -> str:
+def disagreement(
+    answer: str, raw: bytes, fit_text: bytes | None, nominal: bool = False, moved: bool = False
+) -> str:
     """Where the accuracy that a command printed is not that of its own robot on the file; ''.
 
     fit_text: the fit that was evaluated, None for one that the answer itself holds.  nominal: its
-    arm before calibration was asked for.
+    arm before calibration was asked for.  moved: the frame was fitted anew to the file.
     """
     found = json.loads(answer)
     fit = json.loads(fit_text) if fit_text else found
@@ -222,7 +240,8 @@ def disagreement(answer: str, raw: bytes, fit_text: bytes | None, nominal: bool 
         return ""  # they move the points, too
     rows = table(raw.removeprefix(b"\xef\xbb\xbf"))
     if fit_text:
-        return unlike(found["accuracy"]["rms_mm"], rms([d for _, d in distances_mm(fit, rows)]))
+        mine = [d for _, d in distances_mm(fit, rows, moved)]
+        return unlike(found["accuracy"]["rms_mm"], rms(mine))
     held = dict(zip(found["poses"]["line"], found["poses"]["split"], strict=True))
     for part in ("train", "holdout"):
         mine = [d for line, d in distances_mm(fit, rows) if held.get(line) == part]

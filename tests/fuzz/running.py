@@ -45,7 +45,8 @@ INTERNALS = re.compile(
 )
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 DOUBT = re.compile(
-    r"check|misses|implausibl|stand|off by|outside|suspect|far|swapped|mirror|handed|unit|doubt"
+    r"check|misses|implausibl|stand|off by|outside|suspect|outlier|far|swapped|mirror|handed|unit"
+    r"|doubt"
 )
 
 
@@ -166,7 +167,8 @@ def truth(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
     if one.command == "calibrate" or fit in one.files:
         try:
             nominal = ("--rung", "0") in pairwise(one.arguments)
-            said = disagreement(out, one.files["data.csv"], one.files.get(fit), nominal)
+            moved = "--new-frame" in one.arguments
+            said = disagreement(out, one.files["data.csv"], one.files.get(fit), nominal, moved)
         except (ValueError, KeyError, IndexError, TypeError):
             return None  # broken in a way that the independent reader does not follow
         if said:

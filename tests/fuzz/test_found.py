@@ -469,3 +469,16 @@ def test_a_joint_limit_beyond_all_numbers_is_no_warning() -> None:
     robot = mc.load_robot("irb120")
     upper = np.where(np.arange(6) == 0, 1e308, robot.upper)
     check_joints(replace(robot, upper=upper), simulate(robot, poses=9).data)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("objective", 1), ("distance_tolerance", [0.1]), ("seed", -1)]
+)
+@pytest.mark.parametrize("file", ["fit.json", "effects.json"])
+def test_an_option_of_another_kind_in_a_result_is_refused(
+    file: str, name: str, value: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = broken(
+        tmp_path, file, lambda content: content["provenance"]["settings"].update({name: value})
+    )
+    assert f"provenance.settings.{name}" in refused(capsys, "export", path, "--to", "ur-yaml")
