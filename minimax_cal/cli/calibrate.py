@@ -19,6 +19,7 @@ from minimax_cal.cli.options import (
     SOME_CAMPAIGNS,
     InGroups,
     Output,
+    keep,
     options_from,
     plain_option,
     result_options,
@@ -122,7 +123,7 @@ def calibrate_command(
     if pixels or joints or camera or board:
         files = PixelFiles(data, pixels, joints, tuple(camera), board)
         lens = {"camera_on": camera_on, "fix_camera": fix_camera, "camera_prior": camera_prior}
-        return by_cameras(robot, files, to, lens, chosen)
+        return by_cameras(robot, files, to, lens, chosen, details=details)
     if not data:
         raise click.UsageError(
             "Missing argument 'DATA...', or --pixels with --joints and --camera."
@@ -139,12 +140,12 @@ def calibrate_command(
     to.notice(*(notice for notice in fit.notices if notice != fit.reason))
     if to.deliver(lambda: text_of(fit, *more, poses=not without), fit.status):
         intervals = [found.table() for found in more]
-        if details:
-            options.show(*fit.tables(), *intervals, headline=fit.headline())
-            options.show(headline=fit.solution())
-        else:
-            first = (first_table(fit), frames_table(fit), *intervals)
-            options.first_screen(fit.sentences(), *first, advice=advice(fit, robot, data, to.path))
+        first = (first_table(fit), frames_table(fit), *intervals)
+        said = (*fit.sentences(), *([fit.solution()] if details else ()))
+        options.present(
+            details, said, first, lambda: (*fit.tables(), *intervals),
+            advice(fit, robot, data, to.path),
+        )  # fmt: skip
     to.draw(save_errors, fit)
     return options.exit_code(fit.status, fit.reason)
 
@@ -161,7 +162,13 @@ class PixelFiles:
 
 
 def by_cameras(
-    robot: str, files: PixelFiles, to: Output, lens: dict[str, Any], chosen: dict[str, Any]
+    robot: str,
+    files: PixelFiles,
+    to: Output,
+    lens: dict[str, Any],
+    chosen: dict[str, Any],
+    *,
+    details: bool,
 ) -> int:
     """Calibrate from pixels.  Raises OptionError for what they do not know."""
     from minimax_cal.fitting.pixels.calibrate import calibrate_pixels
@@ -190,7 +197,8 @@ def by_cameras(
         )
     to.notice(*fit.notices)
     if to.deliver(fit.json, fit.status):
-        options.show(*fit.tables(), headline=fit.headline())
+        first = [fit.accuracy_table().brief()]
+        options.present(details, [fit.headline()], first, fit.tables, keep(to.path, "fit.json"))
     return options.exit_code(fit.status, fit.reason)
 
 
@@ -202,7 +210,7 @@ def advice(
     diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
     yield f"Next, to find the cause of the remaining {left}", diagnose
     if written and fit.status is Status.CONVERGED:
-        yield "To write a file for a simulator", f"minimax-cal export {written} --to urdf"
+        yield "To write a file for MuJoCo", f"minimax-cal export {written} --to mjcf"
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

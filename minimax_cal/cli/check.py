@@ -9,13 +9,15 @@ import click
 from minimax_cal.cli import FAILED
 from minimax_cal.cli.options import (
     DATA,
+    DETAILS,
     FIT,
     InGroups,
     Output,
+    keep,
     options_of,
     plain_option,
+    present,
     result_options,
-    show,
 )
 from minimax_cal.cli.stderr import tell
 from minimax_cal.ground.files import json_text
@@ -47,6 +49,7 @@ ASKED = "What is asked"
         group=ASKED,
     ),
 )
+@DETAILS
 @result_options("the calibration with what moved refitted (JSON)")
 def check_command(
     fit: Path,
@@ -55,6 +58,7 @@ def check_command(
     known: tuple[str, ...],
     seed: int,
     simulated: bool,
+    details: bool,
     to: Output,
 ) -> int:
     """Check with a few poses in DATA whether the calibration FIT is still valid, and what moved.
@@ -69,7 +73,8 @@ def check_command(
     if to.as_json:
         click.echo(json_text(found.to_dict()), nl=False)
     else:
-        show(*found.tables(), headline=found.headline())
+        present(details, [found.headline()], [found.first_table()], found.tables,
+                keep(to.path, "checked.json"))  # fmt: skip
     if not found.valid:
         tell("error", found.headline(), exit_code=FAILED)
     return 0 if found.valid else FAILED

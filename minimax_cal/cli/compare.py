@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from minimax_cal.cli.options import PATH, InGroups, Output, result_options, show
+from minimax_cal.cli.options import DETAILS, PATH, InGroups, Output, keep, present, result_options
 from minimax_cal.ground.files import json_text
 from minimax_cal.judging.watching.comparison import compare
 
@@ -14,8 +14,9 @@ from minimax_cal.judging.watching.comparison import compare
 @click.command(name="compare", cls=InGroups)
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
+@DETAILS
 @result_options("the comparison (JSON)")
-def compare_command(a: Path, b: Path, to: Output) -> int:
+def compare_command(a: Path, b: Path, details: bool, to: Output) -> int:
     """What differs between two calibrations A and B: before and after a repair, say.
 
     Both are what `calibrate` or `check` wrote with -o, the earlier first.  Base and reflectors may
@@ -24,5 +25,6 @@ def compare_command(a: Path, b: Path, to: Output) -> int:
     found = compare(a, b)
     to.notice(*found.notices)
     if to.deliver(lambda: json_text(found.to_dict())):
-        show(*found.tables(), headline=found.headline())
+        present(details, [found.headline()], [found.first_table()], found.tables,
+                keep(to.path, "compared.json"))  # fmt: skip
     return 0

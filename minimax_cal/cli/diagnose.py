@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from minimax_cal.fitting.options import Options
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import json_text
 from minimax_cal.ground.options import Option
+from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.history import with_history
 from minimax_cal.reporting.plots.diagnosis import save_diagnosis
 from minimax_cal.reporting.tables import effects_list, effects_table, remainder_table, where_tables
@@ -67,16 +69,20 @@ def diagnose_command(
         found = diagnose(robot, options.measured(data, in_rows), progress=progress, **chosen)
     to.notice(*found.notices)
     if to.deliver(found.json, found.status):
-        if details:
-            options.terminal().print(found.headline() + "\n", markup=False)
-            left = remainder_table(found)
-            shown = [left] if left.rows else []
-            options.show(*found.tables(), *shown, *where_tables(found.where))
-        else:
-            first = [budget_table(found)] if found.ladder else []
-            options.first_screen(found.said, *first, advice=advice(found, robot, data, to.path))
+        first = [budget_table(found)] if found.ladder else []
+        every = partial(every_table, found)
+        options.present(details, found.said, first, every, advice(found, robot, data, to.path))
     to.draw(save_diagnosis, found)
     return options.exit_code(found.status)
+
+
+def every_table(found: Diagnosis) -> Iterator[Table]:
+    """Those of the result, and of where its errors lie."""
+    yield from found.tables()
+    left = remainder_table(found)
+    if left.rows:
+        yield left
+    yield from where_tables(found.where)
 
 
 def advice(

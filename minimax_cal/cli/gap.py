@@ -10,6 +10,7 @@ import click
 from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options, paired, read
 from minimax_cal.cli.options import (
+    DETAILS,
     PATH,
     InGroups,
     Output,
@@ -57,8 +58,11 @@ OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains")
     help="Gains of the drives that move the model, of all joints or of each.",
 )
 @options_from(Options, "holdout", "seed")
+@DETAILS
 @result_options("the gap (JSON)", figure="the ladder")
-def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) -> int:
+def gap_command(
+    model: Path, data: tuple[Path, ...], details: bool, to: Output, **chosen: Any
+) -> int:
     """How far the simulated arm of MODEL (MJCF or URDF) misses the real one in DATA, and why.
 
     DATA of poses: the model is driven with the measured commands in MuJoCo, as given and then
@@ -67,7 +71,7 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
     saw, and friction, masses, rotor inertias and what else makes a difference is corrected.
     """
     if are_logs(data):
-        return gap_of_logs(model, data, to, chosen)
+        return gap_of_logs(model, data, to, chosen, details=details)
     if len(data) > 1:
         raise OptionError(f"{data[1]}: poses come in one file; logs need t_s, q1_rad, ..., tau1_Nm")
     for name in OF_LOGS:
@@ -78,12 +82,16 @@ def gap_command(model: Path, data: tuple[Path, ...], to: Output, **chosen: Any) 
     to.wrote(chosen["write"])
     to.notice(*found.notices)
     if to.deliver(found.json):
-        options.show(found.table(), headline=found.headline())
+        first = found.table().brief("model", "RMS mm", "max mm", "fit says mm")
+        advice = options.keep(to.path, "gap.json")
+        options.present(details, [found.headline()], [first], lambda: [found.table()], advice)
     to.draw(save_simulator_gap, found)
     return options.exit_code(found.status) or int(not found.holds)
 
 
-def gap_of_logs(model: Path, data: tuple[Path, ...], to: Output, chosen: dict[str, Any]) -> int:
+def gap_of_logs(
+    model: Path, data: tuple[Path, ...], to: Output, chosen: dict[str, Any], *, details: bool
+) -> int:
     """The same along trajectories."""
     del chosen["seed"]
     with to.stages() as progress:
@@ -91,6 +99,8 @@ def gap_of_logs(model: Path, data: tuple[Path, ...], to: Output, chosen: dict[st
     to.wrote(chosen["write"], Path(found.module) if found.module else None)
     to.notice(*found.notices, *found.sentences())
     if to.deliver(found.json):
-        options.show(found.table(), found.tracking_table(), headline=found.headline())
+        every = (found.table(), found.tracking_table())
+        advice = options.keep(to.path, "gap.json")
+        options.present(details, [found.headline()], [every[0].brief()], lambda: every, advice)
     to.draw(save_motion_gap, found)
     return 0

@@ -368,13 +368,34 @@ DETAILS = click.option(
 )
 
 
-def first_screen(
-    sentences: Iterable[str], *tables: Table, advice: Iterable[tuple[str, str]]
-) -> None:
-    """Print what people want to know first: sentences, small tables, and what to do next.
+Advice = Iterable[tuple[str, str]]  # what for, and the command
 
-    advice: what for, and the command.
-    """
+
+def present(
+    details: bool,
+    sentences: Sequence[str],
+    first: Sequence[Table],
+    every: Callable[[], Iterable[Table]],
+    advice: Advice,
+) -> None:
+    """Print the first screen of a result, or with --details its sentences and every table."""
+    if details:
+        terminal().print(Text(visible(" ".join(sentences))))
+        click.echo()
+        show(*every())
+    else:
+        first_screen(sentences, *first, advice=advice)
+
+
+def keep(written: Path | None, name: str) -> Advice:
+    """How to see every table, and to keep a result that was not written."""
+    if written:
+        return [("To see every table", "add --details")]
+    return [("To keep the result, and to see every table", f"add -o {name} --details")]
+
+
+def first_screen(sentences: Iterable[str], *tables: Table, advice: Advice) -> None:
+    """Print what people want to know first: sentences, small tables, and what to do next."""
     whole = Console(highlight=False)
     width = min(whole.width, FIRST_WIDTH) if whole.is_terminal else FIRST_WIDTH
     console = Console(highlight=False, width=width)

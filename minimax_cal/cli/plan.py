@@ -11,14 +11,15 @@ from click.core import ParameterSource
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
+    DETAILS,
     PATH,
     ROBOT,
     InGroups,
     Output,
+    keep,
     options_from,
     plain_option,
     result_options,
-    show,
     writable,
 )
 from minimax_cal.ground.errors import OptionError
@@ -69,6 +70,7 @@ SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
     show_default=True,
     help=f"The unit of joints in the file: {' or '.join(ANGLES)}.",
 )
+@DETAILS
 @result_options("the poses (CSV)", figure="the poses and how accuracy grows with their number")
 def plan_command(
     robot: str,
@@ -78,6 +80,7 @@ def plan_command(
     poses: int | None,
     motion: bool,
     waypoints: Path | None,
+    details: bool,
     **chosen: Any,
 ) -> int:
     """Which poses of ROBOT to measure next, in which order, and how accurate they will make it.
@@ -91,7 +94,7 @@ def plan_command(
     chosen["joints"] = limits_of(chosen["joints"], arm)
     if motion:
         writable(waypoints)
-        return show_motion(arm, unit, to, waypoints, chosen)
+        return show_motion(arm, unit, to, waypoints, chosen, details=details)
     if poses is None:
         raise OptionError("give the number of poses=, or motion= for a motion")
     for name in MOTION:
@@ -104,8 +107,11 @@ def plan_command(
     if to.as_json:
         click.echo(found.json(), nl=False)
         return 0
-    options.terminal().print(found.headline() + "\n", markup=False)
-    options.show(*found.tables(), *(() if to.path else (found.pose_table(unit),)))
+    options.present(
+        details, [found.headline()], [found.criterion_table().brief()],
+        lambda: (*found.tables(), *(() if to.path else (found.pose_table(unit),))),
+        keep(to.path, "poses.csv"),
+    )  # fmt: skip
     return 0
 
 
@@ -121,7 +127,13 @@ def check_given(motion: bool) -> None:
 
 
 def show_motion(
-    arm: Robot, unit: str, to: Output, waypoints: Path | None, chosen: dict[str, Any]
+    arm: Robot,
+    unit: str,
+    to: Output,
+    waypoints: Path | None,
+    chosen: dict[str, Any],
+    *,
+    details: bool,
 ) -> int:
     """Plan a motion, write and show it."""
     wanted = {name: chosen[name] for name in (*MOTION, *SHARED)}
@@ -135,7 +147,8 @@ def show_motion(
     if to.as_json:
         click.echo(found.json(), nl=False)
         return 0
-    show(found.told_table(), headline=found.headline())
-    if not to.path:
-        click.echo("nothing written; add -o FILE")
+    options.present(
+        details, [found.headline()], [found.told_table().brief()],
+        lambda: (found.told_table(), found.motion_table()), keep(to.path, "motion.csv"),
+    )  # fmt: skip
     return 0

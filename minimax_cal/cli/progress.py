@@ -40,7 +40,7 @@ class Stages:
     def line(self, text: str) -> str:
         """A stage with the time so far, and the time left of those that count."""
         seconds, left = self.times(as_stage(text))
-        return f"{text} ({clock(seconds)}{'' if left is None else f', about {clock(left)} left'})"
+        return f"{text}, {clock(seconds)}{'' if left is None else f', about {clock(left)} left'}"
 
     def event(self, text: str) -> dict[str, Any]:
         """What a line of JSON holds of a stage, beside its words."""

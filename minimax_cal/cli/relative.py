@@ -8,7 +8,15 @@ from typing import Any
 import click
 
 from minimax_cal.cli import options
-from minimax_cal.cli.options import DATA, ROBOT, InGroups, Output, options_from, result_options
+from minimax_cal.cli.options import (
+    DATA,
+    DETAILS,
+    ROBOT,
+    InGroups,
+    Output,
+    options_from,
+    result_options,
+)
 from minimax_cal.fitting.instruments import RelativeOptions, relative
 from minimax_cal.fitting.options import Options
 
@@ -19,8 +27,9 @@ from minimax_cal.fitting.options import Options
 @options_from(Options, "holdout", "seed", "fix", "free", "priors")
 @options_from(RelativeOptions)
 @options_from(Options, "method")
+@DETAILS
 @result_options("the result (JSON)")
-def relative_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
+def relative_command(robot: str, data: Path, details: bool, to: Output, **chosen: Any) -> int:
     """Calibrate ROBOT without coordinates, from the lengths, closures or poses in DATA.
 
     DATA has joint columns and one of: wire1_mm ... (lengths from unknown fixed points to a target
@@ -31,5 +40,7 @@ def relative_command(robot: str, data: Path, to: Output, **chosen: Any) -> int:
         fit = relative(robot, data, progress, **chosen)
     to.notice(*fit.notices)
     if to.deliver(fit.json, fit.status):
-        options.show(*fit.tables(), headline=fit.headline())
+        first = fit.accuracy_table().brief("poses", "count", "RMS mm", "max mm")
+        advice = options.keep(to.path, "relative.json")
+        options.present(details, [fit.headline()], [first], fit.tables, advice)
     return options.exit_code(fit.status)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import click
 
 from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options
-from minimax_cal.cli.options import PATH, InGroups, Output, options_of, result_options
+from minimax_cal.cli.options import DETAILS, PATH, InGroups, Output, options_of, result_options
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import read_logs, runs_of, torque_gains
 from minimax_cal.dynamics.result import MotionDiagnosis
@@ -83,9 +83,10 @@ def written(
     metavar="XML",
     help="Write the arm with these masses, friction and rotor inertias to this MJCF.",
 )
+@DETAILS
 @result_options("the diagnosis (JSON)", figure="torques, friction curves and the budget")
 def torques_command(
-    model: str, logs: tuple[Path, ...], write: Path | None, to: Output, **chosen: Any
+    model: str, logs: tuple[Path, ...], write: Path | None, details: bool, to: Output, **chosen: Any
 ) -> int:
     """Say why joint torques (or currents) in LOGs differ from those of MODEL, and by how much.
 
@@ -107,8 +108,20 @@ def torques_command(
         to.wrote(write, Path(made.module) if made.module else None)
         to.notice(*(f"{made.written}: {text}" for text in made.sentences()))
     if to.deliver(lambda: json_text(found.to_dict() | (made.short() if made else {}))):
-        shown = [found.summary(), found.effects_table()]
-        shown += [found.unexplained_table()] if found.unexplained else []
-        options.show(*shown, headline=found.headline())
+        options.present(
+            details, found.sentences(), [found.summary().brief()], found.tables,
+            advice(model, logs, write, to.path),
+        )  # fmt: skip
     to.draw(save_motion, found)
     return 0
+
+
+def advice(
+    model: str, logs: tuple[Path, ...], write: Path | None, written_to: Path | None
+) -> Iterator[tuple[str, str]]:
+    """What to do next, and its command.  write: the MJCF; written_to: where the diagnosis went."""
+    if Path(model).suffix.lower() in MODELS and not write:
+        files = " ".join(map(str, logs))
+        fix = f"minimax-cal torques {model} {files} --write corrected.xml"
+        yield "Next, to write a model with these masses and friction", fix
+    yield from options.keep(written_to, "torques.json")

@@ -32,6 +32,7 @@ from minimax_cal.measuring.measurements import FARTHEST, Measurements, check_col
 from minimax_cal.modelling.cell import Cell, still
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.reach import Outcome, Reach, arm_of, bent, lever_of, motion, seen
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot, load_robot
@@ -311,7 +312,11 @@ def remarks(arm: Cell, data: Measurements) -> list[str]:
     """What the reader should know about effects and limits."""
     out = limit_notices(arm.robot, data)
     terms = arm.effects.terms
-    timed = [term.label for term in terms if {"constant", "fast", "since"} & term.choice.keys()]
+    timed = [
+        name_effect(*term.key)
+        for term in terms
+        if {"constant", "fast", "since"} & term.choice.keys()
+    ]
     if timed:
         out.append(
             f"{', '.join(timed)} depends on the time in the calibration's session: taken at "

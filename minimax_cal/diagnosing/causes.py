@@ -80,12 +80,11 @@ def causes_of(
 
     And the study, its rows weighed by the noises that were found beside the effects.
     """
-    progress("effects")
     lib, choice = chosen(study, exclude)
     clear = loudest(left_by(study, choice)) is None  # or each joint would absorb it
     plain, study = study, weighed_anew(study, choice.known, each=clear)
     if study is not plain:
-        progress("effects beside noises that differ")
+        progress("testing causes again")
         lib, choice = chosen(study, exclude, choice.found)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears

@@ -17,6 +17,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.drivers import axis_of, own_value
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted, Term
+from minimax_cal.modelling.effects.words import name_effect
 
 VIEWS = ("geometry alone", "with effects", "the first effect taken out")
 FLAT = 1e-6  # of its size: what varies less does not vary
@@ -162,7 +163,7 @@ def along_motion(left: Leftover, term: Term) -> Curve:
     along = motion / np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-12)
     y = tuple(1e3 * np.einsum("kma,kam->km", error, along)[chosen] for error in left.views)
     whose = names[chosen[0]] if len(chosen) == 1 else "all targets"
-    title = f"error of {whose}, for {term.effect} {term.place}"
+    title = f"error of {whose}, for {name_effect(term.effect, term.place)}"
     return Curve(title, xlabel, f"error {words} (mm)", x[chosen], y)
 
 
@@ -186,7 +187,7 @@ def residual_curve(left: Leftover) -> Curve:
     what, unit = ("travel", "mm") if scene.robot.prismatic[joint] else ("turn", "mrad")
     title = f"errors as a {what} of joint {joint + 1}"
     if term:
-        title += f", for {term.effect} {term.place}"
+        title += f", for {name_effect(term.effect, term.place)}"
     if (
         term and term.effect in EFFECTS and EFFECTS[term.effect].linear
     ):  # a constant turn is geometry: leave it out

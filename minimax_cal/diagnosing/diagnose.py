@@ -58,7 +58,7 @@ from minimax_cal.fitting.solve import Solved, fit_cell
 from minimax_cal.fitting.stations import stationed, unplaced
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
-from minimax_cal.ground.stages import name_rung
+from minimax_cal.ground.stages import name_rung, number_step
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring import checks
 from minimax_cal.measuring.campaigns import measured
@@ -80,9 +80,19 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.dictionary import arm_library
 from minimax_cal.modelling.effects.table import EFFECTS
 from minimax_cal.modelling.effects.time import TARGET_SHIFT
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.status import Status
 
+FAULTY, CAUSES, BUDGET = "faults of the data", "testing causes", "error budget"
+REMAINING, PARTS = "remaining error", "regions held out"
+STEPS = (
+    FAULTY,
+    CAUSES,
+    BUDGET,
+    REMAINING,
+    PARTS,
+)  # quick: without the last
 NOT_ASKED = Beyond(reason="not asked for")
 ROBUST = replace(SUM, trim=0.3)  # a fit that up to so many wrong points do not pull
 EARLIEST = 5  # visits before a jump that a study takes for possible, and after it
@@ -178,26 +188,30 @@ class Asked:
 
 def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: float) -> Diagnosis:
     """The diagnosis of checked measurements.  began: when the work did [s]."""
-    progress("data faults")
     robot, options = asked.robot, asked.options
-    clean = cleaned(asked, progress)
+    count = len(STEPS) - options.quick
+
+    def step_of(name: str) -> Progress:
+        return number_step(progress, STEPS.index(name) + 1, count, name)
+
+    clean = cleaned(asked, step_of(FAULTY))
     train = asked.train(clean.data)
     judges = judges_of(asked, clean, train)
     study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
     study = replace(study, moments=clean.moments)
     workers = asked.jobs, asked.cluster
-    study, causes = causes_of(study, clean.faults, options.exclude, progress, *workers)
-    causes, spoken, ladder = in_rungs(study, causes, progress)
+    study, causes = causes_of(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
+    causes, spoken, ladder = in_rungs(study, causes, step_of(BUDGET))
     noise = causes.choice.noise
     last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
     for step in steps:
-        progress(name_rung(step.name, step.holdout.rms_mm))
+        progress(name_rung(name_step(step.name), step.holdout.rms_mm))
     floor = floor_beneath(robot, clean.data, ladder.last, steps[-1])
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
     findings = with_shares([*fault_findings(causes.faults), *effects], steps, floor.least)
-    progress("remainder")
+    step_of(REMAINING)
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes)
     noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
@@ -205,7 +219,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     verdict, unexplained = answered(verdict, structure_left[0], findings, known)
     beyond = NOT_ASKED
     if not options.quick:
-        beyond = beyond_of(study, causes, judges, options.holdout_by, progress)
+        beyond = beyond_of(study, causes, judges, options.holdout_by, step_of(PARTS))
     wrong = against(robot, floor, steps[-1])
     alarming = (*doubts(robot, study.fit, study.nominal.error(study.data)), *filter(None, [wrong]))
     unread = filter(None, [study.scene.unused_torques])
@@ -249,10 +263,9 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
 
 def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:
     """The causes, those found often enough to be spoken of, and the ladder, with maps of joints."""
-    progress("gap ladder")
     spoken, ladder = with_maps(study, causes, progress)
     if ladder.maps:
-        progress("names beside the maps")
+        progress("causes beside the error maps")
         other, wider = with_maps(study, beside_curves(study, causes, ladder.maps), progress)
         if wider.maps and no_worse(wider, ladder):
             spoken, ladder = other, wider

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from minimax_cal.diagnosing.result import Diagnosis, in_words
+from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.effects.words import name_step
 
 MAX_STEPS = 6  # rows of the budget: nominal, geometry, effects, noise
-STEPS = {"nominal": "nominal arm", "geometric": "calibrated geometry"}
 
 
 def budget_table(found: Diagnosis) -> Table:
     """Held-out errors step by step, later effects as one step where there are many."""
-    every = [(name_of(step.name), step.holdout) for step in found.ladder]
+    every = [(name_step(step.name), step.holdout) for step in found.ladder]
     most = MAX_STEPS - 1  # the last row is the noise
     if len(every) > most:
         more = len(every) - most + 1
@@ -25,11 +25,3 @@ def budget_table(found: Diagnosis) -> Table:
         tuple(rows),
         ("", ".3f", ".3f"),
     )
-
-
-def name_of(step: str) -> str:
-    """A step of the ladder in words, as + joint compliance at joint 2."""
-    if not step.startswith("+ "):
-        return STEPS.get(step, step)
-    effect, _, place = step.removeprefix("+ ").partition(" ")
-    return f"+ {effect.replace('_', ' ')} {in_words(place, effect)}"

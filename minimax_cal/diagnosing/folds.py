@@ -77,7 +77,7 @@ def beyond_of(
     for number, pair in share(fold_errors, calls, processes=causes.jobs, cluster=causes.cluster):
         ended[number] = pair
         name = found[waiting[number]].name
-        progress(count_stage("part", len(ended), len(calls), f" left out: {name}"))
+        progress(count_stage("part", len(ended), len(calls), f" held out: {name}"))
     for number, i in enumerate(waiting):
         errors.add(found[i].name, *ended[number])
     if not found:

@@ -14,6 +14,7 @@ from minimax_cal.measuring.stations import moved, station
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.words import name_effect
 
 BLOCKS = 10  # of the visits, left out in turn: what the law misses goes on for a while
 LEAST = 30  # poses at which a reflector was measured
@@ -116,4 +117,4 @@ def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
         )
         odd = ", ".join(np.array(list("xyz"))[wrong])
         verdict = f"they contradict it in {odd}" if odd else "they agree with it"
-        yield f"{term.label}: the reflectors on the foot moved by {shown}: {verdict}"
+        yield f"{name_effect(*term.key)}: the reflectors on the foot moved by {shown}: {verdict}"

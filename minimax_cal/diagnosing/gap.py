@@ -270,7 +270,10 @@ class Judges:
         sound = mended(whole, standing_out(last.placed(whole), error)).seen
         alike = (before * error).sum(axis=-1) > ALIKE * (error**2).sum(axis=-1)
         far = whole.seen & ~sound & alike.T
-        points = [f"line {whole.line[row]} {whole.target_names[i]}" for row, i in np.argwhere(far)]
+        points = [
+            f"{whole.called(whole.line[row])} {whole.target_names[i]}"
+            for row, i in np.argwhere(far)
+        ]
         more = of_lines(self.held.line, whole.line, far).T
         return replace(self, far=self.far | more), tuple(points)
 

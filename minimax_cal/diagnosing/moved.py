@@ -10,6 +10,7 @@ from minimax_cal.diagnosing.result import Finding
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.fitting.between_sessions import amounts, change_of, frame_changes
 from minimax_cal.fitting.uncertainty import quantile
+from minimax_cal.modelling.effects.words import name_effect
 
 
 def session_notices(study: Study, findings: Sequence[Finding]) -> Iterator[str]:
@@ -25,6 +26,6 @@ def session_notices(study: Study, findings: Sequence[Finding]) -> Iterator[str]:
         half = quantile(0.95, study.fit.uncertainty.dof) * sigma
         found = amounts(finding.names, finding.units, value, sigma, half)
         change = change_of(finding.term, names, found, finding.p_value)
-        yield f"{change.effect} {change.place}: {change.when} by {change.sizes}"
+        yield f"{name_effect(change.effect, change.place)}: {change.when} by {change.sizes}"
     if len(names) > 1:
         yield from (frame.sentence for frame in frame_changes(study.geometric, study.fit))

@@ -31,6 +31,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.pose_rows import pose_rows
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.words import name_effect, name_place, name_step
 from minimax_cal.modelling.frames import frames_of
 from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.solvers.status import Status
@@ -48,14 +49,12 @@ FAULTS = {
     "readback": "joint values that were read back before the arm had settled",
     RESEAT: "a reflector that was re-seated, or exchanged for one of another radius",
 }
-FAULTS_OF_TARGETS = ("outliers", "swapped_rows")  # all of their place are the targets
 PEOPLES = {  # how people read a unit of the file
     "rad": (1e3, "mrad"),
     "rad/(N m)": (1e3, "mrad/(N m)"),
 }
 TOLD_AS = {"rad/(N m)": "mrad at most", "1/(N m^2)": "mm at most"}  # where masses are not told
 NONE_HELPS = "no measurement"  # how what is proposed begins where nothing helps
-SMALL = 0.05  # share of the gap below which a confirmed cause is minor to the reader
 VERDICTS = ("none", "named", "one_of", "unknown", "not_repeatable")
 
 
@@ -85,12 +84,12 @@ class Alternative:
     @property
     def at(self) -> str:
         """Where, in words."""
-        return in_words(self.place, self.effect)
+        return name_place(self.place, self.effect)
 
     @property
     def name(self) -> str:
         """Effect and place, in words."""
-        return f"{self.effect.replace('_', ' ')} {self.at}"
+        return name_effect(self.effect, self.place)
 
     @property
     def helps(self) -> bool:
@@ -172,16 +171,22 @@ class Finding:
     @property
     def at(self) -> str:
         """Where, in words."""
-        return in_words(self.term.place, self.term.effect)
+        return name_place(self.term.place, self.term.effect)
 
     @property
-    def lines(self) -> str:
-        """The lines of the file that a fault of the data concerns."""
+    def name(self) -> str:
+        """Effect and place, in words."""
+        return name_effect(self.term.effect, self.term.place)
+
+    def points(self, data: Measurements) -> str:
+        """The points that a fault of the data concerns."""
         if not self.rows:
             return ""
         more = len(self.rows) - SHOWN_LINES
-        named = ", ".join(map(str, self.rows[:SHOWN_LINES]))
-        return f" (line {named}{f' and {more} more' if more > 0 else ''})"
+        first, *others = map(data.called, self.rows[:SHOWN_LINES])
+        kind = first.partition(" ")[0]
+        named = ", ".join([first, *(name.removeprefix(f"{kind} ") for name in others)])
+        return f" ({named}{f' and {more} more' if more > 0 else ''})"
 
     @property
     def chance(self) -> str:
@@ -343,7 +348,7 @@ class Diagnosis:
     def main(self) -> list[Finding]:
         """The confirmed causes but for the minor ones, the largest first; at least one if any."""
         sure = [f for f in self.findings if f.established]
-        return [f for f in sure if not f.share < SMALL] or sure[:1]
+        return [f for f in sure if not f.minor] or sure[:1]
 
     @property
     def minor(self) -> list[Finding]:
@@ -489,7 +494,7 @@ class Diagnosis:
     def ladder_table(self) -> Table:
         """The error budget, step by step."""
         rows: list[tuple[TableCell, ...]] = [
-            (step.name, step.train.rms_mm, step.train.max_mm, step.holdout.rms_mm,
+            (name_step(step.name), step.train.rms_mm, step.train.max_mm, step.holdout.rms_mm,
              step.holdout.max_mm)
             for step in self.ladder
         ]  # fmt: skip
@@ -506,7 +511,7 @@ class Diagnosis:
         """The effects found, with what each does for held-out poses; possible ones last."""
         found = sorted(self.by_rung, key=lambda f: not f.established)
         rows: list[tuple[TableCell, ...]] = [
-            (f"{f.term.effect} {f.term.place}{f.lines}",
+            (f"{f.name}{f.points(self.data)}",
              "as above" if f.cause in [e.cause for e in found[:i]] else f.cause,
              100.0 * f.share + 0.0, f.before, f.after, f.chance, f.evidence)
             for i, f in enumerate(found)
@@ -523,19 +528,19 @@ class Diagnosis:
     def parameter_table(self) -> Table:
         """The parameters of every effect found: millimetres and milliradians."""
         rows = tuple(
-            (f.term.effect, f.term.place, p["name"], scale * p["value"],
+            (f.name, p["name"], scale * p["value"],
              scale * number(p["sigma"]), unit)
             for f in self.by_rung
             for p in f.parameters()
             for scale, unit in (PEOPLES.get(p["unit"], (1.0, p["unit"])),)
         )  # fmt: skip
-        header = ("effect", "place", "parameter", "value", "sigma", "unit")
-        return Table("parameters of the effects", header, rows, ("", "", "", ".4g", ".2g", ""))
+        header = ("effect", "parameter", "value", "sigma", "unit")
+        return Table("parameters of the effects", header, rows, ("", "", ".4g", ".2g", ""))
 
     def rival_table(self) -> Table:
         """What these data cannot tell from the effects found, and what would tell them apart."""
         rows = tuple(
-            (f"{f.term.effect} {f.term.place}", f"{a.effect} {a.place}", a.rho2, a.power, a.loss,
+            (f.name, a.name, a.rho2, a.power, a.loss,
              a.separate_with or "no measurement considered would")
             for f in self.by_rung
             for a in f.alternatives
@@ -551,7 +556,8 @@ class Diagnosis:
 
     def untestable_table(self) -> Table:
         """Effects that are neither found nor excluded."""
-        return Table("not testable with these data", ("effect", "needs"), self.not_testable)
+        rows = tuple((name_effect(effect), needs) for effect, needs in self.not_testable)
+        return Table("not testable with these data", ("effect", "needs"), rows)
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result, but for those of where the errors lie."""
@@ -572,15 +578,6 @@ class Diagnosis:
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""
         return "\n\n".join([self.headline(), *(table.text(width) for table in self.tables())])
-
-
-def in_words(place: str, effect: str = "") -> str:
-    """A place, as at joint 2.  effect: what is there, which may be no part of the arm."""
-    if place == "all":
-        seated = effect in EFFECTS and EFFECTS[effect].moves == "target"
-        return "of the targets" if seated or effect in FAULTS_OF_TARGETS else "of the whole arm"
-    kind = {"J": "joint", "L": "link"}.get(place[:1]) if place[1:].isdigit() else None
-    return f"at {kind} {place[1:]}" if kind else f"at {place}"
 
 
 def load_diagnosis(path: Path | str) -> Diagnosis:

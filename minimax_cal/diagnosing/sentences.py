@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
-from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding, in_words
+from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding
 from minimax_cal.evidence.limits import STRUCTURE
 from minimax_cal.measuring.floor import REPEATS
+from minimax_cal.modelling.effects.words import name_codes, name_place
 from minimax_cal.solvers.status import Status
 
+Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
 REVISIT = "Next measurement: visit 10 poses twice, to know the measurement noise."
@@ -75,7 +77,7 @@ def title_of(found: Diagnosis) -> str:
 
 def unexplained(found: Diagnosis) -> str:
     """What is not explained, and how that is known."""
-    left = found.structure_in
+    left = name_codes(found.structure_in)
     if left in (ABOVE_NOISE, ONLY_MINOR):
         joints = "" if found.floor.source == REPEATS else ", with what sound joints add"
         return (
@@ -107,8 +109,7 @@ def cause_of(same: Sequence[Finding], *, first: bool) -> str:
     """One kind of cause: where, of the first one also what it is, its alternatives, its share."""
     why = f" ({same[0].cause})" if first else ""
     others = sorted({f"{a.name}{at_which(f, same)}" for f in same for a in f.alternatives})
-    text = f"{words_of(same[0].term.effect)} {together([f.at for f in same])}{why}"
-    text += lines_of(same[0])
+    text = f"{named_together(same)}{why}{lines_of(same[0])}"
     if others:
         text += f", or {' or '.join(others)}"
     shares = [f"{100.0 * f.share:.0f} %" for f in same if f.share > 0.0]
@@ -120,17 +121,20 @@ def at_which(finding: Finding, same: Sequence[Finding]) -> str:
     return f" (for {finding.at.removeprefix('at ')})" if len(same) > 1 else ""
 
 
-def words_of(effect: str) -> str:
-    """An effect as people call it, as joint compliance."""
-    return effect.replace("_", " ")
-
-
-def names_of(findings: Sequence[Finding]) -> str:
+def names_of(found: Sequence[Named], between: str = "; ") -> str:
     """Effects with their places, those of one kind together."""
-    kinds: dict[str, list[str]] = {}
-    for finding in findings:
-        kinds.setdefault(words_of(finding.term.effect), []).append(finding.at)
-    return "; ".join(f"{kind} {together(places)}" for kind, places in kinds.items())
+    kinds: dict[str, list[Named]] = {}
+    for one in found:
+        kinds.setdefault(one.name.removesuffix(one.at), []).append(one)
+    return between.join(map(named_together, kinds.values()))
+
+
+def named_together(same: Sequence[Named]) -> str:
+    """Findings of one effect, as joint compliance at joint 2 and 3."""
+    first = same[0]
+    if len(same) == 1:
+        return first.name
+    return f"{first.name.removesuffix(first.at)}{together([f.at for f in same])}"
 
 
 def minor(found: Diagnosis) -> str:
@@ -206,7 +210,9 @@ def remaining(found: Diagnosis) -> str:
         return f"{noise[:1].upper()}{noise[1:]}."
     if left.predictable_mm < NOTHING_MM:
         return f"The remaining {found.ladder[-1].holdout.rms_mm:.3f} mm looks random; {noise}."
-    where = ", ".join(f"{in_words(place)} {100.0 * share:.0f} %" for place, share in left.where[:3])
+    where = ", ".join(
+        f"{name_place(place)} {100.0 * share:.0f} %" for place, share in left.where[:3]
+    )
     named = f" ({where})" if where else ""
     return (
         f"Remaining error: {left.predictable_mm:.3f} mm depends on the pose{named}, "
@@ -250,6 +256,6 @@ def next_measurement(causes: Sequence[Finding]) -> str:
         return sum(shares.values()), len(pairs)
 
     text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
-    named = " and ".join(dict.fromkeys(f"{words_of(f.term.effect)} {f.at}" for f, _ in pairs))
-    others = " and ".join(dict.fromkeys(a.name for _, a in pairs))
+    named = names_of(list({f.name: f for f, _ in pairs}.values()), " and ")
+    others = names_of(list({a.name: a for _, a in pairs}.values()), " and ")
     return f"Next measurement: {text}, to distinguish {named} from {others}."

@@ -20,6 +20,7 @@ from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import finite, json_of, json_text, number, read_text, write_whole
 from minimax_cal.ground.records import reading
 from minimax_cal.ground.tables import Cell, Table
+from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
 
 KIND = "motion_diagnosis"
@@ -77,7 +78,7 @@ class MotionEffect:
     @property
     def words(self) -> str:
         """For people, as `joint flexibility at J2`."""
-        return f"{WORDS[self.effect]} at {self.place}"
+        return f"{WORDS[self.effect]} {name_place(self.place)}"
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,22 @@ class MotionDiagnosis:
                 "have no name"
             )
         return f"{said}."
+
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict, and how far the error of the torques falls on rows that no fit saw."""
+        first, last = (np.array(self.budget[i].holdout_rms) for i in (0, -1))
+        j = int(np.argmax(last / np.maximum(first, 1e-300)))
+        fall = (
+            f"RMS error of held-out torques, median of the joints: {np.median(first):.3g} "
+            f"{self.unit} -> {np.median(last):.3g} {self.unit}; least at J{j + 1}, "
+            f"{first[j]:.3g} -> {last[j]:.3g} {self.unit}."
+        )
+        return self.headline(), fall
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        every = (self.summary(), self.effects_table(), self.unexplained_table())
+        return tuple(table for table in every if table.rows)
 
     def summary(self) -> Table:
         """The error budget: held-out RMS of each joint, step by step."""

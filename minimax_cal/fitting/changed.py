@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from minimax_cal.ground.units import for_people
+from minimax_cal.modelling.effects.words import name_effect
 
 STILL = 0.01  # p-value above which a frame may stand where it stood
 
@@ -67,10 +68,8 @@ class Change:
     def sentence(self) -> str:
         """What changed, by how much, since when, and how a fit takes it into account."""
         if self.text:
-            return (
-                f"moved between sessions: {self.effect} {self.place} {self.when} by {self.sizes}; "
-                f"effects='{self.text}' fits it"
-            )
+            what = f"{name_effect(self.effect, self.place)} {self.when} by {self.sizes}"
+            return f"moved between sessions: {what}; effects='{self.text}' fits it"
         if self.p_value > STILL:
             most = f"{1e3 * self.amounts[0].high95:.2g} mm"
             return f"session {self.session}: instrument and base stand as at first, within {most}"

@@ -43,6 +43,7 @@ from minimax_cal.measuring.spans import Span, spans_of
 from minimax_cal.modelling.cell import Cell, saved_content
 from minimax_cal.modelling.effects.scene import joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
+from minimax_cal.modelling.effects.words import name_codes, name_effect
 from minimax_cal.modelling.frames import frames_of, tables_of, with_effects
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.modelling.model import NO_MIX, model_of, pose_weights
@@ -656,7 +657,13 @@ class Fit:
         maps = [term for term in self.cell.effects.terms if EFFECTS[term.effect].is_map]
         labels = tuple(f"{term.label}." for term in maps)
         rows: list[tuple[TableCell, ...]] = [
-            (p.name, p.written[1], p.value * p.written[0], p.sigma * p.written[0], p.why_not)
+            (
+                name_codes(p.name),
+                p.written[1],
+                p.value * p.written[0],
+                p.sigma * p.written[0],
+                name_codes(p.why_not),
+            )
             for p in self.parameters
             if p.of_effect and not p.name.startswith(labels)
         ]
@@ -665,7 +672,7 @@ class Fit:
             for term in maps:
                 own = effects.values[effects.terms.index(term)]
                 turn = Fitted((term,), (own,)).turn(scene)[:, joint_of(term.place)]
-                rows.append((f"{term.label} RMS", "rad", rms(turn), math.nan, ""))
+                rows.append((f"{name_effect(*term.key)}, RMS", "rad", rms(turn), math.nan, ""))
         header = ("effect", "unit", "value", "sigma", NOT_IDENTIFIED)
         return Table("effects beyond geometry", header, tuple(rows), ("", "", ".4g", ".2g", ""))
 
@@ -730,7 +737,7 @@ class Fit:
             every.append(self.minimax.table())
         if self.certificate:
             every.append(self.certificate.table())
-        every += [*tables_of(self.frames), self.effect_table(), table_of(self.suspects)]
+        every += [*tables_of(self.frames), self.effect_table(), table_of(self.suspects, self.data)]
         every.append(self.parameter_table())
         return tuple(table for table in every if table.rows)
 

@@ -104,7 +104,7 @@ def points_of(data: Measurements, which: Array, error: Array) -> str:
     """Points in words.  which: (k, m).  error: (k, m, 3) [m]."""
     size = 1e3 * np.linalg.norm(error, axis=-1)
     shown = [
-        f"line {data.line[pose]} {data.target_names[target]} {size[target, pose]:.3g} mm"
+        f"{data.called(data.line[pose])} {data.target_names[target]} {size[target, pose]:.3g} mm"
         for target, pose in np.argwhere(which).tolist()
     ]
     return name_first(shown, NAMED)

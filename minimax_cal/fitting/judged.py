@@ -357,7 +357,7 @@ def worst_case(
     chosen = np.arange(len(best.mu))
     if PER[objective] == "point":
         points = np.argwhere(weights > 0.0)
-        labels = tuple(f"{labels[target]} line {train.line[pose]}" for target, pose in points)
+        labels = tuple(f"{labels[k]}, {train.called(train.line[i])}" for k, i in points)
         size = 1e3 * np.linalg.norm(error, axis=-1)[weights > 0.0]
         chosen = np.argsort(-best.mu)
         chosen = chosen[best.mu[chosen] > MIN_MULTIPLIER]

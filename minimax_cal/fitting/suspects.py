@@ -320,15 +320,15 @@ def aside(error: Array, data: Measurements, suspects: Sequence[Suspect]) -> Arra
     return out
 
 
-def table_of(suspects: Sequence[Suspect]) -> Table:
+def table_of(suspects: Sequence[Suspect], data: Measurements) -> Table:
     """The list for people."""
     return Table(
         "outliers (1 % of the list are false alarms; they may be real effects)",
-        ("line", "target", "distance mm", "score", "p-value", "pose", "of the pose"),
+        ("point", "target", "distance mm", "score", "p-value", "poses", "of the pose"),
         tuple(
-            (s.line, s.target, 1e3 * s.distance, s.score, s.p_value,
+            (data.called(s.line), s.target, 1e3 * s.distance, s.score, s.p_value,
              "held out" if s.held else "training", "all targets" if s.together else "")
             for s in suspects
         ),
-        ("d", "", ".4f", ".1f", ".1e", "", ""),
+        ("", "", ".4f", ".1f", ".1e", "", ""),
     )  # fmt: skip

@@ -43,9 +43,21 @@ def count_stage(kind: str, part: int, parts: int, more: str = "") -> Stage:
     return Stage(f"{kind} {part} of {parts}{more}", kind, part, parts)
 
 
+def number_step(progress: Progress, step: int, steps: int, name: str) -> Progress:
+    """Begin a step of long work, as "Step 2 of 5: effects"; stages within it have its number."""
+    head = f"Step {step} of {steps}: "
+
+    def numbered(text: str) -> None:
+        stage = text if isinstance(text, Stage) else Stage(text)
+        progress(Stage(head + stage, stage.kind, stage.part, stage.parts))
+
+    numbered(name)
+    return numbered
+
+
 def name_rung(name: str, rms_mm: float) -> Stage:
     """A step of an error budget that is done, with its held-out error [mm]."""
-    return Stage(f"rung {name}: {rms_mm:.3f} mm", rung=name, rms_mm=rms_mm)
+    return Stage(f"{name}: {rms_mm:.3f} mm", rung=name, rms_mm=rms_mm)
 
 
 def clock(seconds: float) -> str:

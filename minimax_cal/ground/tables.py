@@ -16,6 +16,7 @@ from rich.text import Text
 from minimax_cal.ground.words import visible
 
 Cell = str | float | int
+MAX_ROWS = 6  # of a table on a first screen
 
 LATEX_ESCAPES = str.maketrans(
     {c: "\\" + c for c in "&%$#_{}"}
@@ -31,6 +32,21 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     formats: tuple[str, ...] = ()
+
+    def brief(self, *header: str, rows: int = MAX_ROWS) -> Table:
+        """Some of the columns, all unless named, and at most so many rows: the first and the last.
+
+        The title says how many rows are left out.
+        """
+        kept = [self.header.index(name) for name in header] or list(range(len(self.header)))
+        more = len(self.rows) - rows
+        some = self.rows if more <= 0 else (*self.rows[: rows - 1], self.rows[-1])
+        return Table(
+            f"{self.title} ({more} rows left out)" if more > 0 else self.title,
+            tuple(self.header[i] for i in kept),
+            tuple(tuple(row[i] for i in kept) for row in some),
+            tuple(self.formats[i] for i in kept) if self.formats else (),
+        )
 
     def cells(self) -> list[list[str]]:
         """Every cell as text; NaN is a dash."""

@@ -218,9 +218,9 @@ def elsewhere(judged: Judgement, other: Claim) -> str:
     if judged.verdict != PASSED or other.reason or not seen > limit:
         return ""
     asked = next(name for name in CLAIMS if name != other.name)
-    kind = {"rms": "RMS", "max": "largest"}[judged.limit.kind]
+    kind = {"rms": "RMS", "max": "Largest"}[judged.limit.kind]
     return (
-        f"Passed {asked} the measured poses alone: {other.name} them the {kind} error is "
+        f"{kind} error passed {asked} the measured poses alone: {other.name} them it is "
         f"{seen:.3f} mm, more than the {limit:g} mm required"
     )
 

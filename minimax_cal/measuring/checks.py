@@ -144,7 +144,8 @@ def outliers(data: Measurements, distance: Array) -> list[str]:
     if not len(found):
         return []
     named = [
-        f"line {data.line[pose]} {data.target_names[target]} {1e3 * distance[target, pose]:.3g} mm"
+        f"{data.called(data.line[pose])} {data.target_names[target]} "
+        f"{1e3 * distance[target, pose]:.3g} mm"
         for target, pose in sorted(found, key=lambda at: -distance[tuple(at)])
     ]
     typical = f"outliers (typical error {1e3 * usual:.3g} mm)"

@@ -91,6 +91,13 @@ class Measurements:
         """(m, k) True where a target was measured."""
         return np.isfinite(self.y[:, :, 0])
 
+    def called(self, line: int) -> str:
+        """The row of a line as people call it: pose P201 where the file names it, else line 202."""
+        names = self.columns.get("pose")
+        at = np.flatnonzero(self.line == line)
+        name = str(names[at[0]]).strip() if names is not None and at.size else ""
+        return f"pose {name}" if name else f"line {line}"
+
     def in_visit_order(self) -> Measurements:
         """The same, its rows taken as visited one after the other."""
         return replace(self, columns={**self.columns, "order": np.arange(self.poses, dtype=float)})

@@ -18,6 +18,7 @@ from minimax_cal.measuring.measurements import FARTHEST, Measurements
 from minimax_cal.measuring.stations import ALONE, Sessions, labels, moved, seen_from, shifts
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, fitted_from_list
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.kinematics import rotation, rotation_vector
 from minimax_cal.robots.robot import Robot, checked_poses, robot_from_dict, told_missing
@@ -279,7 +280,7 @@ def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
             f"{data.source}: {named}: taken to be measured from where session "
             f"{next(iter(frames))} was (the fit knows {', '.join(frames)})"
         )
-    led = [t.label for t in cell.effects.terms if EFFECTS[t.effect].of_move]
+    led = [name_effect(*t.key) for t in cell.effects.terms if EFFECTS[t.effect].of_move]
     sides = [data.columns[c] for c in data.columns if c.startswith("approach")]
     told = any(np.nan_to_num(side).any() for side in sides)
     if led and not (told or ordered(data)):
@@ -287,7 +288,7 @@ def strangers(cell: Cell, data: Measurements) -> tuple[str, ...]:
             f"{data.source}: {', '.join(led)} depends on the way to a pose, which these data do "
             "not tell: taken as 0; give the column order, or approach1 ..."
         )
-    timed = [t.label for t in cell.effects.terms if t.by_clock]
+    timed = [name_effect(*t.key) for t in cell.effects.terms if t.by_clock]
     if timed and "clock" not in data.columns:
         column = clock.column if clock else "visit order"
         place = clock.on(data).columns.get("clock") if clock else None

@@ -8,6 +8,7 @@ import numpy as np
 
 from minimax_cal.evidence.limits import ENOUGH
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.planning import separating
 from minimax_cal.planning.candidates import Poses, rarest
 from minimax_cal.planning.designs.criteria import Criterion, inverse, sizes_of
@@ -105,7 +106,7 @@ def remarks(task: Task, found: Poses, best: Found) -> list[str]:
     out = ["the arm's body is a crude one and the cell is not known: check every move yourself"]
     told = {name.rpartition(".")[0] for name in task.ahead.names}
     terms = [term for term in task.ahead.cell.effects.terms if not term.frees_frames]
-    silent_ones = [term.label for term in terms if term.label not in told]
+    silent_ones = [name_effect(*term.key) for term in terms if term.label not in told]
     if silent_ones:
         out.append(
             f"{', '.join(silent_ones)}: taken as known, not planned for, since the way to a pose "

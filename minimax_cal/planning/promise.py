@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from minimax_cal.modelling.effects.words import name_codes
+
 
 @dataclass(frozen=True)
 class Growth:
@@ -49,7 +51,7 @@ class Separation:
 
     def headline(self) -> str:
         """How far the poses get, in words."""
-        pair = f"{self.one} and {self.other}"
+        pair = name_codes(f"{self.one} and {self.other}")
         if self.alike:
             return (
                 f"{pair} move the targets alike at every pose: no pose tells them apart. "

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.diagnosing.result import Diagnosis, in_words
+from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.diagnosing.where import triage_table
 from minimax_cal.ground.files import number
 from minimax_cal.ground.tables import Table
@@ -16,6 +16,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.scene import Scene
 from minimax_cal.modelling.effects.table import EFFECTS
+from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import load_robot
 
 LEVEL = 0.01  # chance of a pattern below which it is one
@@ -82,7 +83,7 @@ def remainder_table(found: Diagnosis) -> Table:
         rows = [
             ("follows the pose, and could be predicted", left.predictable_mm, math.nan),
             *(
-                (f"  of it {in_words(place)}", math.nan, 100.0 * share)
+                (f"  of it {name_place(place)}", math.nan, 100.0 * share)
                 for place, share in left.where
             ),
             ("random", left.unpredictable_mm, math.nan),

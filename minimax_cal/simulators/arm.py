@@ -25,6 +25,7 @@ from minimax_cal.modelling.effects.compliance import (
 from minimax_cal.modelling.effects.gears import BACKLASH, ENCODER_GAIN, JOINT_COUPLING, joints_at
 from minimax_cal.modelling.effects.scene import Effect, Scene, joint_of, mask_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, NOTHING, Fitted, Term
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.gravity import LEAST_MASS, masses_of, weighed
@@ -258,7 +259,7 @@ def without_element(parts: Parts, scene: Scene, term: Term, values: Array) -> No
     if term.columns(scene).only_turns:
         parts.mapped.append((term, values))
     else:
-        parts.left_out.append(f"{term.label}: {why_not(EFFECTS[term.effect])}")
+        parts.left_out.append(f"{name_effect(*term.key)}: {why_not(EFFECTS[term.effect])}")
 
 
 def why_not(effect: Effect) -> str:

@@ -23,6 +23,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.effects.compliance import WHOLE
 from minimax_cal.modelling.effects.scene import unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.robots.robot import Robot
 from minimax_cal.simulators.arm import ELEMENTS, assumed, why_not
 from minimax_cal.simulators.chain import Chain
@@ -91,7 +92,9 @@ def causes_of(
     others = [term for term in terms if term.effect not in ELEMENTS]
     turning = tuple(term for term in others if maps(term, fit))
     left_out = tuple(
-        f"{term.label}: {why_not(EFFECTS[term.effect])}" for term in others if term not in turning
+        f"{name_effect(*term.key)}: {why_not(EFFECTS[term.effect])}"
+        for term in others
+        if term not in turning
     )
     rows, held, same = judged_by(fit, data, chosen)
     floor = told.floor if told else None

@@ -22,6 +22,7 @@ from minimax_cal.measuring.grouping import check_chance
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.modelling.effects.words import name_effect, name_step
 from minimax_cal.robots.transforms import inverse
 from minimax_cal.simulators.arm import Arm, arm_of, assumed, unheld
 from minimax_cal.simulators.causes import Causes, causes_of
@@ -189,15 +190,17 @@ class Run:
         mapped, left_out = list(self.causes.turning), list(self.causes.left_out)
         rungs = [self.fitted("calibrated geometry", fit)]
         for term in self.causes.firm:
-            self.progress(f"fit with {term.label}")
+            self.progress(f"fit with {name_effect(*term.key)}")
             more = self.causes.fitted([*taken, term])
             if unheld(more.cell, more.train):
                 mapped.append(term)
                 continue
-            rung = self.fitted(f"+ {term.label.replace(':', ' ')}", more)
+            rung = self.fitted(f"+ {' '.join(term.key)}", more)
             if worse(rung, rungs[-1]):
                 change = f"{rungs[-1].holdout_rms_mm:.4f} -> {rung.holdout_rms_mm:.4f} mm"
-                left_out.append(f"{term.label}: the simulated arm is worse with it ({change})")
+                left_out.append(
+                    f"{name_effect(*term.key)}: the simulated arm is worse with it ({change})"
+                )
                 continue
             fit, taken = more, [*taken, term]
             rungs.append(rung)
@@ -242,7 +245,7 @@ class Run:
         commands = Commands(replace(fit.cell, effects=whole.mapped)).follow(self.data)
         rung, _ = self.rung("with its command map", chain, fit.cell, whole, fit, commands)
         return replace(rung, why="commands corrected for " + ", ".join(
-            dict.fromkeys(term.label for term in whole.mapped.terms)))  # fmt: skip
+            dict.fromkeys(name_effect(*term.key) for term in whole.mapped.terms)))  # fmt: skip
 
     def arm(self, fit: Fit) -> Arm:
         """The elements of a fit, with the model's own masses unless those are assumed."""
@@ -335,8 +338,8 @@ class Run:
 def disagreement(rungs: Sequence[Rung]) -> list[str]:
     """A notice on each rung at which the simulator does other than the formulas of its fit."""
     return [
-        f"{rung.name}: the simulated arm misses by {rung.holdout_rms_mm:.4f} mm where the fit "
-        f"says {rung.predicted_rms_mm:.4f} mm"
+        f"{name_step(rung.name)}: the simulated arm misses by {rung.holdout_rms_mm:.4f} mm "
+        f"where the fit says {rung.predicted_rms_mm:.4f} mm"
         for rung in rungs
         if abs(rung.holdout_rms_mm - rung.predicted_rms_mm)
         > max(AGREES * rung.predicted_rms_mm, AGREES_MM)

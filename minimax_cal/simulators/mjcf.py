@@ -16,6 +16,7 @@ from minimax_cal.correcting.exporters.job import origins
 from minimax_cal.correcting.exporters.urdf import in_link
 from minimax_cal.ground.files import json_text
 from minimax_cal.modelling.cell import Cell
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.robots.gravity import G, inertia_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import tail
@@ -32,7 +33,7 @@ def told(arm: Arm) -> list[str]:
     """What the file does not hold, for people."""
     out = []
     if arm.mapped.terms:
-        named = ", ".join(dict.fromkeys(term.label for term in arm.mapped.terms))
+        named = ", ".join(dict.fromkeys(name_effect(*term.key) for term in arm.mapped.terms))
         out.append(
             f"{named}: no element of a simulator; the file beside (*{COMMANDS}) corrects commands, "
             "and the model counts on it: ctrl = mc.load_commands(PATH)(q)"

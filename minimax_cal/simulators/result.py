@@ -17,6 +17,7 @@ from minimax_cal.ground.files import finite, json_text, write_whole
 from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Table
 from minimax_cal.modelling.cell import saved_content
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.solvers.status import Status
 
 KIND = "simulator_gap"
@@ -139,9 +140,10 @@ class SimulatorGap:
         """The ladder."""
         every = (*self.rungs, *([self.commands] if self.commands else []))
         rows = tuple(
-            (r.name, r.holdout_rms_mm, r.holdout_max_mm, r.predicted_rms_mm, r.sag_mrad, r.why)
+            (name_step(r.name), r.holdout_rms_mm, r.holdout_max_mm, r.predicted_rms_mm,
+             r.sag_mrad, r.why)
             for r in every
-        )
+        )  # fmt: skip
         if math.isfinite(self.floor):
             noise = (math.nan, math.nan, math.nan, self.floor_from)
             rows = (*rows, ("noise floor", self.floor, *noise))
@@ -161,7 +163,7 @@ class SimulatorGap:
             most = max(range(len(falls)), key=falls.__getitem__)
             text += (
                 f"; corrected, by {last.holdout_rms_mm:.3f} mm (largest {last.holdout_max_mm:.3f} "
-                f"mm). Most is gained by: {self.rungs[most + 1].name}"
+                f"mm). Most is gained by: {name_step(self.rungs[most + 1].name)}"
             )
         if self.commands:
             text += f". With its command map {self.commands.holdout_rms_mm:.3f} mm remain"

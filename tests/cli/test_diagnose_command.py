@@ -253,5 +253,5 @@ def test_what_cannot_be_tested_and_what_to_measure_next(folder: Path) -> None:
     more = replace(found, findings=(first,), not_testable=(("settling", "the visit order"),))
     *_, further, needs = more.tables()
     assert needs.rows == (("settling", "the visit order"),)
-    assert further.rows[0][1:] == ("base_flex frame", 0.9, 3.0, 1.0, "ten poses stretched out")
+    assert further.rows[0][1:] == ("base flex", 0.9, 3.0, 1.0, "ten poses stretched out")
     assert len(replace(more, findings=(), not_testable=()).tables()) == 1  # the ladder

@@ -50,7 +50,7 @@ def test_pixels_to_urdf(
 def test_tables_say_what_pixels_do_not(
     files: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("calibrate", "ur5", *files, "--fix-camera") == 0
+    assert run("calibrate", "ur5", *files, "--fix-camera", "--details") == 0
     out, err = capsys.readouterr()
     text = " ".join(out.split())
     for words in ("determine a position of the arm to", "RMS px", "drawn_within", "board_rz"):

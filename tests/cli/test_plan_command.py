@@ -70,7 +70,7 @@ def planned(folder: Path) -> Path:
     """A file of stops, with revisits from the other side."""
     path, picture = folder / "plan.csv", folder / "plan.svg"
     code, out, err = run("irb2600", "--poses", 10, "-o", path, "--figure", picture, "--revisit", 2,
-                         "--approach", "both", "--candidates", 80, *WIDE)  # fmt: skip
+                         "--approach", "both", "--candidates", 80, "--details", *WIDE)  # fmt: skip
     assert code == 0
     for words in ("10 poses by criterion I", "self-collision", "worth"):
         assert words in out
@@ -185,10 +185,10 @@ def test_a_fit_and_its_poses(fit: Path, poses: Path) -> None:
 
 def test_separate(poses: Path) -> None:
     code, out, _ = run("irb2600", "--poses", 5, "--data", poses, "--separate", "encoder_gain:J3",
-                       "gear_error:J3:turns=1", *FEW, *WIDE)  # fmt: skip
+                       "gear_error:J3:turns=1", "--details", *FEW, *WIDE)  # fmt: skip
     assert code == 0
     text = " ".join(out.split())
-    assert "Power to tell encoder_gain:J3 and gear_error:J3 apart" in text
+    assert "Power to tell encoder gain at joint 3 and gear error at joint 3 apart" in text
     assert "power to tell the effects apart" in text
     assert "stops in order" in text  # without -o the poses are shown
 

@@ -29,15 +29,15 @@ def test_time_left_is_that_of_the_steps_so_far() -> None:
     def replicate(part: int) -> Stage:
         return count_stage("replicate", part, 10)
 
-    assert told.line("geometry") == "geometry (0 s)"
+    assert told.line("geometry") == "geometry, 0 s"
     now.at += 60.0
-    assert told.line(replicate(1)) == "replicate 1 of 10 (1 min 0 s)"
+    assert told.line(replicate(1)) == "replicate 1 of 10, 1 min 0 s"
     now.at += 4.0  # two steps took four seconds, eight are left
-    assert told.line(replicate(3)) == "replicate 3 of 10 (1 min 4 s, about 16 s left)"
+    assert told.line(replicate(3)) == "replicate 3 of 10, 1 min 4 s, about 16 s left"
     now.at += 10.0
     first = count_stage("part", 1, 3, " left out: joint 2")
-    assert told.line(first) == "part 1 of 3 left out: joint 2 (1 min 14 s)"
-    assert told.line("step 3 of 9") == "step 3 of 9 (1 min 14 s)"  # words are never read back
+    assert told.line(first) == "part 1 of 3 left out: joint 2, 1 min 14 s"
+    assert told.line("step 3 of 9") == "step 3 of 9, 1 min 14 s"  # words are never read back
     assert clock(125.4) == "2 min 5 s"
 
 
@@ -61,9 +61,9 @@ def test_a_line_every_ten_seconds_from_the_first_second(
     ticker.run()
     assert waits == [progress.FIRST, 10.0, 10.0, 10.0]
     assert capsys.readouterr().err.splitlines() == [
-        "progress: geometry (1 s)",
-        "progress: part 3 of 18 (11 s)",
-        "progress: part 3 of 18 (21 s, about 1 min 20 s left)",
+        "progress: geometry, 1 s",
+        "progress: part 3 of 18, 11 s",
+        "progress: part 3 of 18, 21 s, about 1 min 20 s left",
     ]
     with stages(quiet=True) as show:
         show("start")

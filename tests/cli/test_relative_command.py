@@ -52,7 +52,7 @@ def test_tables_on_stdout_and_notices_on_stderr(
     files: dict[str, Path],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert run("relative", "irb2600", files[kind]) == 0
+    assert run("relative", "irb2600", files[kind], "--details") == 0
     out, err = capsys.readouterr()
     text = " ".join(out.split())
     for some in (*words, "held out, nominal", "held out, calibrated", "not identified because"):

@@ -61,7 +61,7 @@ def test_every_part_is_left_out_and_judges(
     every = judges.everyone
     left_out = parts(every)
     assert [one.where for one in found.folds] == [part.name for part in left_out]
-    assert told == [f"part {i} of {len(left_out)} left out: {part.name}"
+    assert told == [f"part {i} of {len(left_out)} held out: {part.name}"
                     for i, part in enumerate(left_out, 1)]  # fmt: skip
     for one, part, (rows, state) in zip(found.folds, left_out, asked, strict=True):
         here = every.take(part.rows)

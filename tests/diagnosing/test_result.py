@@ -18,7 +18,6 @@ from minimax_cal.diagnosing.result import (
     Diagnosis,
     Finding,
     Step,
-    in_words,
     of_curve,
 )
 from minimax_cal.diagnosing.sentences import closed_words
@@ -27,6 +26,7 @@ from minimax_cal.fitting.fit import Provenance
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.floor import DECLARED, Floor
 from minimax_cal.modelling.effects.table import Fitted, Term
+from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.modelling.simulate import simulate
 from minimax_cal.solvers.status import Status
 
@@ -41,7 +41,7 @@ def rung(name: str, train: float) -> Step:
     return Step(name, scores(train), scores(1.1 * train), scores(1.05 * train))
 
 
-RUNGS = (rung("nominal", 3.0), rung("geometric", 1.0), rung("+ backlash J2", 0.8),
+RUNGS = (rung("nominal", 3.0), rung("calibrated geometry", 1.0), rung("+ backlash J2", 0.8),
          rung("+ joint_compliance J3", 0.5))  # fmt: skip
 
 
@@ -84,8 +84,16 @@ def made() -> Diagnosis:
         (SHOWN_LINES + 2, " (line 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18 and 2 more)"),
     ],
 )
-def test_a_dozen_lines_are_told_one_by_one(count: int, text: str) -> None:
-    assert replace(FINDINGS[2], rows=tuple(range(7, 7 + count))).lines == text
+def test_a_dozen_lines_are_told_one_by_one(made: Diagnosis, count: int, text: str) -> None:
+    found = replace(FINDINGS[2], rows=tuple(range(7, 7 + count)))
+    assert found.points(made.data) == text
+
+
+def test_points_go_by_the_names_of_the_file(made: Diagnosis) -> None:
+    names = np.array([f"P{200 + i}" for i in range(made.data.poses)], dtype=object)
+    named = replace(made.data, columns={**made.data.columns, "pose": names})
+    found = replace(FINDINGS[2], rows=tuple(int(line) for line in named.line[:2]))
+    assert found.points(named) == " (pose P200, P201)"
 
 
 @pytest.mark.parametrize(
@@ -141,13 +149,13 @@ def test_an_alternative_helps_if_a_measurement_tells_it_apart() -> None:
      ("smr1", "at smr1"), ("T1", "at T1")],
 )  # fmt: skip
 def test_places_in_words(place: str, words: str) -> None:
-    assert in_words(place) == words
+    assert name_place(place) == words
 
 
 def test_all_targets_are_not_the_whole_arm() -> None:
-    assert in_words("all", "outliers") == in_words("all", "target_reseat") == "of the targets"
-    assert in_words("all", "joint_compliance") == "of the whole arm"
-    assert in_words("smr1", "outliers") == "at smr1"
+    assert name_place("all", "outliers") == name_place("all", "target_reseat") == "of the targets"
+    assert name_place("all", "joint_compliance") == "of the whole arm"
+    assert name_place("smr1", "outliers") == "at smr1"
 
 
 def test_results_are_themselves_and_stay_so(made: Diagnosis) -> None:
@@ -235,21 +243,22 @@ def test_findings_stand_in_the_order_of_the_ladder(made: Diagnosis) -> None:
 
 def test_the_tables_hold_the_numbers_of_people(made: Diagnosis) -> None:
     ladder = made.ladder_table()
-    assert ladder.rows[1] == ("geometric", 1.0, 2.0, 1.1, 2.2)
+    assert ladder.rows[1] == ("calibrated geometry", 1.0, 2.0, 1.1, 2.2)
     assert ladder.rows[-1] == (f"noise floor ({DECLARED})", 0.1, "", 0.1, "")
     effects = made.effects_table()
     assert [row[0] for row in effects.rows] == [  # what is tentative last
-        "outliers all (line 3, 5)", "joint_compliance J3", "backlash J2"]  # fmt: skip
+        "outliers of the targets (line 3, 5)", "joint compliance at joint 3",
+        "backlash at joint 2"]  # fmt: skip
     assert_allclose([row[2] for row in effects.rows], [10.0, 60.0, 30.0])
     assert [row[-1] for row in effects.rows] == [
         "confirmed", "confirmed, 1.00", "possible, 0.80"]  # fmt: skip
     assert effects.rows[1][3:6] == (0.84, 0.5, "1e-09")
-    values = {row[0]: row[3:] for row in made.parameter_table().rows}
+    values = {row[0].partition(" at ")[0]: row[2:] for row in made.parameter_table().rows}
     assert_allclose(values["backlash"][:2], (0.03, 0.002))
     assert values["backlash"][2] == "mrad"
-    assert_allclose(values["joint_compliance"][:2], (2e-3, 1e-4))
-    assert values["joint_compliance"][2] == "mrad/(N m)"
-    assert_allclose(values["outliers"][:2], (2.0, math.nan))
+    assert_allclose(values["joint compliance"][:2], (2e-3, 1e-4))
+    assert values["joint compliance"][2] == "mrad/(N m)"
+    assert_allclose(values["outliers of the targets"][:2], (2.0, math.nan))
     assert made.untestable_table().rows == (("thermal", "temperatures"),)
 
 
@@ -265,7 +274,7 @@ def test_a_cause_is_told_once(made: Diagnosis) -> None:
     twice = replace(FINDINGS[0], terms=(Term("joint_compliance", "J4"),), share=0.2)
     rows = replace(made, findings=(FINDINGS[0], twice)).effects_table().rows
     assert [row[1] == "as above" for row in rows] == [False, True]
-    assert rows[0][0] == "joint_compliance J4"
+    assert rows[0][0] == "joint compliance at joint 4"
 
 
 def test_rivals_are_told_with_what_tells_them_apart(made: Diagnosis) -> None:
@@ -273,9 +282,10 @@ def test_rivals_are_told_with_what_tells_them_apart(made: Diagnosis) -> None:
               Alternative("encoder_gain", "J2", 0.5, 30.0, 9.0))  # fmt: skip
     found = replace(made, findings=(replace(FINDINGS[1], alternatives=rivals),))
     assert found.rival_table().rows == (
-        ("backlash J2", "gear_error J2", 0.9, 12.0, 3.0, "20 poses"),
-        ("backlash J2", "encoder_gain J2", 0.5, 30.0, 9.0, "no measurement considered would"),
-    )
+        ("backlash at joint 2", "gear error at joint 2", 0.9, 12.0, 3.0, "20 poses"),
+        ("backlash at joint 2", "encoder gain at joint 2", 0.5, 30.0, 9.0,
+         "no measurement considered would"),
+    )  # fmt: skip
     titles = [table.title for table in found.tables()]
     assert len(titles) == len(made.tables()) + 1
     assert all(table.rows for table in found.tables())

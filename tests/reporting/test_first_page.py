@@ -125,7 +125,7 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path
     for verdict in ("unknown", "not_repeatable"):
         guess = limiting(verdict, 0.9)
         assert "establishes" not in guess
-        assert f"verdict of the diagnosis: {verdict.replace('_', ' ')}" in guess
+        assert "leaves part of the error unexplained" in guess
         assert f"best guess, which this model leaves out: {cause}" in guess
     assert cause not in limiting("named", -0.001)  # a cause that closes nothing limits nothing
 

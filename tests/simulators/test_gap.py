@@ -235,10 +235,10 @@ def test_what_makes_the_simulator_worse_is_not_written(
     )  # fmt: skip
     assert gap.rungs[-1].name == "calibrated geometry"
     assert any(
-        text.startswith("joint_compliance:all: the simulated arm is worse with it")
+        text.startswith("joint compliance of the whole arm: the simulated arm is worse with it")
         for text in gap.left_out
     )
-    assert any("not in the file: base_flex:frame" in text for text in gap.notices)
+    assert any("not in the file: base flex" in text for text in gap.notices)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "corrected.xml"))
     assert "base_flex_x" not in [model.joint(i).name for i in range(model.njnt)]
 
@@ -247,7 +247,7 @@ def test_a_simulator_that_does_other_than_the_fit_says_so() -> None:
     rung = Rung("+ base_flex frame", 0.0950, 0.3, 0.0950, 0.3, 0.0, predicted_rms_mm=0.0800)
     (said,) = ladder.disagreement([rung, replace(rung, predicted_rms_mm=0.0900)])
     assert said == (
-        "+ base_flex frame: the simulated arm misses by 0.0950 mm where the fit says 0.0800 mm"
+        "+ base flex: the simulated arm misses by 0.0950 mm where the fit says 0.0800 mm"
     )
     assert not ladder.disagreement([replace(rung, predicted_rms_mm=float("nan"))])
 

@@ -81,10 +81,21 @@ class Comparison:
         )
         return f"{self.robot}: {', '.join(self.joints)} changed from {a} to {b} ({told})."
 
-    def tables(self) -> tuple[Table, ...]:
-        """Which joints changed, accuracy on common poses, every parameter."""
-        changed = moved_table("parameters that explain the differences", self.changed)
-        common = Table(
+    def first_table(self) -> Table:
+        """What changed, by how much; where nothing did, the accuracy on common poses."""
+        if self.changed:
+            return self.changed_table().brief(
+                "parameter", "by", "unit", "sigma", "p-value", "or as well"
+            )
+        return self.common_table().brief()
+
+    def changed_table(self) -> Table:
+        """The parameters that explain the differences."""
+        return moved_table("parameters that explain the differences", self.changed)
+
+    def common_table(self) -> Table:
+        """The accuracy of both on common poses."""
+        return Table(
             "the same poses; base and reflectors may have moved",
             ("poses", "count", "A RMS mm", "A max mm", "B RMS mm", "B max mm"),
             tuple(
@@ -93,6 +104,9 @@ class Comparison:
             ),
             ("", "d", *[".4f"] * 4),
         )
+
+    def tables(self) -> tuple[Table, ...]:
+        """Which joints changed, accuracy on common poses, every parameter."""
         each = Table(
             f"A: {self.names[0]}, B: {self.names[1]}",
             ("parameter", "unit", "A", "B", "B - A", "sigma", "in sigmas", "not compared because"),
@@ -103,7 +117,9 @@ class Comparison:
             ),
             ("", "", ".4f", ".4f", "+.4f", ".2g", "+.1f", ""),
         )  # fmt: skip
-        return tuple(table for table in (changed, common, each) if table.rows)
+        return tuple(
+            table for table in (self.changed_table(), self.common_table(), each) if table.rows
+        )
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

@@ -28,6 +28,7 @@ from minimax_cal.judging.watching.moved import Moved, search
 from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.grouping import regions
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import links_of, zero_positions
 from minimax_cal.robots.robot import Robot
@@ -210,7 +211,7 @@ def remarks(one: Fit, other: Fit) -> Iterator[str]:
             "both are fitted to the same measurements: what differs is the way of fitting, and "
             "the sigmas, which take them for independent, say nothing of it"
         )
-    effects = [[t.label for t in fit.cell.effects.terms] for fit in (one, other)]
+    effects = [[name_effect(*t.key) for t in fit.cell.effects.terms] for fit in (one, other)]
     if effects[0] != effects[1]:
         told = " against ".join(", ".join(labels) or "none" for labels in effects)
         yield f"they hold different effects ({told}): geometry takes over part of what one lacks"

@@ -172,8 +172,10 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
         return told(None, STATED[0], f"{seen}, and {poses} poses are too few to say")
     if not rms and accuracy(error).max_mm > limit.size_mm:
         return told(
-            False, STATED[1], f"{accuracy(error).max_mm:.3f} mm was seen, {limit.size_mm:g}"
-        )
+            False, STATED[1],
+            f"{KINDS[limit.kind]} {accuracy(error).max_mm:.3f} mm was seen, at most "
+            f"{limit.size_mm:g} mm is required",
+        )  # fmt: skip
     if not rms and chance_of_larger(poses) > CHANCE:
         return told(None, STATED[0], f"{seen}, and a maximum needs at least {FEWEST} poses")
     sure = confidence(interval, 1e-3 * limit.size_mm, above=value > limit.size_mm)

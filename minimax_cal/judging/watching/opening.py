@@ -18,6 +18,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import labels
 from minimax_cal.modelling.effects.table import EFFECTS, Fitted
+from minimax_cal.modelling.effects.words import name_effect
 
 LEAST_FOOT = 3  # reflectors on the foot tell where it stands
 NOBODY = np.zeros((0, 3))  # no reflector on the foot
@@ -53,7 +54,7 @@ def watched_of(
         and (term.place not in cell.target_names or term.place in data.target_names)
     ]
     terms, values = tuple(term for term, _ in kept), tuple(value for _, value in kept)
-    gone = [term.label for term in cell.effects.terms if term not in terms]
+    gone = [name_effect(*term.key) for term in cell.effects.terms if term not in terms]
     said = (f"left out: {', '.join(gone)}; they ended with the calibration's session",)
     ratio = usual_u95(data) / usual_u95(fit.data)
     variance = known_by.noise.variance * (ratio**2 if math.isfinite(ratio) else 1.0)

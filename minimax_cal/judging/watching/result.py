@@ -116,9 +116,19 @@ class Health:
             text += f" {aside_sentence(self.set_aside, self.with_them)}"
         return text
 
-    def tables(self) -> tuple[Table, ...]:
-        """What was required, what moved, what could have been found."""
-        required = Table(
+    def first_table(self) -> Table:
+        """What moved, by how much; where nothing did, what was required."""
+        if self.moved:
+            return moved_table("moved since the calibration", self.moved).brief(
+                "parameter", "by", "unit", "sigma", "p-value", "or as well"
+            )
+        return self.required_table().brief(
+            "error", "at most mm", "seen mm", "95 % from", "to", "verdict"
+        )
+
+    def required_table(self) -> Table:
+        """What was required, and what was seen."""
+        return Table(
             f"required of {self.robot}; base and reflectors fitted to {self.poses} poses",
             ("error", "at most mm", "seen mm", "95 % from", "to", "verdict", "confidence %"),
             tuple(
@@ -128,6 +138,9 @@ class Health:
             ),
             ("", "g", ".4f", ".4f", ".4f", "", ".1f"),
         )  # fmt: skip
+
+    def tables(self) -> tuple[Table, ...]:
+        """What was required, what moved, what could have been found."""
         moved = moved_table("moved since the calibration", self.moved)
         found = Table(
             "smallest shift that these poses find in 95 of 100 cases",
@@ -143,7 +156,7 @@ class Health:
             ("zero position", "looks like", "measure"),
             tuple((h.parameter, h.like, h.needs) for h in self.hidden),
         )
-        return tuple(table for table in (required, moved, found, hidden) if table.rows)
+        return tuple(table for table in (self.required_table(), moved, found, hidden) if table.rows)
 
     def summary(self, width: int = 110) -> str:
         """The result as plain text."""

@@ -59,7 +59,7 @@ def told(data: Measurements, found: Mapping[tuple[int, int], str]) -> tuple[Faul
     points = sorted(found)
     rows, targets = np.array(points).T
     named = name_first(
-        [f"line {data.line[row]} {data.target_names[target]}" for row, target in points]
+        [f"{data.called(data.line[row])} {data.target_names[target]}" for row, target in points]
     )
     by = " and by ".join(sorted(set(found.values())))
     places = sorted({data.target_names[target] for target in targets})

@@ -61,6 +61,11 @@ class Section:
     title: str
     blocks: tuple[Block, ...]
 
+    @property
+    def is_told(self) -> bool:
+        """Whether it holds more than what is missing; without, it is no chapter."""
+        return any(not isinstance(one, Note) or one.kind != "missing" for one in self.blocks)
+
 
 @dataclass(frozen=True, eq=False)
 class Report:

@@ -20,6 +20,7 @@ from minimax_cal.judging.tolerance import (
     judge,
     overall,
 )
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
@@ -145,4 +146,4 @@ def delivered_table(rows: Sequence[Row]) -> Table:
 
 def kinds(labels: Sequence[str]) -> str:
     """Effects in words, each kind once."""
-    return ", ".join(dict.fromkeys(each.partition(":")[0].replace("_", " ") for each in labels))
+    return ", ".join(dict.fromkeys(name_effect(each.partition(":")[0]) for each in labels))

@@ -15,29 +15,25 @@ from minimax_cal.ground.tables import Table
 from minimax_cal.ground.words import visible
 from minimax_cal.judging.tolerance import Limit
 from minimax_cal.reporting.html import fit_sections, gap_sections, simulator_section
-from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, missing, text
+from minimax_cal.reporting.html.content import Block, Blocks, Note, Report, Section, text
 from minimax_cal.reporting.html.facts import told_facts
 from minimax_cal.reporting.html.first_page import Signed, page_blocks, signed
 from minimax_cal.reporting.html.fit_tables import settings_table
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import gap_verdict
 
-NO_FIT = (
-    "Not in this report: it was made without a calibration; give the file that `minimax-cal "
-    "calibrate` writes as well."
-)
 HEX = re.compile(r"[0-9a-f]{64}")
 FOLDERS = re.compile(r"(?:[A-Za-z]:)?[^,]*[/\\](?=[^/\\,]+\.[A-Za-z]\w*(?:,|$))")  # before a file
 
 
 def of_fit(blocks: Callable[[Fit], Blocks]) -> Callable[[Sources], Blocks]:
-    """What needs a calibration, or that there is none."""
-    return lambda sources: blocks(sources.fit) if sources.fit else [missing(NO_FIT)]
+    """What needs a calibration; nothing without one."""
+    return lambda sources: blocks(sources.fit) if sources.fit else ()
 
 
 def of_gap(blocks: Callable[[Diagnosis], Blocks]) -> Callable[[Sources], Blocks]:
-    """What needs a diagnosis, or that there is none."""
-    return lambda sources: blocks(sources.gap) if sources.gap else [missing(gap_sections.NO_GAP)]
+    """What needs a diagnosis; nothing without one."""
+    return lambda sources: blocks(sources.gap) if sources.gap else ()
 
 
 SECTIONS = (  # name, title, what it holds
@@ -51,7 +47,7 @@ SECTIONS = (  # name, title, what it holds
     ("solution", "How the fit was found", of_fit(fit_sections.solution)),
     ("diagnosis", "Diagnosis", of_gap(gap_verdict)),
     ("gap", "Error budget, step by step", of_gap(gap_sections.gap_steps)),
-    ("causes", "Causes and alternatives", gap_sections.causes_of),
+    ("causes", "Causes and alternatives", gap_sections.causes),
     ("where", "Where geometry leaves errors", of_gap(gap_sections.places)),
     ("untestable", "What could not be tested", of_gap(gap_sections.untestable)),
     ("simulator", "The arm in the simulator", simulator_section.blocks),
@@ -100,11 +96,8 @@ def compose(sources: Sources, wording: Wording, found: Signed | None = None) -> 
     facts += [("Measurements", file_name(told.data) or "not named")]
     facts += [("SHA-256 of the measurements", told.data_sha256 or "not recorded")]
     parts = WITHOUT_COORDINATES if sources.relative else SECTIONS
-    sections = (
-        Section(name, title, tuple(made(sources)))
-        for name, title, made in parts
-        if name != "simulator" or sources.simulator or sources.motion
-    )
+    every = (Section(name, title, tuple(made(sources))) for name, title, made in parts)
+    sections = (section for section in every if section.is_told)
     found = found or wording.judge(sources)
     first = Section("verdict", "Requirement and result", page_blocks(sources, found))
     return Report(

@@ -184,8 +184,8 @@ def shown(poses: Poses) -> tuple[Array, str]:
 
 
 def hover(poses: Poses, chosen: Array) -> Array:
-    """What a pose is called: its line in the file."""
-    return np.array([f"line {poses.data.line[i]}" for i in chosen])
+    """What each pose is called."""
+    return np.array([poses.data.called(poses.data.line[i]) for i in chosen])
 
 
 def trend(x: Array, y: Array) -> tuple[Array, Array]:

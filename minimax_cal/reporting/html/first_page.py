@@ -37,6 +37,7 @@ from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
+from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Note, text
 from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
@@ -48,6 +49,7 @@ from minimax_cal.solvers.status import Status
 CERTAIN = ("named", "one_of")  # verdicts that let a cause be told for established
 CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not limit
 NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
+MAX_NAMED = 5  # more kinds of effects than this are counted, not listed
 SHOWN_REASONS = 3  # why points were set aside
 NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
 
@@ -216,7 +218,9 @@ def model_of(fit: Fit) -> str:
 
 def with_effects(cell: Arm) -> str:
     """Geometry and the kinds of effects of an arm."""
-    terms = dict.fromkeys(term.effect.replace("_", " ") for term in cell.effects.terms)
+    terms = list(dict.fromkeys(name_effect(term.effect) for term in cell.effects.terms))
+    if len(terms) > MAX_NAMED:
+        return f"geometry and {len(terms)} kinds of effects"
     return f"geometry, {', '.join(terms)}" if terms else "geometry alone"
 
 
@@ -379,9 +383,8 @@ def limits_now(sources: Sources, found: Signed) -> str:
             return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
         if lacking:
             return (
-                f"the cause is not known (verdict of the diagnosis: "
-                f"{sources.gap.verdict.replace('_', ' ')}). Its best guess, which this model "
-                f"leaves out: {said_of(lacking)}."
+                f"the diagnosis leaves part of the error unexplained. Its best guess, which this "
+                f"model leaves out: {said_of(lacking)}."
             )
         guess = sources.gap.verdict == "unknown" and causes(sources.gap)
         names = " The diagnosis calls the names in this model a best guess." if guess else ""
@@ -430,7 +433,7 @@ def holds(sources: Sources, finding: Finding) -> bool:
 
 def said_of(findings: list[Finding]) -> str:
     """Causes in words, at most three."""
-    named = [f"{f.cause} ({f.term.effect.replace('_', ' ')} {f.at})" for f in findings[:3]]
+    named = [f"{f.cause} ({f.name})" for f in findings[:3]]
     more = f" and {len(findings) - 3} more" if len(findings) > 3 else ""
     return ", ".join(named) + more
 

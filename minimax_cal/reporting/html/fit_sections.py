@@ -179,11 +179,11 @@ def iso_tables(fit: Fit) -> tuple[Table, ...]:
 
 def suspect_points(sources: Sources) -> Blocks:
     """Points that do not fit the others."""
-    suspects = sources.fit.suspects if sources.fit else ()
-    table = table_of(sorted(suspects, key=lambda s: -s.score)[:MOST_SUSPECTS])
-    note = text("The files name no suspect points.")
+    if not sources.fit or not sources.fit.suspects:
+        return ()
+    worst = sorted(sources.fit.suspects, key=lambda s: -s.score)[:MOST_SUSPECTS]
     what = caveat(
         "A suspect may be a wrong point, or a real effect that the fit lacks: no row should be "
         "deleted before the diagnosis has been read."
     )
-    return [table, what] if table.rows else [note]
+    return [table_of(worst, sources.fit.data), what]

@@ -13,10 +13,6 @@ from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.tables import remainder_table, where_tables
 
 CURVES = ("residual", "order")
-NO_GAP = (
-    "Not in this report: it was made without a diagnosis; give the file that `minimax-cal "
-    "diagnose` writes as well."
-)
 
 
 def gap_steps(gap: Diagnosis) -> Blocks:
@@ -35,19 +31,18 @@ def closing(gap: Diagnosis) -> str:
     return out
 
 
-def causes_of(sources: Sources) -> Blocks:
-    """As `causes`; parameters of effects that the fit holds too stand with the fit."""
-    if not sources.gap:
-        return [missing(NO_GAP)]
-    return causes(sources.gap, parameters=not (sources.fit and sources.fit.cell.effects.terms))
+def causes(sources: Sources) -> Blocks:
+    """What was found, what else it could be, and what to measure next.
 
-
-def causes(gap: Diagnosis, *, parameters: bool) -> Blocks:
-    """What was found, what else it could be, and what to measure next."""
+    Parameters of effects that the fit holds too are with the fit.
+    """
+    gap, fit = sources.gap, sources.fit
+    if not gap:
+        return ()
     blocks: list[Block] = []
     if gap.findings:
         blocks.append(gap.effects_table())
-        blocks += [gap.parameter_table()] if parameters else []
+        blocks += [] if fit and fit.cell.effects.terms else [gap.parameter_table()]
     else:
         blocks.append(text("No effect beyond geometry was found."))
     blocks += [curve_chart(k, gap.curves[k], gap.held) for k in CURVES if k in gap.curves]
@@ -72,7 +67,7 @@ def causes(gap: Diagnosis, *, parameters: bool) -> Blocks:
 def untestable(gap: Diagnosis) -> Blocks:
     """What is neither found nor excluded."""
     table = gap.untestable_table()
-    note = text("Every effect of the library could be tested with these data.")
+    note = missing("Every effect of the library could be tested with these data.")
     return [table if table.rows else note]
 
 

@@ -14,6 +14,7 @@ from minimax_cal.dynamics.result import KIND, WORDS, MotionDiagnosis
 from minimax_cal.ground.errors import CalibrationError, OptionError
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.ground.words import visible
+from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.reporting.html.charts import (
     LOOKS,
     axis,
@@ -145,10 +146,15 @@ def budget_figure(found: MotionDiagnosis) -> Figure:
 def effect_blocks(found: MotionDiagnosis) -> tuple[Block, ...]:
     """Effects with their values, and what else they could be."""
     rows: list[tuple[Cell, ...]] = [
-        (one.words, f"{WORDS[other.effect]} at {other.place}", other.rho2, other.separate_with)
+        (
+            one.words,
+            f"{WORDS[other.effect]} {name_place(other.place)}",
+            other.rho2,
+            other.separate_with,
+        )
         for one in found.effects
         for other in one.alternatives
-    ]
+    ]  # fmt: skip
     if not found.effects:
         return (text("No effect is shown by these logs."),)
     header = ("effect", "could be", "similarity", "what tells them apart")

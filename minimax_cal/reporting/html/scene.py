@@ -220,7 +220,7 @@ def still(space: Space, poses: Poses, names: Names, where: str) -> str:
     worst = int(np.argmax(of_poses(poses.after)[space.chosen]))
     words = (
         f"errors {names[1]}, magnified {times} times",
-        f"arm at the worst pose (line {poses.data.line[space.chosen[worst]]})",
+        f"arm at the worst pose ({poses.data.called(poses.data.line[space.chosen[worst]])})",
         where,
     )
     picture = Drawing(

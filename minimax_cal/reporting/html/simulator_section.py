@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.html.charts import axis, figure, frame, line, log_axis
 from minimax_cal.reporting.html.content import Block, Blocks, Figure, caveat, label, text
 from minimax_cal.reporting.html.sources import Sources
@@ -59,7 +60,8 @@ def ladder_chart(gap: SimulatorGap) -> Figure:
         traces.append(line("third", "noise floor", np.full(2, gap.floor), ends))
     layout = frame(
         xaxis=log_axis("error (mm)", held, worst),
-        yaxis=axis("", tickvals=at.tolist(), ticktext=[label(rung.name) for rung in rungs],
+        yaxis=axis("", tickvals=at.tolist(),
+                   ticktext=[label(name_step(rung.name)) for rung in rungs],
                    range=[len(rungs) - 0.5, -0.5], automargin=True, zeroline=False),
     )  # fmt: skip
     title = "The simulated arm, from the model as given to the corrected one"

@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.diagnosing.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.plots.figures import (
     AFTER,
     BEFORE,
@@ -23,6 +24,7 @@ from minimax_cal.reporting.plots.figures import (
     scale_bar,
 )
 
+NAME = 36  # letters of a step in a line
 LETTERS, LADDER = 10.0, 200.0  # size of letters, and of all rungs' together: none touches another
 COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
 
@@ -53,7 +55,9 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
     else:
         axes.set_xlim(left=0.0)
     letters = min(LETTERS, LADDER / len(steps))
-    axes.set_yticks(at, [textwrap.fill(step.name, 24) for step in steps], fontsize=letters)
+    axes.set_yticks(
+        at, [textwrap.fill(name_step(step.name), NAME) for step in steps], fontsize=letters
+    )
     axes.set_ylim(len(steps) - 0.5, -0.5)
     right = axes.secondary_yaxis("right")
     right.set_yticks(at, [f"{value:.3f}" for value in held], fontsize=letters)
@@ -132,7 +136,7 @@ def draw_maps(part: Any, left: Leftover) -> None:
 
 def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict in a few words."""
-    names = [f"{f.term.effect} {f.term.place}" for f in diagnosis.by_rung if f.established]
+    names = [f.name for f in diagnosis.by_rung if f.established]
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     found = ", ".join(names[:3]) + more
     return {

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, plain_ticks, save
 from minimax_cal.simulators.result import SimulatorGap
 
@@ -41,7 +42,7 @@ def simulator_figure(gap: SimulatorGap) -> Figure:
         axes.set_xscale("log")
         axes.set_xlim(0.7 * positive.min(), 1.4 * positive.max())
         plain_ticks(axes.xaxis, positive)
-    axes.set_yticks(at, [textwrap.fill(rung.name, 28) for rung in rungs])
+    axes.set_yticks(at, [textwrap.fill(name_step(rung.name), 28) for rung in rungs])
     axes.set_ylim(len(rungs) - 0.5, -0.5)
     axes.set_xlabel("error (mm)")
     axes.grid(visible=True, axis="x", alpha=0.3)
