@@ -105,12 +105,12 @@ def joint(study: Study, terms: Sequence[Term]) -> Joint:
         prior = np.concatenate([np.zeros(len(poses.prior) - len(weight)), weight])
         pull = poses.score.sum(axis=0) + poses.prior * poses.off
         pull[len(pull) - len(weight) :] -= weight * state.effects
-        bread = poses.bread + np.diag(prior)
+        normal_matrix = poses.normal_matrix + np.diag(prior)
         room = np.full((len(pull), 2), np.inf)
         room[:, 0] = -np.inf
         room[len(room) - len(allowed) :] = allowed - state.effects[:, None]
-        step = bounded(bread, pull, *room.T)
-        gain = float(2.0 * step @ pull - step @ bread @ step)
+        step = bounded(normal_matrix, pull, *room.T)
+        gain = float(2.0 * step @ pull - step @ normal_matrix @ step)
         square = float((poses.error**2).sum())
         state = moved(model, state, step)
         if gain <= SETTLED * square:

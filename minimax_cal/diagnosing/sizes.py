@@ -44,7 +44,7 @@ def weights_of(poses: Linearised, values: Array, parts: Sequence[slice]) -> Arra
     weight = np.zeros(len(values))
     if not parts:
         return weight
-    gram, pull = poses.bread, poses.pull + poses.prior * poses.off
+    gram, pull = poses.normal_matrix, poses.gradient + poses.prior * poses.off
     p = len(gram) - len(values)
     across = solve_normal(gram[:p, :p], gram[:p, p:])
     left = gram[p:, p:] - gram[p:, :p] @ across  # what geometry leaves of the effects

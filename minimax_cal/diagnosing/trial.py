@@ -72,7 +72,7 @@ class Predicting(ABC):
             left = self.left_at(fold)
             score = np.tensordot(poses.jacobian[fold], left, ((0, 1), (0, 1)))
             total += float(
-                (left**2).sum() - score @ solve_normal(poses.bread, score[:, None])[:, 0]
+                (left**2).sum() - score @ solve_normal(poses.normal_matrix, score[:, None])[:, 0]
             )
         return total
 
@@ -137,9 +137,9 @@ class Trials:
         ]
         weight = np.zeros(len(index))
         weight[first:] = weights_of(start, np.zeros(len(index) - first), parts)
-        bread = start.bread + np.diag(weight)
-        pull = start.pull + start.prior * start.off
-        step = bounded(bread, pull, *self.allowed[index].T)
+        normal_matrix = start.normal_matrix + np.diag(weight)
+        pull = start.gradient + start.prior * start.off
+        step = bounded(normal_matrix, pull, *self.allowed[index].T)
         rests = at_bounds(step, self.allowed[index])
         return Trial(Linear(self, index, step, weight, rests), step[first:])
 

@@ -274,7 +274,7 @@ def pooled(every: Sequence[Accuracy]) -> float:
 
 def needed(poses: Linearised, part: Array) -> bool:
     """Whether a fit loses parameters, or much sureness, without some poses.  part: mask (m,)."""
-    return bool(are_needed(poses.bread, poses.gram_of(part)[None])[0])
+    return bool(are_needed(poses.normal_matrix, poses.gram_of(part)[None])[0])
 
 
 def are_needed(gram: Array, parts: Array) -> Array:
@@ -294,9 +294,9 @@ def are_needed(gram: Array, parts: Array) -> Array:
 
 def step_without(poses: Linearised, part: Array) -> Array:
     """(p,) the step of the free parameters once some poses are left out.  part: mask (m,)."""
-    gram, pull = poses.sums_of(part)
-    left = poses.pull - pull + poses.prior * poses.off
-    return solve_normal(poses.bread - gram, left[:, None])[:, 0]
+    gram, gradient = poses.sums_of(part)
+    left = poses.gradient - gradient + poses.prior * poses.off
+    return solve_normal(poses.normal_matrix - gram, left[:, None])[:, 0]
 
 
 def without(
@@ -318,9 +318,9 @@ def without(
     poses, model = Poses.of(estimator, state), estimator.model
     free = np.flatnonzero(model.active) < model.names.geometric + frames
     every = poses.sums_by_part(parts)
-    lost = are_needed(poses.bread[np.ix_(free, free)], every.gram[:, free][:, :, free])
+    lost = are_needed(poses.normal_matrix[np.ix_(free, free)], every.gram[:, free][:, :, free])
     lost &= np.array([part.any() for part in parts])
-    gone = np.array([untold(poses, gram, ~free) for gram in every.gram])
+    gone = np.array([unidentified(poses, gram, ~free) for gram in every.gram])
     near = one_step(poses, parts, every, ~lost & ~gone.any(axis=1))
     return [
         None if lost[i] else near.get(i) or fit_of_rest(poses, part, gone[i])
@@ -328,14 +328,14 @@ def without(
     ]
 
 
-def untold(poses: Poses, part: Array, asked: Array) -> Array:
+def unidentified(poses: Poses, part: Array, asked: Array) -> Array:
     """(p,) True for parameters that poses outside a part do not tell, as `identify.identify` asks.
 
     part: its J'AJ (p, p).  asked: (p,) those that may be given up.
     """
     out = np.zeros(len(asked), dtype=bool)
     if asked.any():
-        gram = poses.bread - np.diag(poses.prior) - part
+        gram = poses.normal_matrix - np.diag(poses.prior) - part
         own = np.maximum(np.diag(gram), 0.0)
         gram[np.diag_indices_from(gram)] = np.where(poses.prior > 0.0, 2.0 * own, own)
         out[redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK)] = True
@@ -348,21 +348,21 @@ def one_step(
     """Where one step leads without a part, for parts after which a second would hardly matter.
 
     It would where it moved the part's points by a share NEAR of their error in the whole fit; the
-    pull on it is that at the first step's end, the normal matrix that of the whole fit.
+    gradient on it is that at the first step's end, the normal matrix that of the whole fit.
 
     parts: masks (m,), every: their sums.  allowed: (f,) False for parts that are not to be tried.
     Returns states by the number of the part.
     """
     model, whole, which = poses.estimator.model, poses.estimator.whole, np.flatnonzero(allowed)
-    rest, held = poses.bread - every.gram[which], poses.prior * poses.off
-    first = solve_normal(rest, (poses.pull - every.pull[which] + held)[..., None])[..., 0]
+    rest, held = poses.normal_matrix - every.gram[which], poses.prior * poses.off
+    first = solve_normal(rest, (poses.gradient - every.gradient[which] + held)[..., None])[..., 0]
     near = [moved(model, poses.state, step) for step in first]
-    pull = np.zeros(first.shape)
+    gradient = np.zeros(first.shape)
     for i, at in enumerate(near):
         left = whole.take(~parts[which[i]])
         off = (model.prior.mean - model.values(at))[model.active]
-        pull[i] = left.normal(at, model.active).gradient.sum(axis=0) + poses.prior * off
-    more = solve_normal(rest, pull[..., None])
+        gradient[i] = left.normal(at, model.active).gradient.sum(axis=0) + poses.prior * off
+    more = solve_normal(rest, gradient[..., None])
     motion = (np.swapaxes(more, 1, 2) @ every.gram[which] @ more)[:, 0, 0]
     arrived = motion <= NEAR**2 * every.square[which]  # not so where the step is no number
     return {

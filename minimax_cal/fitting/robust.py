@@ -201,12 +201,12 @@ def remarks(at: Weighted, kept: Array, suspects: tuple[Suspect, ...], trim: floa
     elif trim and len(suspects) > away:
         yield f"{more}, but not in a fit without them; they stay in it"
     names = at.plain.names.all
-    lost = ", ".join(names[i] for i in np.flatnonzero(at.plain.active)[untold(at)])
+    lost = ", ".join(names[i] for i in np.flatnonzero(at.plain.active)[unidentified(at)])
     if lost:
         yield f"without the outliers the poses hardly determine {lost}"
 
 
-def untold(at: Weighted) -> Array:
+def unidentified(at: Weighted) -> Array:
     """(free,) True for parameters whose variance the weights raise by a factor UNTOLD or more."""
     prior = np.diag(at.plain.prior.weight[at.plain.active])
     both = [

@@ -144,12 +144,12 @@ class Linearised(ABC):
         return self.sums_of(np.ones(self.seen.shape[1], dtype=bool))
 
     @cached_property
-    def bread(self) -> Array:
+    def normal_matrix(self) -> Array:
         """(p, p) normal matrix, the prior in it."""
         return np.asarray(self.sums[0] + np.diag(self.prior))
 
     @property
-    def pull(self) -> Array:
+    def gradient(self) -> Array:
         """(p,) J'A e of all poses."""
         return self.sums[1]
 
@@ -159,7 +159,7 @@ class PartSums:
     """Sums over each of some parts of the poses: J'AJ (f, p, p), J'Ae (f, p), e'Ae (f,)."""
 
     gram: Array
-    pull: Array
+    gradient: Array
     square: Array
 
 
@@ -247,7 +247,9 @@ class Poses(Linearised):
     @cached_property
     def left_free(self) -> float:
         """Degrees of freedom of the errors: coordinates less parameters that the data pay for."""
-        paid = float(np.trace(solve_normal(self.bread, self.bread - np.diag(self.prior))))
+        paid = float(
+            np.trace(solve_normal(self.normal_matrix, self.normal_matrix - np.diag(self.prior)))
+        )
         return max(3.0 * np.count_nonzero(self.seen) - paid, 1.0)
 
     @property
@@ -287,7 +289,7 @@ class Poses(Linearised):
                 if some.any():
                     e, j = error[some].ravel(), jacobian[some].reshape(-1, p)
                     out.gram[i] += j.T @ j
-                    out.pull[i] += j.T @ e
+                    out.gradient[i] += j.T @ e
                     out.square[i] += e @ e
         return out
 
@@ -424,9 +426,9 @@ def by_noise(poses: Poses, noise: Noise) -> Array:
     """H^-1 F H^-1 with F = sum J'A (s^2 + t^2 S S') A J: (p, p) of the free parameters [SI]."""
     weighted = poses.weighted.reshape(-1, poses.weighted.shape[-1])
     swing = np.swapaxes(poses.weighted, -1, -2) @ poses.arm
-    meat = noise.variance * weighted.T @ weighted
-    meat += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
-    return sandwich(poses, meat)
+    score_covariance = noise.variance * weighted.T @ weighted
+    score_covariance += noise.jitter**2 * np.einsum("mpn,mqn->pq", swing, swing, optimize=True)
+    return sandwich(poses, score_covariance)
 
 
 def by_poses(poses: Poses, group: Array) -> Array:
@@ -438,8 +440,12 @@ def by_poses(poses: Poses, group: Array) -> Array:
     NaN where the fit needs one of the poses.
     """
     member, sizes = np.unique(group, return_inverse=True, return_counts=True)[1:]
-    order, count, p = np.argsort(member.reshape(-1), kind="stable"), len(sizes), len(poses.bread)
-    cover, ends = solve_normal(poses.bread, np.eye(p)), np.cumsum(sizes)
+    order, count, p = (
+        np.argsort(member.reshape(-1), kind="stable"),
+        len(sizes),
+        len(poses.normal_matrix),
+    )
+    cover, ends = solve_normal(poses.normal_matrix, np.eye(p)), np.cumsum(sizes)
     total = np.zeros((p, p))
     for size in np.unique(sizes):  # groups of as many rows at once
         rows = order[(ends[sizes == size] - size)[:, None] + np.arange(size)]
@@ -459,13 +465,13 @@ def by_poses(poses: Poses, group: Array) -> Array:
     return np.asarray((count - 1) / count * total + prior)
 
 
-def sandwich(poses: Poses, meat: Array) -> Array:
+def sandwich(poses: Poses, score_covariance: Array) -> Array:
     """H^-1 F H^-1.  A prior is rows as noisy as what it was weighed beside."""
     if poses.prior.any():
         variance = np.where(poses.beside > 0.0, poses.beside, poses.mean_square)
-        meat = meat + np.diag(variance * poses.prior)
-    half = solve_normal(poses.bread, meat)
-    return np.asarray(solve_normal(poses.bread, half.T))
+        score_covariance = score_covariance + np.diag(variance * poses.prior)
+    half = solve_normal(poses.normal_matrix, score_covariance)
+    return np.asarray(solve_normal(poses.normal_matrix, half.T))
 
 
 def uncertainty_of(
@@ -480,7 +486,7 @@ def uncertainty_of(
     few, rows = estimator.thinned(group, PLENTY)
     poses = Poses.of(few, state)
     dof = poses.freedom
-    found, source = np.full(poses.bread.shape, np.nan), "poses"
+    found, source = np.full(poses.normal_matrix.shape, np.nan), "poses"
     if dof >= 1.0 and estimator.share.ndim == 1:
         found = by_poses(poses, group[rows])
     if dof >= 1.0 and np.isnan(found).any():

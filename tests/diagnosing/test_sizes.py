@@ -63,8 +63,8 @@ def test_the_size_is_the_likeliest(power: float, at: float) -> None:
 def test_what_the_data_tell_is_left_alone(geared: Study) -> None:
     found = joint(geared, (GEAR,))
     poses, _ = linear(geared, GEAR)
-    gram = poses.bread
-    free = np.linalg.lstsq(gram, poses.pull + poses.prior * poses.off, rcond=None)[0][-2:]
+    gram = poses.normal_matrix
+    free = np.linalg.lstsq(gram, poses.gradient + poses.prior * poses.off, rcond=None)[0][-2:]
     sigma = np.sqrt(np.diag(np.linalg.pinv(gram, hermitian=True))[-2:])
     sigma *= np.sqrt((poses.error**2).mean())
     assert (np.abs(found.state.effects - free) < 0.3 * sigma).all()
@@ -75,7 +75,7 @@ def test_what_the_data_do_not_tell_stays_small(geared: Study) -> None:
     other = Term("gear_error", "J5", {"turns": 1.0})
     poses, values = linear(geared, GEAR, other)
     weight = weights_of(poses, values, [slice(0, 2), slice(2, 4)])
-    gram, pull = poses.bread, poses.pull + poses.prior * poses.off
+    gram, pull = poses.normal_matrix, poses.gradient + poses.prior * poses.off
     prior = np.concatenate([np.zeros(len(gram) - 4), weight])
     free, held = (np.linalg.solve(gram + np.diag(w), pull)[-2:] for w in (0.0 * prior, prior))
     assert np.linalg.norm(held) < 0.7 * np.linalg.norm(free)

@@ -13,7 +13,7 @@ from minimax_cal.fitting.beyond import (
     needed,
     one_step,
     step_without,
-    untold,
+    unidentified,
     without,
 )
 from minimax_cal.fitting.uncertainty import Poses
@@ -123,7 +123,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
     for part in (part.rows[~fit.held] for part in parts(fit.data)):
         near = moved(estimator.model, state, step_without(poses, part))
         sums = poses.sums_by_part([part])
-        if untold(poses, sums.gram[0], effects_of).any():
+        if unidentified(poses, sums.gram[0], effects_of).any():
             continue
         if one_step(poses, [part], sums, np.ones(1, dtype=bool)):
             continue
@@ -132,7 +132,7 @@ def test_the_search_goes_on_where_one_step_does_not_arrive(robot: mc.Robot) -> N
         assert found is not None
         there = Poses.of(estimator, found)
         step, more = step_without(there, part), step_without(Poses.of(estimator, near), part)
-        motion, left = (float(one @ there.bread @ one) for one in (step, more))
+        motion, left = (float(one @ there.normal_matrix @ one) for one in (step, more))
         assert motion < 1e-6 * left  # a further step leads nowhere
     assert far
 
@@ -161,7 +161,7 @@ class Rows:
     weights: float
 
     @property
-    def bread(self) -> Array:
+    def normal_matrix(self) -> Array:
         return self.gram_of(np.ones(len(self.rows), dtype=bool)) + self.weights * np.eye(2)
 
     def gram_of(self, part: Array) -> Array:
@@ -299,5 +299,5 @@ def test_sums_by_part_are_those_of_each_part(robot: mc.Robot, noisy: Simulation)
     for i, mask in enumerate(masks):
         gram, pull = poses.sums_of(mask)
         assert_allclose(every.gram[i], gram, rtol=0, atol=1e-12 * np.abs(gram).max())
-        assert_allclose(every.pull[i], pull, rtol=0, atol=1e-12 * np.abs(poses.error).sum())
+        assert_allclose(every.gradient[i], pull, rtol=0, atol=1e-12 * np.abs(poses.error).sum())
     assert_allclose(every.square.sum(), poses.estimator.whole.cost(poses.state).sum(), rtol=1e-12)

@@ -86,9 +86,9 @@ def dense(robot: mc.Robot, data: Measurements, found: Solved) -> tuple[Array, Ar
 def sandwich(J: Array, A: Array, V: Array, prior: Array) -> Array:
     """H^-1 F H^-1, pose by pose from dense matrices.  A, V: (m, 3k, 3k)."""
     turned = np.swapaxes(J, 1, 2)
-    bread = np.linalg.inv((turned @ A @ J).sum(axis=0) + np.diag(prior))
-    meat = (turned @ A @ V @ A @ J).sum(axis=0)
-    return np.asarray(bread @ meat @ bread)
+    normal_matrix = np.linalg.inv((turned @ A @ J).sum(axis=0) + np.diag(prior))
+    score_covariance = (turned @ A @ V @ A @ J).sum(axis=0)
+    return np.asarray(normal_matrix @ score_covariance @ normal_matrix)
 
 
 def alike(found: Array, expected: Array, tolerance: float) -> None:
@@ -198,7 +198,7 @@ def test_leaving_out_a_pose_is_what_a_fit_without_it_gives(
             )[fit.identification.active]
         )
         gram, score = poses.gram_of(~kept), poses.score[pose]
-        expected = -np.linalg.solve(poses.bread - gram, score)
+        expected = -np.linalg.solve(poses.normal_matrix - gram, score)
         assert_allclose((moved / sigma)[linear], (expected / sigma)[linear], rtol=0, atol=0.01)
 
 
