@@ -49,7 +49,7 @@ from minimax_cal.evidence.alternatives import resemblances
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.checks import NO_ROWS, check_plausible, misplaced, put_right
 from minimax_cal.fitting.claims import too_far
-from minimax_cal.fitting.crossed import FEW
+from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.judged import doubts
 from minimax_cal.fitting.options import Options, Progress, silent
@@ -151,7 +151,7 @@ def diagnose(
 
 def few_judges(held: Measurements) -> Iterator[str]:
     """That few poses judge.  held: those held out."""
-    if len(np.unique(clusters(held))) < FEW:
+    if len(np.unique(clusters(held))) < MIN_HELD_POSES:
         yield (
             f"only {held.poses} poses are held out: what is said of new poses rests on these; "
             "calibrate with the effects found judges every pose by a fit without it"

@@ -31,10 +31,14 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.status import Status
 
-WORSE = 3.0  # a part is needed, and not left out, if the condition without it is so much worse
-RANK = 1e-3  # singular value below which a parameter is lost, as `identify.RESOLUTION`
-NEAR = 5e-3  # of a part's error: a fit that another step would move there by less has arrived
-SHOWN = 4  # parts, the worst, for people
+MAX_CONDITION_GROWTH = (
+    3.0  # a part is needed, and not left out, if the condition without it is so much worse
+)
+RANK_TOLERANCE = 1e-3  # singular value below which a parameter is lost, as `identify.RESOLUTION`
+MAX_SECOND_STEP = (
+    5e-3  # of a part's error: a fit that another step would move there by less has arrived
+)
+MAX_SHOWN_PARTS = 4  # parts, the worst, for people
 NOTHING_LEFT = "every part of the poses is needed for the fit"
 
 
@@ -137,7 +141,7 @@ class Beyond:
 
     def table(self) -> Table:
         """All parts together, and the worst few."""
-        shown = sorted(self.folds, key=lambda fold: -fold.rms_mm)[:SHOWN]
+        shown = sorted(self.folds, key=lambda fold: -fold.rms_mm)[:MAX_SHOWN_PARTS]
         count = sum(fold.poses for fold in self.folds)
         most = max((fold.max_mm for fold in self.folds), default=math.nan)
         whole = self.judged or f"all {len(self.folds)} parts"
@@ -286,9 +290,9 @@ def are_needed(gram: Array, parts: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     alike = np.concatenate([gram[None], gram - parts]) / np.outer(scale, scale)
     size = np.sqrt(np.maximum(np.linalg.eigvalsh(alike), 0.0))
-    kept = (size > RANK * size[:, -1:]).sum(axis=1)
+    kept = (size > RANK_TOLERANCE * size[:, -1:]).sum(axis=1)
     whole, rest, had = size[0], size[1:], int(kept[0])
-    wider = rest[:, -1] * whole[-had] > WORSE * whole[-1] * rest[:, -had]
+    wider = rest[:, -1] * whole[-had] > MAX_CONDITION_GROWTH * whole[-1] * rest[:, -had]
     return np.asarray((kept[1:] < had) | wider)
 
 
@@ -338,7 +342,9 @@ def unidentified(poses: Poses, part: Array, asked: Array) -> Array:
         gram = poses.normal_matrix - np.diag(poses.prior) - part
         own = np.maximum(np.diag(gram), 0.0)
         gram[np.diag_indices_from(gram)] = np.where(poses.prior > 0.0, 2.0 * own, own)
-        out[redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK)] = True
+        out[
+            redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK_TOLERANCE)
+        ] = True
     return out
 
 
@@ -364,7 +370,9 @@ def one_step(
         gradient[i] = left.normal(at, model.active).gradient.sum(axis=0) + poses.prior * off
     more = solve_normal(rest, gradient[..., None])
     motion = (np.swapaxes(more, 1, 2) @ every.gram[which] @ more)[:, 0, 0]
-    arrived = motion <= NEAR**2 * every.square[which]  # not so where the step is no number
+    arrived = (
+        motion <= MAX_SECOND_STEP**2 * every.square[which]
+    )  # not so where the step is no number
     return {
         int(i): at
         for i, at, done in zip(which, near, arrived, strict=True)

@@ -29,19 +29,19 @@ from minimax_cal.robots import kinematics
 from minimax_cal.robots.kernels.choice import work
 from minimax_cal.robots.robot import Robot
 
-FEW = 30  # poses that are enough to test a slip of units or signs
+MAX_TRIAL_POSES = 30  # poses that are enough to test a slip of units or signs
 POOR_FIT = 5e-3  # errors above this share of the arm's reach are not what calibration is about
 EXPLAINED = 0.04  # of the mean square: a slip that leaves no more is the cause
-ROUNDS = 5
-APART = 8.0  # times the typical miss, and this share of the reach: no error of the arm
-LEAST = 0.02
-CLOSE = 3.0  # times the typical miss: where a row belongs
+MAX_ROUNDS = 5
+MIN_STRAY_RATIO = 8.0  # times the typical miss, and this share of the reach: no error of the arm
+MIN_STRAY_OF_REACH = 0.02
+MAX_HOME_RATIO = 3.0  # times the typical miss: where a row belongs
 LEAST_HEAD = 8  # rows that place a base well enough to judge others
 LEAST_PLACED = 10  # rows at the start that may be right before a break
 CLOSE_BY = 3  # rows at either end that no break is looked for in
 FEW_CLIPPED = 3  # rows at the end of a joint's values that are no chance
 MOST_SCALE = 0.05  # a larger one is another unit, or another arm
-SURE = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
+MIN_SCALE_GAIN = 50.0  # twice the log likelihood that a common factor must gain, as elsewhere
 LEAST_MOVING = 5  # joints whose links have ways enough to differ from a common factor
 SHIFTS = tuple(by for size in range(1, MOST_SHIFT + 1) for by in (size, -size))
 NO_ROWS: Array = np.zeros(0, dtype=int)
@@ -98,10 +98,10 @@ def check_plausible(robot: Robot, data: Measurements) -> BaseFit:
 
 
 def few_of(data: Measurements) -> Measurements:
-    """At most `FEW` rows, spread evenly."""
-    if data.poses <= FEW:
+    """At most `MAX_TRIAL_POSES` rows, spread evenly."""
+    if data.poses <= MAX_TRIAL_POSES:
         return data
-    return data.take(np.linspace(0, data.poses - 1, FEW).astype(int))
+    return data.take(np.linspace(0, data.poses - 1, MAX_TRIAL_POSES).astype(int))
 
 
 def check_fresh(robot: Robot, data: Measurements) -> None:
@@ -124,7 +124,7 @@ def check_scale(robot: Robot, data: Measurements, given: BaseFit) -> None:
         return
     found = scale_of(robot, data, given)
     change = found.factor - 1.0
-    if found.gain >= SURE and LEAST_SHARE < abs(change) < MOST_SCALE:
+    if found.gain >= MIN_SCALE_GAIN and LEAST_SHARE < abs(change) < MOST_SCALE:
         raise DataError(
             f"{data.source}: all points lie {found.factor:.5g} times as far apart as {robot.name} "
             "is drawn, as no error of links does: check the instrument's scale, units and "
@@ -150,7 +150,7 @@ def check_broken(robot: Robot, data: Measurements) -> None:
     if data.poses < 3 * LEAST_HEAD:
         return
     limit = 4.0 * POOR_FIT * robot.reach()
-    count = min(data.poses // 3, FEW)
+    count = min(data.poses // 3, MAX_TRIAL_POSES)
     rows = np.arange(data.poses)
     for end in (rows[:count], rows[:LEAST_PLACED], rows[-count:]):
         state = fitted(robot, data.take(end)).state
@@ -207,7 +207,7 @@ def check_clipped(robot: Robot, data: Measurements) -> None:
             continue
         rest = fitted(robot, data.take(~at_end))
         away = misses(robot, data.take(at_end), rest.state)
-        if np.sqrt(rest.mean_square) <= limit and np.median(away) > CLOSE * limit:
+        if np.sqrt(rest.mean_square) <= limit and np.median(away) > MAX_HOME_RATIO * limit:
             worst = ", ".join(f"{end:.6g}" for end in ends)
             unit = "m" if robot.prismatic[joint] else "rad"
             raise DataError(
@@ -280,27 +280,31 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     Found by where the arm would have been.  A row whose points belong nowhere has itself there.
     """
     model, good = model_of(robot, data), np.ones(data.poses, dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         state = fitted(robot, data.take(good)).state
         measured, predicted = measured_and_predicted(model, state)
         squares = (np.where(model.seen[:, None], measured - predicted, 0.0) ** 2).sum(axis=(0, 1))
         miss = np.sqrt(squares / np.maximum(model.seen.sum(axis=0), 1))
         typical = float(np.median(miss[good]))
-        limit = max(APART * typical, LEAST * robot.reach())
+        limit = max(MIN_STRAY_RATIO * typical, MIN_STRAY_OF_REACH * robot.reach())
         if not (miss > limit).any() and good.all():
             break
-        kept = miss < max(CLOSE * float(np.median(miss)), limit)
+        kept = miss < max(MAX_HOME_RATIO * float(np.median(miss)), limit)
         if (kept == good).all() or kept.sum() < max(10, data.poses // 2):
             break
         good = kept
-    bad = np.flatnonzero(miss > max(APART * float(np.median(miss)), LEAST * robot.reach()))
+    bad = np.flatnonzero(
+        miss > max(MIN_STRAY_RATIO * float(np.median(miss)), MIN_STRAY_OF_REACH * robot.reach())
+    )
     if not len(bad) or len(bad) > data.poses // 5:
         return NO_ROWS, NO_ROWS
     off = measured[:, :, None, bad] - predicted[:, :, bad, None]  # of points b at pose a
     both = model.seen[:, None, bad] & model.seen[:, bad, None]
     distance = np.sqrt((off**2).sum(axis=1) * both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
     pose, points = scipy.optimize.linear_sum_assignment(distance)
-    fits = distance[pose, points] < max(CLOSE * typical, LEAST * robot.reach() / 4.0)
+    fits = distance[pose, points] < max(
+        MAX_HOME_RATIO * typical, MIN_STRAY_OF_REACH * robot.reach() / 4.0
+    )
     return bad, bad[np.where(fits, points, pose)]
 
 

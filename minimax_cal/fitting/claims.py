@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond, left_out, not_claimed
-from minimax_cal.fitting.crossed import FEW, crossed
+from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
@@ -28,11 +28,11 @@ from minimax_cal.modelling.model import model_of
 from minimax_cal.modelling.parameters import State
 from minimax_cal.robots.robot import Robot
 
-GROSS = 0.01  # of the reach: a fit that misses by more contradicts its own data
-FLOORS = 50.0  # times the floor, likewise
+MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts its own data
+MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
 YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
-LISTED = 5  # lines that a notice names
-LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
+MAX_NAMED = 5  # lines that a notice names
+MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 
 
 def unseen_suspects(
@@ -55,7 +55,7 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
     if held:
         named = [f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held]
         yield (
-            f"{source}: outliers among the held-out points: {name_first(named, LISTED)}; they "
+            f"{source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; they "
             "count in the held-out accuracy, which is also given without them"
         )
 
@@ -68,7 +68,7 @@ def unjudged(data: Measurements, crossed: Array) -> Iterator[str]:
     if crossed.size:
         lost = data.seen.any(axis=1) & ~np.isfinite(crossed).any(axis=(0, 2))
         if lost.any():
-            named = name_first([str(line) for line in data.line[lost]], LISTED)
+            named = name_first([str(line) for line in data.line[lost]], MAX_NAMED)
             yield (
                 f"{data.source}: {lost.sum()} of {data.poses} poses are needed for the fit, so "
                 f"that none without them judges them: line {named}"
@@ -100,15 +100,18 @@ def too_far(
     floor: of noise [mm], and how it is known.  scores: of parts of the poses by their names, over
     all points and without those that are suspect.
     """
-    limit, what = 1e3 * GROSS * robot.reach(), f"{100 * GROSS:g} % of the arm's reach"
-    if floor and FLOORS * floor[0] < limit:
-        limit = FLOORS * floor[0]
-        what = f"{FLOORS:g} times the noise floor ({floor[1]})"
+    limit, what = (
+        1e3 * MAX_MISS_OF_REACH * robot.reach(),
+        f"{100 * MAX_MISS_OF_REACH:g} % of the arm's reach",
+    )
+    if floor and MAX_MISS_OF_FLOOR * floor[0] < limit:
+        limit = MAX_MISS_OF_FLOOR * floor[0]
+        what = f"{MAX_MISS_OF_FLOOR:g} times the noise floor ({floor[1]})"
         if limit < 1e3 * YIELDS * robot.reach():
             limit = 1e3 * YIELDS * robot.reach()
             what += f" and {100 * YIELDS:g} % of the arm's reach"
     for name, (whole, left) in scores.items():
-        few = sum(left.counts) < LEFT * sum(whole.counts)
+        few = sum(left.counts) < MIN_POINTS_LEFT * sum(whole.counts)
         miss = whole.rms_mm if few else left.rms_mm  # where most are suspects it is the fit
         if miss > limit:
             return (
@@ -141,7 +144,7 @@ def errors_of(robot: Robot, data: Measurements, solved: Solved) -> Callable[[Sta
 
 def is_crossed(options: Options, held: Measurements) -> bool:
     """Whether to cross-validate: asked for, or few poses are held out."""
-    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < FEW)
+    return options.cv or (bool(held.poses) and len(np.unique(clusters(held))) < MIN_HELD_POSES)
 
 
 def crossed_of(

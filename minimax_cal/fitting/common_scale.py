@@ -27,8 +27,13 @@ FACTORS = np.geomspace(0.1, 30.0, 26)  # of the links' errors
 NOISES = np.geomspace(2e-6, 2e-2, 30)  # of a coordinate, with what no link explains [m]
 POSES = 60  # that tell a scale
 LEAST_LENGTH, FEWEST = 0.05, 4  # of lengths that tell a common share: size [m]; their number
-CHANCE, DOUBTFUL = 0.003, 0.05  # that lengths which are off at random agree so well on a share
-CLEAR = 3.0  # sigmas of what the angles let expect, beside which doubtful agreement is enough
+MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = (
+    0.003,
+    0.05,
+)  # that lengths which are off at random agree so well on a share
+MIN_CLEAR_SIGMAS = (
+    3.0  # sigmas of what the angles let expect, beside which doubtful agreement is enough
+)
 MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
 
 
@@ -51,7 +56,9 @@ def common_share(drawn: Array, change: Array, found: Array) -> float:
     stretch = abs(share) * np.sqrt(size)
     chance = 2.0 * float(stdtr(spare, -stretch / apart))
     usual = float(np.median(angles)) / MEDIAN / OFF_ANGLE * OFF_LENGTH
-    clear = chance < CHANCE or (chance < DOUBTFUL and stretch > CLEAR * usual)
+    clear = chance < MAX_P_VALUE or (
+        chance < MAX_DOUBTFUL_P_VALUE and stretch > MIN_CLEAR_SIGMAS * usual
+    )
     return share if clear and abs(share) > LEAST_SHARE else 0.0
 
 

@@ -21,9 +21,11 @@ from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.parameters import State
 
-FEW = 20  # held-out poses; of fewer a share is left out in turn as well
+MIN_HELD_POSES = 20  # held-out poses; of fewer a share is left out in turn as well
 FOLDS = 10  # parts of the training poses: a fit without one has nearly all of them
-PLENTY = 3.0  # numbers measured per parameter; with fewer, errors on new poses are far larger
+MIN_NUMBERS_PER_PARAMETER = (
+    3.0  # numbers measured per parameter; with fewer, errors on new poses are far larger
+)
 FREE = 6  # numbers that a pose tells at most, however many targets it shows
 NOT_CROSSED = np.zeros((0, 0, 3))
 
@@ -91,9 +93,9 @@ def few_poses(train: Measurements, parameters: int) -> str:
     _, first = np.unique(groups(train), return_index=True)
     each = np.minimum(3 * train.seen[first].sum(axis=1), FREE)
     numbers = int(each.sum())
-    if numbers >= PLENTY * parameters or not parameters:
+    if numbers >= MIN_NUMBERS_PER_PARAMETER * parameters or not parameters:
         return ""
-    more = math.ceil(PLENTY * parameters / each.mean())
+    more = math.ceil(MIN_NUMBERS_PER_PARAMETER * parameters / each.mean())
     growth = "many"
     if numbers > parameters:
         growth = f"about {math.sqrt((numbers + parameters) / (numbers - parameters)):.1f}"

@@ -26,9 +26,9 @@ PARALLEL = np.sin(np.radians(5.0))  # neighbouring axes closer than this count a
 # Singular values of the column-scaled Jacobian, relative to the largest: below RANK a direction is
 # redundant whatever the poses; below RESOLUTION these poses show it a thousand times weaker than
 # others, and its estimate would be noise (a target 0.1 mm off the last axis "measures" the wrist).
-RANK = 1e-6
+RANK_TOLERANCE = 1e-6
 RESOLUTION = 1e-3
-SHOWN = 4  # names in a reason
+MAX_NAMED = 4  # names in a reason
 SAME_MOTION = "same motion as {}"
 NOT_TOLD = "these poses do not tell it from {}"
 TOGETHER = "all targets moved together"
@@ -104,7 +104,7 @@ class Kept:
         spots = [name for name in shown if name.rsplit("_", 1)[0] in stems]
         if len({name.rsplit("_", 1)[0] for name in spots}) > 1:
             shown = [name for name in shown if name not in spots] + [whole]
-        return name_first(shown, SHOWN)
+        return name_first(shown, MAX_NAMED)
 
 
 def drop_order(robot: Robot, names: Names) -> Array:
@@ -168,7 +168,7 @@ def determined(
     kept = kept.without(kept.active & (scale <= 1e-12), "moves no measured point")
     plain = gram_of(reference, replace(state, effects=np.zeros(0)))
     plain = np.pad(plain, (0, names.count - len(plain)))
-    gone = redundant(plain, kept.active & geometric(names), order, RANK)
+    gone = redundant(plain, kept.active & geometric(names), order, RANK_TOLERANCE)
     kept = kept.without(gone, SAME_MOTION)
     told = gram + np.diag(np.where(known, np.diag(gram), 0.0))
     return kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD), gram, scale
@@ -192,7 +192,7 @@ def generic_count(robot: Robot, reference: Model, order: Array, allowed: Array) 
     if asked not in known:
         spots = np.random.default_rng(0).normal(size=(len(reference.y), 3))
         state = State(robot.mdh, np.eye(3), np.zeros(3), 0.1 * robot.reach() * spots)
-        gone = redundant(gram_of(reference, state), allowed, order, RANK)
+        gone = redundant(gram_of(reference, state), allowed, order, RANK_TOLERANCE)
         known[asked] = int(allowed.sum()) - len(gone)
     return known[asked]
 

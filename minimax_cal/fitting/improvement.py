@@ -20,9 +20,9 @@ from minimax_cal.measuring.measurements import Measurements
 
 # A point that both arms miss by so many times what lies between them there does not say which of
 # them is right; a point that only the calibrated arm misses does, and counts.
-APART = 2.0
-LEFT = 2.0 / 3.0  # of the points: where fewer are left, all count
-NAMED = 5  # points that a reason names
+MIN_COMMON_MISS = 2.0
+MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are left, all count
+MAX_NAMED = 5  # points that a reason names
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,10 @@ def improvement(
     if whole.is_better:
         return whole
     between = np.linalg.norm(drawn - calibrated, axis=-1)
-    alike = np.linalg.norm(calibrated, axis=-1) > APART * between
+    alike = np.linalg.norm(calibrated, axis=-1) > MIN_COMMON_MISS * between
     wrong = alike & np.isnan(aside(calibrated, data, suspects)[..., 0])
     judged = np.isfinite(calibrated[..., 0])
-    if not (wrong & judged).any() or (judged & ~wrong).sum() < LEFT * judged.sum():
+    if not (wrong & judged).any() or (judged & ~wrong).sum() < MIN_POINTS_LEFT * judged.sum():
         return whole
     hidden = np.where(wrong[..., None], np.nan, calibrated)
     less = compare_arms(drawn, hidden, group)
@@ -107,13 +107,13 @@ def points_of(data: Measurements, which: Array, error: Array) -> str:
         f"{data.called(data.line[pose])} {data.target_names[target]} {size[target, pose]:.3g} mm"
         for target, pose in np.argwhere(which).tolist()
     ]
-    return name_first(shown, NAMED)
+    return name_first(shown, MAX_NAMED)
 
 
 def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
     off = [f"line {one.line} {one.target} {1e3 * one.distance:.3g} mm" for one in suspects]
-    rows = f"; check the outliers ({name_first(off, NAMED)})" if off else ""
+    rows = f"; check the outliers ({name_first(off, MAX_NAMED)})" if off else ""
     return (
         f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "
         "the drawn arm, or calibrate again with more poses, joint values with all their digits "

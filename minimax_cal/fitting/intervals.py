@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from minimax_cal.ground.arrays import Array
 
-FEWEST = 3  # poses; fewer say nothing about their spread
+MIN_POSES = 3  # poses; fewer say nothing about their spread
 DRAWS = 2000  # bootstrap samples: the ends are then sure to about 2 % of the width
 PIVOTS = 4000  # simulated samples behind the interval of the largest error
 TAIL = 100  # no more than so many of the largest errors tell the tail
@@ -64,7 +64,7 @@ def rms_interval(
     bundle = np.arange(len(count)) % BUNDLES
     total, count = np.bincount(bundle, total), np.bincount(bundle, count)
     m = len(count)
-    if m < FEWEST:
+    if m < MIN_POSES:
         return UNKNOWN
     mean = float(total.sum() / count.sum())
     if mean == 0.0:
@@ -119,7 +119,7 @@ def max_interval(
     np.maximum.at(largest, group, each)
     largest = largest[largest >= 0.0]
     m = len(largest)
-    if m < FEWEST:
+    if m < MIN_POSES:
         return UNKNOWN
     size = float(np.sqrt(np.mean(largest**2)))
     if size == 0.0:

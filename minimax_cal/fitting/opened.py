@@ -17,7 +17,7 @@ from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.options import Options, options_from
 from minimax_cal.fitting.start import fit_base
-from minimax_cal.fitting.stations import LEAST, moving
+from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError, DataError, OptionError
@@ -142,7 +142,7 @@ def in_new_frame(cell: Cell, data: Measurements) -> Cell:
     alone = replace(cell, sessions=replace(cell.sessions, frames={}))
     error = np.moveaxis(alone.error(data), 0, 1)
     here = data.y[data.seen]
-    if len(here) < LEAST:
+    if len(here) < MIN_FRAME_POINTS:
         raise DataError(f"{data.source}: {len(here)} points do not place a frame; measure more")
     there = here - error[data.seen]  # where the calibration's instrument would see them
     return replace(alone, base=moving(there, here) @ cell.base)

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minimax_cal.fitting.checks import LEAST, exchanged
+from minimax_cal.fitting.checks import MIN_STRAY_OF_REACH, exchanged
 from minimax_cal.fitting.claims import contradiction
 from minimax_cal.fitting.computed import computed, least_noise, residual
 from minimax_cal.fitting.improvement import Improvement, improvement
 from minimax_cal.fitting.options import Options, objective_of
 from minimax_cal.fitting.same_arm import too_changed
-from minimax_cal.fitting.solve import DOUBTED, Solved
+from minimax_cal.fitting.solve import MIN_TRUSTED_WEIGHT, Solved
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
@@ -24,7 +24,11 @@ from minimax_cal.robots.robot import Robot
 def exchanged_rows(robot: Robot, data: Measurements, before: Array) -> Array:
     """(b,) rows whose points belong to other rows.  before: (k, m, 3) errors as drawn [m]."""
     far = np.nanmax(np.linalg.norm(before, axis=-1), initial=0.0)
-    return exchanged(robot, data) if far > LEAST * robot.reach() else np.zeros(0, dtype=int)
+    return (
+        exchanged(robot, data)
+        if far > MIN_STRAY_OF_REACH * robot.reach()
+        else np.zeros(0, dtype=int)
+    )
 
 
 def said_of_exchanged(data: Measurements, rows: Array) -> str:
@@ -54,7 +58,7 @@ def impossible(
     """
     active, links = solved.identification.active, 5 * robot.joints
     noise, train = least_noise(data, robot.repeatability), np.flatnonzero(~held)
-    pulling = np.isin(swapped, train[(solved.robust.weights > DOUBTED).any(axis=0)])
+    pulling = np.isin(swapped, train[(solved.robust.weights > MIN_TRUSTED_WEIGHT).any(axis=0)])
     if pulling.any():
         return said_of_exchanged(data, swapped)
     changed = ""

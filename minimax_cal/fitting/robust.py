@@ -21,11 +21,11 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import LeastSquares, solve_normal
 
 SQUARE = "square"  # the loss of plain least squares
-START = 0.3  # share of the points that may leave the start of a loss
-MOST = 0.5  # no method tells wrong points from right ones where they are the majority
-ROUNDS = 200  # of reweighting
-SETTLED = 1e-6  # change of a weight that ends them
-UNTOLD = 100.0  # times the variance: these poses no longer tell a parameter
+START_TRIM = 0.3  # share of the points that may leave the start of a loss
+MAX_TRIM = 0.5  # no method tells wrong points from right ones where they are the majority
+MAX_ROUNDS = 200  # of reweighting
+WEIGHT_TOLERANCE = 1e-6  # change of a weight that ends them
+MAX_VARIANCE_GROWTH = 100.0  # times the variance: these poses no longer tell a parameter
 ALL: Array = np.ones(0, dtype=bool)
 
 
@@ -65,12 +65,12 @@ def reweighted(at: Weighted, kept: Array, loss: Loss, scale: float) -> Weighted:
 
     kept: (k, m) 0 for points set aside, which stay out.
     """
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         size = distances(at.plain, at.state) / (scale * loss.tuning)
         weights = kept * loss.weight(size)
         change = float(np.abs(weights - at.weights)[at.judged].max(initial=0.0))
         at = at.again(weights)
-        if change <= SETTLED:
+        if change <= WEIGHT_TOLERANCE:
             return at
     return at.unsettled()
 
@@ -149,8 +149,8 @@ def check_robust(loss: str, trim: float) -> None:
     """Raise OptionError for a choice that does not exist."""
     if loss not in (SQUARE, *LOSSES):
         raise OptionError(f"no loss {loss!r}; choose {', '.join((SQUARE, *LOSSES))}")
-    if not 0.0 <= trim < MOST:
-        raise OptionError(f"trim {trim:g}: give a share of the points, 0 <= trim < {MOST:g}")
+    if not 0.0 <= trim < MAX_TRIM:
+        raise OptionError(f"trim {trim:g}: give a share of the points, 0 <= trim < {MAX_TRIM:g}")
 
 
 def robust_fit(
@@ -176,7 +176,7 @@ def robust_fit(
     if not np.isfinite(found.cost).all():  # its status tells why; there is nothing to start from
         loss, trim = SQUARE, 0.0
     if loss != SQUARE or trim > 0.0:
-        at = set_aside(concentrate(soften(at), max(trim, START)), trim or START)
+        at = set_aside(concentrate(soften(at), max(trim, START_TRIM)), trim or START_TRIM)
         kept = at.weights if trim else seen
     if loss != SQUARE:
         scale = at.spread(at.scores()).scale
@@ -215,7 +215,7 @@ def unidentified(at: Weighted) -> Array:
     ]
     ridge = RIDGE * np.diag(np.diag(both[0]))
     before, after = (np.diag(solve_normal(gram + ridge, np.eye(len(gram)))) for gram in both)
-    return np.asarray(after > UNTOLD * before)
+    return np.asarray(after > MAX_VARIANCE_GROWTH * before)
 
 
 def moments(model: Model, state: State, loss: str, scale: float) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from minimax_cal.fitting.checks import check_plausible
-from minimax_cal.fitting.claims import GROSS
+from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.solve import LEAST_POSES
 from minimax_cal.fitting.stations import stationed
 from minimax_cal.ground.arrays import Array
@@ -23,7 +23,7 @@ WILD_ANGLE = 0.05  # no joint of a whole robot is farther from its drawing [rad]
 WILD_LENGTH = 0.02  # nor a length, of its reach
 LARGE_LENGTH = 0.05  # of the reach: with an identified length so far off it is another arm
 LARGE_TWIST, LARGE_ZERO = math.radians(5.0), math.radians(30.0)  # alpha, beta; theta, as well
-NAMED = 5  # changes that are told one by one
+MAX_NAMED = 5  # changes that are told one by one
 
 
 def wild(names: Names, change: Array, reach: float) -> str:
@@ -35,7 +35,7 @@ def wild(names: Names, change: Array, reach: float) -> str:
     far = np.flatnonzero(np.abs(change) > np.where(length, WILD_LENGTH * reach, WILD_ANGLE))
     return ", ".join(
         f"{names.all[i]} by {1e3 * change[i]:+.4g} {'mm' if length[i] else 'mrad'}"
-        for i in far[:NAMED]
+        for i in far[:MAX_NAMED]
     )
 
 
@@ -65,7 +65,7 @@ def too_changed(robot: Robot, after: Robot, active: Array) -> str:
         for i in far
     ]  # fmt: skip
     return (
-        f"the measured arm is not the one that {robot.name} draws: {name_first(named, NAMED)} "
+        f"the measured arm is not the one that {robot.name} draws: {name_first(named, MAX_NAMED)} "
         f"(at most {1e3 * LARGE_LENGTH * robot.reach():.3g} mm, 5 % of the reach; 5 degrees of "
         "alpha and beta, 30 of theta): check the robot file, joint signs and units; where the "
         "drawing is rough, give allow_large_changes=True"
@@ -82,7 +82,7 @@ def check_arm(robot: Robot, data: Measurements) -> None:
         return
     data = stationed(robot, data, np.ones(data.poses, dtype=bool))
     given = check_plausible(robot, data)
-    limit = GROSS * robot.reach()
+    limit = MAX_MISS_OF_REACH * robot.reach()
     if np.sqrt(given.mean_square) <= limit:
         return
     free = np.zeros(Names.of(robot, data.target_names).count, dtype=bool)

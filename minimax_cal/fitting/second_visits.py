@@ -18,10 +18,12 @@ from minimax_cal.measuring.floor import FEWEST
 from minimax_cal.measuring.grouping import visits
 from minimax_cal.measuring.measurements import Measurements
 
-GUILTY = 3.0  # times the error of the other visit: the one that is wrong
-MOST = 8  # pairs that are told
-HIGH = 0.95  # share of the other visits that keep to what is told of them
-GROSS = 4.0  # times that: drift, growth and nests that shift part visits by less (blind_gap)
+MIN_GUILTY_RATIO = 3.0  # times the error of the other visit: the one that is wrong
+MAX_NAMED_PAIRS = 8  # pairs that are told
+USUAL_QUANTILE = 0.95  # share of the other visits that keep to what is told of them
+MIN_GROSS_RATIO = (
+    4.0  # times that: drift, growth and nests that shift part visits by less (blind_gap)
+)
 
 
 def contradictions(data: Measurements, error: Array) -> Iterator[str]:
@@ -41,8 +43,8 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
     apart, other = min(near, key=lambda visit: float(np.median(visit[0][known])))
     scores = Scores(np.where(known, apart, 0.0) ** 2, 3 * known)
     far = spread_of(scores, 3.0 * known.sum()).far(scores)
-    usual = float(np.quantile(apart[known & ~far], HIGH)) if (known & ~far).any() else 0.0
-    far &= apart > max(GROSS * usual, FAINT)
+    usual = float(np.quantile(apart[known & ~far], USUAL_QUANTILE)) if (known & ~far).any() else 0.0
+    far &= apart > max(MIN_GROSS_RATIO * usual, FAINT)
     if not far.any():
         return
     size = np.linalg.norm(error, axis=-1)
@@ -51,13 +53,13 @@ def contradictions(data: Measurements, error: Array) -> Iterator[str]:
         pair = sorted((row, other[target, row]), key=lambda i: size[target, i])
         right, wrong = (int(data.line[i]) for i in pair)
         name, off = data.target_names[target], 1e3 * apart[target, row]
-        guilty = size[target, pair[1]] > GUILTY * size[target, pair[0]]
+        guilty = size[target, pair[1]] > MIN_GUILTY_RATIO * size[target, pair[0]]
         text = f"line {wrong} {name} is {off:.2g} mm from line {right}"
         told.setdefault((*sorted(pair), target), text + (", which fits" if guilty else ""))
     yield (
         f"{data.source}: visits to one pose that contradict each other; of each pair one point is "
         f"wrong, or something moved (95 % of the others come within {1e3 * usual:.2g} mm): "
-        f"{name_first(list(told.values()), MOST, '; ')}"
+        f"{name_first(list(told.values()), MAX_NAMED_PAIRS, '; ')}"
     )
 
 

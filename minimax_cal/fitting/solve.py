@@ -50,21 +50,25 @@ QP_TOLERANCE = 1e-9
 # With smr:K the other targets follow the geometry without pulling at it: a weight that is nothing
 # beside 1, but leaves their own coordinates determined.
 ASIDE = 1e-9
-PASSES = 2  # of a fit with effects: the second takes finite turns into account
+EFFECT_PASSES = 2  # of a fit with effects: the second takes finite turns into account
 PRIOR_ROUNDS = 20  # of weighing a prior against the noise that remains
-FLOOR = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
+MIN_TARGET_WEIGHT = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
-DOUBTED = 0.5  # a point of less weight tells no distance between targets
+MIN_TRUSTED_WEIGHT = 0.5  # a point of less weight tells no distance between targets
 AT_BOUND = "at its bound"
-EXACT = 1e-9  # an error below is rounding: data that were computed, not measured [m]
-HOPELESS = 10.0 * POOR_FIT  # worst errors above this share of the reach: no calibration, so that
+MAX_ROUNDING = 1e-9  # an error below is rounding: data that were computed, not measured [m]
+MIN_HOPELESS_MISS = (
+    10.0 * POOR_FIT
+)  # worst errors above this share of the reach: no calibration, so that
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
 # Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
 # by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
 # whose angles are off by up to 0.5 rad some need 2e-2 (`experiments random_arms`).
-GROWN = 1e-2
-PAYS = 0.5  # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
-GROWTHS = 3  # times that it is asked again
+MIN_GROWN_SINGULAR = 1e-2
+MAX_REMAINING_COST = (
+    0.5  # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
+)
+MAX_GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something
 
@@ -262,7 +266,7 @@ def fit_cell(
         mix = pose_weights(data, options.lever)
         model = stage.robust.by_pose
         stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
-    believed = np.where(stage.robust.weights.T[..., None] > DOUBTED, data.y, np.nan)
+    believed = np.where(stage.robust.weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
     distances = measured_distances(data.with_y(believed), options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
     state, identification = optimum.x if optimum else stage.state, stage.identification
@@ -361,15 +365,15 @@ def geometry(task: Task, progress: Progress) -> Stage:
     wide, notices = wider(task.robot, robust.model, robust.fit, progress)
     if wide is not robust.fit:
         robust = task.robust(robust.plain, wide)
-    for _ in range(GROWTHS):
+    for _ in range(MAX_GROWTHS):
         at = task.base.emphasise(task.share), robust.fit.x.take(np.array(0)), identification
         more = task.grown(*at, 0.0)
         if more is None:
             break
-        clear = task.grown(*at, GROWN)
+        clear = task.grown(*at, MIN_GROWN_SINGULAR)
         more = clear or more
         model, squares = task.squares(robust.plain.only(more.active), at[1])
-        if clear is None and squares.cost[0] > PAYS * robust.fit.cost[0]:
+        if clear is None and squares.cost[0] > MAX_REMAINING_COST * robust.fit.cost[0]:
             break
         identification, robust = more, task.robust(model, squares)
     return Stage(task.base, identification, robust, robust.fit, notices=notices)
@@ -421,7 +425,7 @@ def with_effects(task: Task, stage: Stage) -> tuple[Task, Stage]:
 def jointly(task: Task, stage: Stage, terms: tuple[Term, ...]) -> tuple[Task, Stage]:
     """Geometry and effects together; the task with the data where its sessions then stand."""
     robot, robust, identification = task.robot, stage.robust, stage.identification
-    for _ in range(PASSES):
+    for _ in range(EFFECT_PASSES):
         frames, here = turned_in(task.data.frames, robust.fit.x.take(np.array(0)))
         task = replace(task, data=seen_from(task.data, frames))
         y = model_of(robot, task.data).y if frames else task.base.y
@@ -477,13 +481,13 @@ def worst_case(
     problem = minimax_problem(model, state, distances, options.distance, per)
     qp, notices = solver_of(options.qp, QP_TOLERANCE)
     settings = Sqp(hessian=options.hessian)
-    if problem.size > (HOPELESS * task.robot.reach()) ** 2:
+    if problem.size > (MIN_HOPELESS_MISS * task.robot.reach()) ** 2:
         settings = replace(settings, iterations=min(settings.iterations, LAST_STEPS))
     optimum = minimax.solve(problem, state, qp, settings)
     if len(model.room):
         effects = settled(optimum.x.effects, model.room)
         optimum = replace(optimum, x=replace(optimum.x, effects=effects))
-    if optimum.status is Status.STALLED and optimum.value * problem.size < EXACT**2:
+    if optimum.status is Status.STALLED and optimum.value * problem.size < MAX_ROUNDING**2:
         optimum = replace(optimum, status=Status.CONVERGED)  # nothing but rounding is left
     certificate = None
     if per == "point" and optimum.status is not Status.FAILED:
@@ -497,4 +501,4 @@ def shares(task: Task, model: Model, optimum: Optimum[State] | None) -> Array:
         return task.share
     if PER[task.options.objective] == "point":
         return point_share(optimum.mu, model.seen)
-    return np.asarray(np.maximum(optimum.mu, FLOOR) * model.counts.sum() / model.counts)
+    return np.asarray(np.maximum(optimum.mu, MIN_TARGET_WEIGHT) * model.counts.sum() / model.counts)

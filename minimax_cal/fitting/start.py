@@ -21,8 +21,12 @@ from minimax_cal.robots.transforms import nearest_rotation
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, Limits
 
-SCREEN, KEEP, ROUNDS = 15, 6, 8  # steps of the first look, starts that go on, further rounds
-ENOUGH = 60  # poses that tell one basin from another
+MAX_SCREEN_STEPS, MAX_KEPT_STARTS, MAX_SEARCH_ROUNDS = (
+    15,
+    6,
+    8,
+)  # steps of the first look, starts that go on, further rounds
+MAX_SCREENED_POSES = 60  # poses that tell one basin from another
 CHUNK = 1024  # poses whose rows are kept at a time
 EVERYWHERE: Array = np.zeros((0, 3))  # where to look for a base of which nothing is known
 
@@ -162,7 +166,7 @@ def linear_rows(model: Model, mdh: Array, centre: Array, poses: slice) -> Array:
 
 @work(brief=False)
 def search(
-    model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = ROUNDS
+    model: Model, mdh: Array, points: float, good: float = 0.0, rounds: int = MAX_SEARCH_ROUNDS
 ) -> LeastSquares[State]:
     """The best fit over base rotations when the geometry's angles may be far off.
 
@@ -201,11 +205,11 @@ def descend(model: Model, starts: State, points: float) -> LeastSquares[State]:
 
     All take a few damped steps, the best few go on, and the two best of these are finished.
     """
-    few, count = thinned(model, ENOUGH), len(starts.mdh)
+    few, count = thinned(model, MAX_SCREENED_POSES), len(starts.mdh)
     some = float(few.counts.sum())
     problem = SumOfSquares(few)
-    first = least_squares.solve(problem, starts, count, some, limits=Limits(1e-9, SCREEN))
-    chosen = np.argsort(first.cost)[:KEEP]
+    first = least_squares.solve(problem, starts, count, some, limits=Limits(1e-9, MAX_SCREEN_STEPS))
+    chosen = np.argsort(first.cost)[:MAX_KEPT_STARTS]
     second = least_squares.solve(
         problem, first.x.take(chosen), len(chosen), some, limits=Limits(1e-9, 100)
     )

@@ -24,9 +24,12 @@ from minimax_cal.robots.kinematics import rotation_vector
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.transforms import nearest_rotation, transform
 
-LEAST = 3  # points that give a frame
-ALONE = 12  # poses of a session that place the robot by themselves
-ROUNDS, SAME = 20, 1e-9  # of placing targets and frames in turn, until these move less [m]
+MIN_FRAME_POINTS = 3  # points that give a frame
+MIN_SESSION_POSES = 12  # poses of a session that place the robot by themselves
+MAX_ROUNDS, MAX_SETTLED_MOVE = (
+    20,
+    1e-9,
+)  # of placing targets and frames in turn, until these move less [m]
 
 
 def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
@@ -40,7 +43,7 @@ def stationed(robot: Robot, data: Measurements, train: Array) -> Measurements:
         return data
     for name in names:
         rows = train & (label == name)
-        if data.seen[rows].sum() < LEAST:
+        if data.seen[rows].sum() < MIN_FRAME_POINTS:
             raise DataError(
                 f"{data.source}: session {name!r} has {data.seen[rows].sum()} points to place its "
                 "measurement frame by; measure more, leave its rows out, or give them the session "
@@ -75,18 +78,18 @@ def placed(robot: Robot, data: Measurements, names: list[str]) -> dict[str, Arra
     frames = {}
     for name, poses in zip(names, count, strict=True):
         own = data.take(label == name)
-        if poses >= ALONE:
+        if poses >= MIN_SESSION_POSES:
             mine = fit_base(model_of(robot, own), robot.mdh).state
             frames[name] = state.base @ np.linalg.inv(mine.base)
         else:
             frames[name] = fitting(own, robot, state)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         common = seen_from(data, frames)
         state = fit_base(model_of(robot, common), robot.mdh).state
         turned = {name: fitting(data.take(label == name), robot, state) for name in names}
         step = max(np.abs(turned[name] - frames[name]).max() for name in names)
         frames = turned
-        if step < SAME:
+        if step < MAX_SETTLED_MOVE:
             break
     first = np.linalg.inv(frames[names[0]])
     return {name: np.eye(4) if name == names[0] else first @ frames[name] for name in names}

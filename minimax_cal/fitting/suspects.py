@@ -23,15 +23,17 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.scalar import least_between
 
-LEVEL = 0.01  # share of a list that is expected to be ordinary points
-FOLLOWED = 0.01  # a fit that leaves less of a direction's variance hides what is wrong there
+FALSE_DISCOVERY_RATE = 0.01  # share of a list that is expected to be ordinary points
+MIN_VARIANCE_SHARE = (
+    0.01  # a fit that leaves less of a direction's variance hides what is wrong there
+)
 RIDGE = 1e-10  # of each parameter's own weight: one that the kept points do not tell is open
-BEYOND = 1.5  # times what any point of the fit is off: a held-out point that is suspect
+MIN_HELD_EXCESS = 1.5  # times what any point of the fit is off: a held-out point that is suspect
 LEAST_SCALE = 1e-7  # no instrument tells less [m]
-TAILS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
-CLEARLY = 2.0  # gain in log-likelihood that makes tails heavier than the Gaussian's
-ROUNDS = 30
-SETTLED = 1e-8  # change of a log scale that ends its search
+TAIL_DOFS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
+MIN_TAIL_GAIN = 2.0  # gain in log-likelihood that makes tails heavier than the Gaussian's
+MAX_ROUNDS = 30
+SCALE_TOLERANCE = 1e-8  # change of a log scale that ends its search
 
 EXPLANATION = (
     "a suspect may be a wrong point or a real effect that the fit lacks (a compliant joint moves a "
@@ -90,11 +92,11 @@ def standardised(covariance: Array, error: Array) -> tuple[Array, Array]:
     Those of less variance than FOLLOWED are left out.
     """
     try:
-        np.linalg.cholesky(covariance - FOLLOWED * np.eye(3))
+        np.linalg.cholesky(covariance - MIN_VARIANCE_SHARE * np.eye(3))
     except np.linalg.LinAlgError:
         share, axes = np.linalg.eigh(covariance)
         along = np.einsum("kcab,kca->kcb", axes, error)
-        told = share > FOLLOWED
+        told = share > MIN_VARIANCE_SHARE
         square = (along**2 * told / np.where(told, share, 1.0)).sum(axis=-1)
         return square, told.sum(axis=-1)
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
@@ -126,7 +128,7 @@ class Spread:
 
     def far(self, found: Scores) -> Array:
         """(k, m) True for the points that stand out, see `unlikely`."""
-        edge = fdtri((1, 2, 3), self.dof, 1.0 - LEVEL) * (1, 2, 3) * self.scale**2
+        edge = fdtri((1, 2, 3), self.dof, 1.0 - FALSE_DISCOVERY_RATE) * (1, 2, 3) * self.scale**2
         judged = found.directions > 0
         directions, square = found.directions[judged], found.square[judged]
         near_edge = square > (1.0 - 1e-9) * edge[directions - 1]  # none below is unlikely
@@ -154,7 +156,7 @@ def spread_of(found: Scores, dof: float) -> Spread:
     middle = np.median(mean_square / fdtri((1, 2, 3), dof, 0.5)[directions - 1])
     here = Spread(max(float(np.sqrt(middle)), LEAST_SCALE), dof)
     before = [np.zeros(len(mean_square), dtype=bool)]
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         far = here.far(found)[judged]
         if any(np.array_equal(far, other) for other in before):
             break
@@ -189,7 +191,7 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
         own = 0.5 * kinds * np.log(kinds / tail) - betaln(0.5 * kinds, 0.5 * tail)
         return float(times @ own)
 
-    tails = (dof, *(tail for tail in TAILS if tail < dof))
+    tails = (dof, *(tail for tail in TAIL_DOFS if tail < dof))
     shapes = {tail: shape(tail) for tail in tails}
     low, high = math.log(usual) - 2.0, math.log(usual) + 2.0
     best: list[tuple[float, Spread]] = []
@@ -199,7 +201,7 @@ def student(mean_square: Array, directions: Array, edge: float, dof: float, usua
         else:
             at = min(max(likeliest(size, half, tail, math.log(usual)), low), high)
             value = loss(at, tail)
-        doubt = CLEARLY if tail < dof else 0.0
+        doubt = MIN_TAIL_GAIN if tail < dof else 0.0
         spread = Spread(max(float(np.exp(at)), LEAST_SCALE), float(tail))
         best.append((value + doubt, spread))
     return min(best, key=lambda trial: trial[0])[1]
@@ -211,17 +213,17 @@ def likeliest(size: Array, half: Array, tail: float, log_scale: float) -> float:
     size: (n,) squares [m^2], half: (n,) half their directions.
     """
     weight, target = half + 0.5 * tail, float(half.sum())
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         ratio = size * (math.exp(-2.0 * log_scale) / tail)
         share = ratio / (1.0 + ratio)
         step = 0.5 * (float(weight @ share) - target) / float(weight @ (share / (1.0 + ratio)))
         log_scale += min(max(step, -1.0), 1.0)
-        if abs(step) <= SETTLED:
+        if abs(step) <= SCALE_TOLERANCE:
             break
     return log_scale
 
 
-def unlikely(p_value: Array, level: float = LEVEL) -> Array:
+def unlikely(p_value: Array, level: float = FALSE_DISCOVERY_RATE) -> Array:
     """True for points that stand out, of any shape [Benjamini and Hochberg 1995].
 
     Of those listed a share `level` is expected to be ordinary; without outliers the list is empty
@@ -298,8 +300,8 @@ def held_suspects(
 ) -> tuple[Suspect, ...]:
     """The points that stand out among those that the fit has not seen, judged by those it has.
 
-    A model's own errors are larger at poses that it has not seen: those listed are also `BEYOND`
-    times farther off than any point of the fit.
+    A model's own errors are larger at poses that it has not seen: those listed are also
+    `MIN_HELD_EXCESS` times farther off than any point of the fit.
     model: of all poses, with the fit's free parameters.  weights: (k, m) 0 where held out.
     spread: of ordinary points of the fit.  held: (m,).  line: (m,) of the file.
     """
@@ -307,7 +309,7 @@ def held_suspects(
         return ()
     every = scores(model, state, weights)
     found = Scores(every.square[:, held], every.directions[:, held])
-    most = BEYOND * np.sqrt(every.square[weights > 0.0].max(initial=0.0)) / spread.scale
+    most = MIN_HELD_EXCESS * np.sqrt(every.square[weights > 0.0].max(initial=0.0)) / spread.scale
     told = suspects_of(model.take(held), state, found, spread, line[held])
     return tuple(replace(one, held=True) for one in told if one.score > most)
 

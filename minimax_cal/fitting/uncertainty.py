@@ -37,9 +37,11 @@ from minimax_cal.modelling.rows import rows_of
 from minimax_cal.robots import kinematics
 from minimax_cal.solvers.least_squares import solve_normal
 
-PLENTY = 1000  # poses that tell all; of more, so many are drawn
+MAX_DRAWN_POSES = 1000  # poses that tell all; of more, so many are drawn
 LEAST_DOF = 3.0  # degrees of freedom that tell two noises apart
-ALONE = 1e-3  # of what all poses tell of a direction, all but one must tell this share
+MIN_SHARE_WITHOUT_ONE = (
+    1e-3  # of what all poses tell of a direction, all but one must tell this share
+)
 # A fit of the worst point rests on a few points: other noise would choose others.  With this share
 # of the mean multiplier as the least of any point, `by_noise` covers as it should; no theory says
 # so, but runs with 30 to 160 poses, one target and three (experiments.coverage shows some).
@@ -455,7 +457,7 @@ def by_poses(poses: Poses, group: Array) -> Array:
         lever = back @ np.swapaxes(jacobian, 1, 2)
         eye = np.eye(lever.shape[1])
         try:  # no eigenvalue is as large as 1 - ALONE
-            np.linalg.cholesky((1.0 - ALONE) * eye - lever)
+            np.linalg.cholesky((1.0 - MIN_SHARE_WITHOUT_ONE) * eye - lever)
         except np.linalg.LinAlgError:
             return np.full((p, p), np.nan)
         left = np.linalg.solve(eye - lever, error.reshape(len(rows), -1, 1))
@@ -483,7 +485,7 @@ def uncertainty_of(
     noises are all there is, and better where they are not (experiments.coverage).  Not for a fit of
     the worst point, which always needs a few.  group: (m,) as `data.groups`.  units: of effects.
     """
-    few, rows = estimator.thinned(group, PLENTY)
+    few, rows = estimator.thinned(group, MAX_DRAWN_POSES)
     poses = Poses.of(few, state)
     dof = poses.freedom
     found, source = np.full(poses.normal_matrix.shape, np.nan), "poses"

@@ -25,7 +25,7 @@ MOST_JOINTS = 12
 RIGHT = 0.5 * np.pi
 TRIALS, ROUNDS = 8, 2  # of arms drawn at random, and of starts of each
 GUESS = 0.3  # length of a link that is sought; lengths are solved for [m]
-CLOSE = 2e-3  # of the points' spread: a fit that misses by less has found the arm
+MAX_FOUND_MISS = 2e-3  # of the points' spread: a fit that misses by less has found the arm
 SWEEPS, SEARCH = "sweeps of single joints", "a search over random poses"
 
 
@@ -139,13 +139,13 @@ def searched(name: str, data: Measurements, sliding: Array, lacking: Sequence[in
         mdh[-1] = 0.0
         robot = rough(name, mdh, sliding)
         model = model_of(robot, data)
-        first = search(model, mdh, points, CLOSE * spread, ROUNDS)
+        first = search(model, mdh, points, MAX_FOUND_MISS * spread, ROUNDS)
         miss = float(np.sqrt(first.cost[0] / points))
         if miss < least:
             best, least = rough(name, plain_links(first.x.mdh[0], sliding), sliding), miss
-        if least < CLOSE * spread:
+        if least < MAX_FOUND_MISS * spread:
             break
-    if best is None or least >= CLOSE * spread:
+    if best is None or least >= MAX_FOUND_MISS * spread:
         named = ", ".join(str(j + 1) for j in lacking)
         raise DataError(
             f"{data.source}: no arm of these joints fits (the best misses by {1e3 * least:.3g} mm);"

@@ -39,8 +39,8 @@ from minimax_cal.solvers.minimax import Sqp
 from minimax_cal.solvers.status import Status
 
 BUNDLES = 2000  # more poses than these are drawn in bundles
-LEAST = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
-MOST = 100_000  # replicates: of 2000 poses their draws fill 1.6 GB
+MIN_DRAWN_SHARE = 1e-3  # of what all poses tell of some direction, those drawn must tell as much
+MAX_REPLICATES = 100_000  # replicates: of 2000 poses their draws fill 1.6 GB
 MOST_LOST = 0.5  # of the replicates
 TOGETHER = 250  # replicates of a minimax that are solved at once
 BATCH = 64  # replicates whose Gram matrices are kept at a time
@@ -151,8 +151,8 @@ def bootstrap(
 
     >>> print(mc.bootstrap(fit, replicates=200).table().text())
     """
-    if not 2 <= replicates <= MOST:
-        raise OptionError(f"{replicates} replicates: give 2 to {MOST}, 500 as a rule")
+    if not 2 <= replicates <= MAX_REPLICATES:
+        raise OptionError(f"{replicates} replicates: give 2 to {MAX_REPLICATES}, 500 as a rule")
     check_seed(seed)
     if fit.objective == "point":
         raise OptionError(
@@ -310,7 +310,7 @@ def determined(draws: Draws, gram: Array, prior: Array) -> Array:
     out = np.zeros(len(draws.times), dtype=bool)
     for first in range(0, len(out), BATCH):
         part = np.tensordot(draws.times[first : first + BATCH], alike, 1) + known
-        out[first : first + BATCH] = np.linalg.eigvalsh(part)[:, 0] > LEAST
+        out[first : first + BATCH] = np.linalg.eigvalsh(part)[:, 0] > MIN_DRAWN_SHARE
     return out
 
 

@@ -19,7 +19,7 @@ from minimax_cal.robots.kernels import sums
 from minimax_cal.robots.kernels.choice import kernels
 from minimax_cal.solvers.minimax import Sqp
 
-STEPS = 15  # SQP steps; a draw that takes more is no near one
+MAX_STEPS = 15  # SQP steps; a draw that takes more is no near one
 CHANGES = 20  # of the set of active rows in a QP
 SLIGHT = 1e-11  # a row of the QP broken by less is met
 
@@ -198,7 +198,7 @@ def solved_at_once(
     ends, good = fit.repeat(len(draw.times)), np.zeros(len(draw.times), dtype=bool)
     left, at, x = np.arange(len(good)), Redrawn.of(model, draw, fit), ends
     z = np.repeat(np.pad(mu, (0, len(draw.pairs)))[None], len(good), axis=0)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         here = at.rows(x)
         done = here.residual(z) <= settings.tolerance
         d, z, told = here.step(z, settings.floor)

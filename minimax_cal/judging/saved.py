@@ -24,8 +24,10 @@ from minimax_cal.modelling.model import model_of
 from minimax_cal.robots.robot import load_robot
 
 BEFORE, AFTER = "before", "after"
-SAME = 1e-6  # a file's own errors come back to this, or its effects need more columns [m]
-FAR = 5e-3  # errors above this share of the arm's reach are not what calibration leaves
+MAX_OWN_ERROR = 1e-6  # a file's own errors come back to this, or its effects need more columns [m]
+MAX_MISS_OF_REACH = (
+    5e-3  # errors above this share of the arm's reach are not what calibration leaves
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ def open_saved(
     before, more = nominal_cell(cell, drawn, train, nominal, known.source)
     notices += [*said, *more]
     miss = np.nanmedian(np.linalg.norm(cell.error(measured), axis=-1))
-    if miss > FAR * cell.robot.reach():
+    if miss > MAX_MISS_OF_REACH * cell.robot.reach():
         notices.append(
             f"{measured.source}: the fit misses by {1e3 * miss:.3g} mm: check that data and fit "
             "belong to the same robot, measurement frame, units and order of targets"
@@ -153,7 +155,7 @@ def check_own(known: Opened) -> None:
     told = known.rungs[known.number].error
     if told is None:
         return
-    if not np.nanmax(np.abs(known.cell.error(known.data) - told), initial=0.0) <= SAME:
+    if not np.nanmax(np.abs(known.cell.error(known.data) - told), initial=0.0) <= MAX_OWN_ERROR:
         raise DataError(
             f"{known.source}: its effects need columns of the measurements that it does not hold; "
             "name the file of measurements too"

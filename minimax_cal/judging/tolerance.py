@@ -17,9 +17,13 @@ PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"
 CLAIMS = ("inside", "outside")  # the measured poses
 OTHER_SPELLINGS = {"within": "inside", "beyond": "outside"}  # accepted, and not offered
 KINDS = {"rms": "RMS", "max": "largest"}  # as people write it, and as they read it
-CHANCE = 0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
-FEWEST = math.ceil(1.0 / CHANCE - 1.0)  # poses: `chance_of_larger` is then small enough
-NAMED = 3  # parts that could not be judged
+MAX_EXCEED_CHANCE = (
+    0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
+)
+MIN_POSES = math.ceil(
+    1.0 / MAX_EXCEED_CHANCE - 1.0
+)  # poses: `chance_of_larger` is then small enough
+MAX_NAMED = 3  # parts that could not be judged
 LIMIT = re.compile(r"\s*(rms|max)\s*[:=<]?\s*([0-9.eE+-]+)\s*(mm)?\s*", re.IGNORECASE)
 
 
@@ -166,7 +170,7 @@ def open_of(found: Beyond) -> str:
         return "an earlier version wrote this file and does not tell which parts were not judged"
     if not found.missed:
         return ""
-    named = name_first(found.missed, NAMED)
+    named = name_first(found.missed, MAX_NAMED)
     return f"only {found.judged} could be judged, not {named}, which the fit needs"
 
 
@@ -191,10 +195,10 @@ def judge(limit: Limit, claim: Claim) -> Judgement:
         return told(NOT_STATED, claim.reason)
     if bound.value > limit.size_mm:
         return told(NOT_PASSED, f"{bound.value:.3f} mm was seen")
-    if limit.kind == "max" and chance_of_larger(claim.poses) > CHANCE:
+    if limit.kind == "max" and chance_of_larger(claim.poses) > MAX_EXCEED_CHANCE:
         return told(
             NOT_STATED,
-            f"{claim.poses} poses are too few for a maximum: at least {FEWEST} are needed",
+            f"{claim.poses} poses are too few for a maximum: at least {MIN_POSES} are needed",
         )
     if math.isnan(bound.high):
         return told(

@@ -45,8 +45,8 @@ from minimax_cal.solvers.status import Status
 from qp_backends import solve as solve_qp
 
 SCHEMA = 1
-STEPS, MOST_STEPS = 7, 100
-SAME = 1e-6  # relative: what is not farther than this below a chord lies on it
+DEFAULT_STEPS, MAX_STEPS = 7, 100
+CHORD_TOLERANCE = 1e-6  # relative: what is not farther than this below a chord lies on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def curve_of(
         share = (a.most - b.most) / (a.most - b.most + b.mean - a.mean)
         best = minimax.solve(Blend(worst, share), b.state, qp)
         found = Compromise.of(worst, share, best.x, best.status)
-        if found.level(share) < b.level(share) * (1.0 - SAME):
+        if found.level(share) < b.level(share) * (1.0 - CHORD_TOLERANCE):
             curve.insert(at + 1, found)
         else:
             straight.add(a.share)
@@ -256,7 +256,7 @@ class Tradeoff:
 def tradeoff(
     robot: Robot | Fit | str | Path,
     data: Measurements | str | Path | None = None,
-    steps: int = STEPS,
+    steps: int = DEFAULT_STEPS,
     qp: str = "daqp",
     holdout: float = 0.2,
     seed: int = 0,
@@ -271,8 +271,8 @@ def tradeoff(
 
     >>> print(mc.tradeoff(mc.load_fit("fit.json"), steps=5).headline())
     """
-    if not 0 <= steps <= MOST_STEPS:
-        raise OptionError(f"steps {steps}: give a whole number from 0 to {MOST_STEPS}")
+    if not 0 <= steps <= MAX_STEPS:
+        raise OptionError(f"steps {steps}: give a whole number from 0 to {MAX_STEPS}")
     began = time.perf_counter()
     settings = {"steps": steps, "qp": qp, "holdout": holdout, "seed": seed}
 

@@ -27,7 +27,7 @@ from minimax_cal.solvers.status import Status
 
 ROUNDING = 1e-13  # of the cost: a decrease by less is none
 HALVINGS = 10  # of a step that leads up
-MOST = 15  # plain steps; a start from which these do not suffice is not near
+MAX_STEPS = 15  # plain steps; a start from which these do not suffice is not near
 
 
 def nearby(model: Model, begin: State, method: str = JOINT) -> LeastSquares[State]:
@@ -59,7 +59,7 @@ def jointly(model: Model, begin: State) -> LeastSquares[State] | None:
     which = np.flatnonzero(model.active)
     prior = model.prior.mean[which], model.prior.weight[which]
     at, trace, well = sums.descend(
-        kernels(), arrays_of(begin), model.sight, which, prior, NEAR.step, MOST
+        kernels(), arrays_of(begin), model.sight, which, prior, NEAR.step, MAX_STEPS
     )
     return straight_down(State(*at), trace, "nlgn") if well else None
 
@@ -76,7 +76,7 @@ def separated(model: Model, begin: State) -> LeastSquares[State] | None:
     lengths, mean, hold = which[linear], model.prior.mean[which], model.prior.weight[which]
     every, few = sums.Columns.of(at, which), sums.Columns.of(at, lengths)
     trace = [np.inf]
-    for _ in range(MOST + 1):
+    for _ in range(MAX_STEPS + 1):
         off = (mean - sums.values(at, which))[linear] if hold.any() else np.zeros(len(lengths))
         dr, *_, told = own.solved(*few.normal(own, at, model.sight), off, hold[linear])
         if not told:
@@ -122,7 +122,7 @@ def between(model: Model, free: LeastSquares[State]) -> LeastSquares[State]:
     state = kept(free.x.take(np.array(0)), room)
     cost, gradient, gram = problem.normal(state)
     costs, status = [float(cost)], Status.ITERATION_LIMIT
-    for _ in range(MOST):
+    for _ in range(MAX_STEPS):
         ends = allowed - model.values(state)[model.active][:, None]
         step = bounded(gram, gradient, *ends.T)
         square = float(step @ gram @ step)

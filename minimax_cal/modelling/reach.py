@@ -17,8 +17,8 @@ from minimax_cal.robots import kinematics
 from minimax_cal.robots.inverse import NEAR, at_poses, missing, nearest
 
 SLIDE = 0.5  # metres a slide may change by where a turning joint may by a radian [m/rad]
-PASSES, PATIENCE = 12, 6  # over the effects; those until sides are kept
-SETTLED = 1e-10  # change of a joint that no pass need follow [rad, m]
+MAX_PASSES, FREE_PASSES = 12, 6  # over the effects; those until sides are kept
+JOINT_TOLERANCE = 1e-10  # change of a joint that no pass need follow [rad, m]
 TETRAHEDRON = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
 CORNERS = tuple(f"corner{i + 1}" for i in range(4))
 LEAST_LEVER, USUAL_LEVER = 0.02, 0.1  # a tool of no size says nothing of what a radian is worth [m]
@@ -174,7 +174,7 @@ class Reach:
         Effects are taken from the joints before and kept while Newton reaches the goals.
         """
         data = self.at(q)
-        for count in range(PASSES):
+        for count in range(MAX_PASSES):
             turn, moved = bent(self.arm, data)
             goal = np.linalg.inv(moved) @ self.goal
             new = self.nearest(q, goal, turn, soft)
@@ -182,17 +182,17 @@ class Reach:
             q = new
             if not self.arm.effects.terms:
                 return q, np.ones(len(q), dtype=bool)
-            kept = data.columns if count >= PATIENCE else self.data.columns
+            kept = data.columns if count >= FREE_PASSES else self.data.columns
             data = replace(self.at(q), columns=kept)
-            if count + 1 == PATIENCE:  # play that pulls both ways: decide on a side
+            if count + 1 == FREE_PASSES:  # play that pulls both ways: decide on a side
                 history = with_history(data).columns
                 sides = {name: c for name, c in history.items() if name.startswith("approach")}
                 data = replace(data, columns={**data.columns, **sides})
-            if change.max() < SETTLED:
+            if change.max() < JOINT_TOLERANCE:
                 break
         walked, _ = bent(self.arm, self.at(q))
-        agree = np.abs(walked - turn).max(axis=1) < 1e4 * SETTLED
-        return q, agree & (change < 1e4 * SETTLED)
+        agree = np.abs(walked - turn).max(axis=1) < 1e4 * JOINT_TOLERANCE
+        return q, agree & (change < 1e4 * JOINT_TOLERANCE)
 
     def nearest(self, begin: Array, goal: Array, turn: Array, soft: Array) -> Array:
         """Joints (m, n) nearest to goals for effects that turn the joints by turn (m, n).

@@ -24,10 +24,10 @@ WIDE, SHORT = 1.0, 0.15  # lengths of a joint's curve, of a radian or of half it
 WAVES, FASTEST = 3, 6  # waves a turn, of one joint, and of two together
 COURSE, SWINGS = 4, 24  # half periods over the measurement: slow, and fast
 KEEPS = (0.5, 0.8, 0.92, 0.97)  # of the past, from visit to visit
-NEAR = 0.6  # correlation of one visit with the next
+VISIT_CORRELATION = 0.6  # correlation of one visit with the next
 RANDOM = 64  # Fourier features of all joints [Rahimi and Recht 2007]
 ALL = 2.0  # length of their kernel, in standard deviations of each joint
-LEAST = 1e-9  # of a driver's size: it does not vary
+MIN_SPAN = 1e-9  # of a driver's size: it does not vary
 
 Drivers = dict[str, Array]
 
@@ -62,7 +62,7 @@ def components(scene: Scene, rows: Rows, named: Sequence[tuple[str, Array]]) -> 
 def driven(place: str, motion: Array, drivers: Drivers) -> Iterator[Component]:
     """The motion with each driver that varies."""
     for name, feature in drivers.items():
-        if np.abs(feature).max(initial=0.0) > LEAST:
+        if np.abs(feature).max(initial=0.0) > MIN_SPAN:
             ways = feature if feature.ndim == 3 else feature[None]
             yield Component(place, name, motion, ways)
 
@@ -214,7 +214,7 @@ def wave(q: Array, k: int) -> Array:
 def randomly(q: Array) -> Array:
     """(2 f, m) Fourier features of all joints (n, m) together: a Gaussian kernel's."""
     spread = q.std(axis=1)
-    moving = spread > LEAST
+    moving = spread > MIN_SPAN
     rng = np.random.default_rng(0)
     pull = rng.normal(size=(RANDOM // 2, int(moving.sum()))) / (ALL * spread[moving])
     return np.concatenate([np.cos(pull @ q[moving]), np.sin(pull @ q[moving])])
@@ -235,7 +235,7 @@ def wound(move: Array) -> Array:
         for i, step in enumerate(move):
             at = min(max(at + step, -most), most)
             row[i] = at
-    return out / max(usual, LEAST)
+    return out / max(usual, MIN_SPAN)
 
 
 def following(clock: Array) -> Array:
@@ -244,7 +244,7 @@ def following(clock: Array) -> Array:
     root = np.zeros((len(clock), len(clock)))
     lag = np.arange(len(clock))
     root[order[:, None], order] = np.where(
-        lag[:, None] >= lag, NEAR ** np.abs(lag[:, None] - lag), 0.0
+        lag[:, None] >= lag, VISIT_CORRELATION ** np.abs(lag[:, None] - lag), 0.0
     )
     return root
 

@@ -18,7 +18,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
 from minimax_cal.modelling.parameters import State
 
-EXACT = 1e-8  # noise below which data were computed, not measured [m]
+MAX_COMPUTED_NOISE = 1e-8  # noise below which data were computed, not measured [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def rows_of(error: Array, jacobian: Array, joint_jacobian: Array, weight: Array)
         size=size,
         group=np.repeat(np.arange(m), 3 * k),
         measured=(root > 0.0).reshape(-1),
-        exact=EXACT,
+        exact=MAX_COMPUTED_NOISE,
         turn=turn,
         weight=root,
     )

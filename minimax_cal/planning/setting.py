@@ -28,8 +28,8 @@ from minimax_cal.planning.visibility import THICK, Room, Sight, normals_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.status import Status
 
-APART = 3.0  # where the tracker stands unless told: so far off, or the arm's reach [m]
-EXACT = 1e-7  # noise below which data were computed, not measured [m]
+TRACKER_DISTANCE = 3.0  # where the tracker stands unless told: so far off, or the arm's reach [m]
+MAX_COMPUTED_NOISE = 1e-7  # noise below which data were computed, not measured [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def assumed(robot: Robot, options: PlanOptions) -> tuple[Cell, str]:
     cell = Cell(robot, np.eye(4), names, spots)
     if len(options.tracker):
         return cell_ahead(cell, np.array(options.tracker, dtype=float)), ""
-    away = max(APART, robot.reach())
+    away = max(TRACKER_DISTANCE, robot.reach())
     place = front(cell, away)
     where = ", ".join(f"{1e3 * value:.0f}" for value in place)
     text = f"the tracker is taken to stand at {where} mm in base axes; say where with tracker="
@@ -136,7 +136,7 @@ def shown_noise(
     base, source = Instrument(), ", assumed"
     if measured and not told:
         noise = noise_of(cell, measured[0])
-        if np.sqrt(noise.variance) > EXACT:
+        if np.sqrt(noise.variance) > MAX_COMPUTED_NOISE:
             source = (
                 ", estimated from the existing poses, with the model errors in them; give noise= "
                 "and jitter= where you know them"

@@ -21,7 +21,7 @@ from minimax_cal.robots.robot import Robot
 
 THICK = 0.04  # radius of the body, as a share of the arm's reach
 ANYWHERE = np.pi  # acceptance of a target that can be seen from everywhere [rad]
-APART = 2.5  # radii of arm between two segments below which they are neighbours
+NEIGHBOUR_RADII = 2.5  # radii of arm between two segments below which they are neighbours
 NORMALS = ("flange", "radial")
 
 
@@ -154,7 +154,7 @@ def clear_of_itself(view: View) -> Array:
     for place, one in enumerate(bones):
         for other in bones[place + 1 :]:
             # with less between them they touch wherever the joints between them are
-            if length[one + 1 : other].sum() > APART * view.room.radius:
+            if length[one + 1 : other].sum() > NEIGHBOUR_RADII * view.room.radius:
                 ends = (corner[one], corner[one + 1], corner[other], corner[other + 1])
                 free &= gap(*ends) > 2.0 * view.room.radius
     return free

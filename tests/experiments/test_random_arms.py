@@ -24,7 +24,7 @@ def test_a_random_arm_reaches_the_noise(kind: str) -> None:
 def test_identification_is_asked_again_at_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Axes drawn coaxial that are not: without the second look the fit stops above the noise."""
     job = Job("coaxial neighbours", 0)
-    monkeypatch.setattr(solve, "GROWTHS", 0)
+    monkeypatch.setattr(solve, "MAX_GROWTHS", 0)
     before = end_of(job)
     monkeypatch.undo()
     after = end_of(job)
@@ -48,4 +48,4 @@ def test_whole_arms_gain_nothing(robot: mc.Robot) -> None:
     model = task.base.emphasise(task.share)
     known = task.identified(model, task.frame.state)
     _, squares = task.squares(model.only(known.active), task.frame.state)
-    assert task.grown(model, squares.x.take(np.array(0)), known, solve.GROWN) is None
+    assert task.grown(model, squares.x.take(np.array(0)), known, solve.MIN_GROWN_SINGULAR) is None

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
-from minimax_cal.fitting.crossed import FEW
+from minimax_cal.fitting.crossed import MIN_HELD_POSES
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.modelling.simulate import Simulation, simulate
 
@@ -39,7 +39,7 @@ def _by_group(fit: mc.Fit, folds: np.ndarray) -> np.ndarray:
 def test_few_held_out_poses_are_cross_validated(robot: mc.Robot) -> None:
     few, many = (simulate(robot, count, 3, seed=5).data for count in (60, 100))
     told = mc.calibrate(robot, few, "sum")
-    assert told.accuracy["holdout"].poses < FEW
+    assert told.accuracy["holdout"].poses < MIN_HELD_POSES
     assert any("the result is cross-validated" in notice for notice in told.notices)
     assert "60 poses, each judged by a fit without it" in told.headline()
     assert_allclose(told.within.after.rms_mm, accuracy(told.error_crossed).rms_mm, rtol=1e-12)

@@ -432,7 +432,7 @@ def test_a_pose_has_the_least_weight_of_its_targets(robot: mc.Robot) -> None:
 def test_rounds_that_do_not_settle_are_told(
     robot: mc.Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robust, "ROUNDS", 1)
+    monkeypatch.setattr(robust, "MAX_ROUNDS", 1)
     found = shifted(robot, 0.1, 1e-3, poses=30).robust("huber")
     assert found.fit.status == ("iteration_limit",)
 

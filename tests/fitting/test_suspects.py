@@ -13,7 +13,7 @@ from scipy import stats
 import minimax_cal as mc
 from experiments import outliers
 from minimax_cal.fitting.suspects import (
-    LEVEL,
+    FALSE_DISCOVERY_RATE,
     Scores,
     Spread,
     Suspect,
@@ -115,13 +115,13 @@ def test_scores_of_clean_points_are_chi_square(clean: list[tuple[Scores, float]]
 
 
 def test_clean_points_are_rarely_listed(clean: list[tuple[Scores, float]]) -> None:
-    """At most `LEVEL` of the data sets have suspects; 4 of 40 would be a chance of 1 in 2000."""
+    """At most 1 % of the data sets have suspects; 4 of 40 would be a chance of 1 in 2000."""
     lists, low, count = 0, 0, 0
     for found, dof in clean:
         p_value = spread_of(found, dof).p_value(found)
         lists += bool(unlikely(p_value).any())
         low, count = low + int((p_value < 0.05).sum()), count + p_value.size
-    assert stats.binom.sf(lists - 1, len(clean), LEVEL) > 1e-3
+    assert stats.binom.sf(lists - 1, len(clean), FALSE_DISCOVERY_RATE) > 1e-3
     assert abs(low / count - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / count)
 
 

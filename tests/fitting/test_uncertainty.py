@@ -340,7 +340,7 @@ def test_many_poses_are_thinned_fairly(robot: mc.Robot, monkeypatch: pytest.Monk
     data = simulate(robot, 600, 1, 5, Truth(compliance=0)).data
     found = fitted(robot, data)
     whole = found.uncertainty.sigma[found.identification.active]
-    monkeypatch.setattr(uncertainty, "PLENTY", 150)
+    monkeypatch.setattr(uncertainty, "MAX_DRAWN_POSES", 150)
     part = uncertainty_of(found.estimator, found.state, found.group).sigma
     ratio = part[found.identification.active] / whole
     assert_allclose(ratio, 1.0, rtol=0, atol=0.4)

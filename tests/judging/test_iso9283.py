@@ -455,8 +455,8 @@ def test_wrong_targets_and_joints_are_refused(cell: mc.Cell) -> None:
 
 
 def test_many_poses_form_pairs_of_some(cell: mc.Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("minimax_cal.judging.iso9283.visits.MOST", 10)
-    monkeypatch.setattr("minimax_cal.judging.iso9283.result.MOST", 10)
+    monkeypatch.setattr("minimax_cal.judging.iso9283.visits.MAX_PAIRED_POSES", 10)
+    monkeypatch.setattr("minimax_cal.judging.iso9283.result.MAX_PAIRED_POSES", 10)
     found = of(cell, seen_at(cell, level_poses(cell.robot, 30)))
     assert len(found.parts["train"].values["after"].pairs) == 45
     assert any("pairs of 10 of 30" in notice for notice in found.notices)

@@ -7,7 +7,7 @@ import pytest
 import minimax_cal as mc
 from minimax_cal.fitting.beyond import Beyond, Fold
 from minimax_cal.judging.tolerance import (
-    FEWEST,
+    MIN_POSES,
     NOT_PASSED,
     NOT_STATED,
     PASSED,
@@ -43,7 +43,7 @@ def test_rms(poses: int, value: float, high: float, limit: float, verdict: str) 
 
 def test_a_maximum_needs_poses_and_says_how_many() -> None:
     """The next pose exceeds all n so far with probability 1/(n + 1): at most 5 % from 19 on."""
-    assert FEWEST == 19
+    assert MIN_POSES == 19
     few, enough = (judge(Limit("max", 1.0), claim(n)) for n in (18, 19))
     assert few.verdict == NOT_STATED
     assert "18 poses are too few for a maximum: at least 19 are needed" in few.why

@@ -40,7 +40,7 @@ OUTER = "E"
 WRITTEN = re.compile(
     r"^[^\S\r\n]*(\w{1,32})((?:\[[^\]]{0,20}\])?\.(?:[XYZABCST]|[AE][1-6]))\s*=(?!=)", re.I | re.M
 )
-LEVEL = 1e-7  # cosine of B below which A and C turn about one axis
+MIN_COSINE_B = 1e-7  # cosine of B below which A and C turn about one axis
 
 
 def read(text: str, source: str) -> Text:
@@ -163,7 +163,7 @@ def numbers_of(pose: Array, point: Point) -> list[str]:
 def angles(turn: Array, a: float) -> Array:
     """A, B, C of a rotation (3, 3) [deg]; A as given [rad] where B leaves only A and C together."""
     level = float(np.hypot(turn[0, 0], turn[1, 0]))
-    a = float(np.arctan2(turn[1, 0], turn[0, 0])) if level > LEVEL else a
+    a = float(np.arctan2(turn[1, 0], turn[0, 0])) if level > MIN_COSINE_B else a
     b = np.arctan2(-turn[2, 0], level)
     rest = Rotation.from_euler("Z", -a).as_matrix() @ turn
     return np.degrees([a, b, np.arctan2(-rest[1, 2], rest[1, 1])])

@@ -35,10 +35,10 @@ LANGUAGES: dict[str, ModuleType] = {
     ".src": krl, ".dat": krl,
 }  # fmt: skip
 LARGEST = 16 << 20  # bytes of a program
-MOST = 20_000  # points
+MAX_POINTS = 20_000  # points
 STARTS, CHUNK = 48, 100  # of the search for all ways; points at a time
 AXES = ".abcdef"  # of RAPID's external axes, from 1
-SAME = 1e-3  # two ways are one [rad]
+WAY_TOLERANCE = 1e-3  # two ways are one [rad]
 
 
 def is_program(path: Path | str) -> bool:
@@ -90,13 +90,15 @@ def read_program(path: Path | str, robot: Robot, tool: str = "", work: str = "")
     check_unmarked(text)
     if robot.joints != 6 or robot.prismatic.any():
         raise OptionError(f"{robot.name}: points of programs are for arms with six turning joints")
-    points = tuple(point for point, _ in zip(language.points(text), range(MOST + 1), strict=False))
+    points = tuple(
+        point for point, _ in zip(language.points(text), range(MAX_POINTS + 1), strict=False)
+    )
     if not points:
         only = any(language.left(text))
         more = ", only relative motions, offsets or parts of points" if only else ""
         raise DataError(f"{path}: holds no points with numbers{more}")
-    if len(points) > MOST:
-        raise DataError(f"{path}: holds over {MOST} points; split it")
+    if len(points) > MAX_POINTS:
+        raise DataError(f"{path}: holds over {MAX_POINTS} points; split it")
     for line, name in language.displacements(text):
         raise DataError(
             f"{path}:{line}: {name} displaces the points after it, so their positions are not "
@@ -240,7 +242,7 @@ def all_ways(robot: Robot, goals: Array) -> Iterator[Array]:
 
 def distinct(ways: Array) -> Array:
     """The different ones."""
-    _, first = np.unique(np.round(ways / SAME).astype(int), axis=0, return_index=True)
+    _, first = np.unique(np.round(ways / WAY_TOLERANCE).astype(int), axis=0, return_index=True)
     return np.asarray(ways[np.sort(first)])
 
 
@@ -249,7 +251,7 @@ def turned(robot: Robot, ways: Array) -> Array:
     for joint in range(robot.joints):
         steps = 2.0 * np.pi * np.eye(robot.joints)[joint]
         more = np.concatenate([ways, ways - steps, ways + steps])
-        inside = (more >= robot.lower - SAME) & (more <= robot.upper + SAME)
+        inside = (more >= robot.lower - WAY_TOLERANCE) & (more <= robot.upper + WAY_TOLERANCE)
         near = np.abs(more[:, joint]) <= 2.0 * np.pi
         ways = more[inside.all(axis=1) & near]
     return distinct(ways) if len(ways) else ways

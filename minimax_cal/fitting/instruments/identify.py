@@ -12,7 +12,7 @@ import numpy as np
 
 from minimax_cal.fitting.identify import (
     NOT_TOLD,
-    RANK,
+    RANK_TOLERANCE,
     RESOLUTION,
     SAME_MOTION,
     Identification,
@@ -69,7 +69,9 @@ def open_scale(reference: Instrument, x: State, active: Array, order: Array) -> 
     if len(reference.first) < 2:  # one socket: nothing has a length
         return True
     told = replace(reference, pairs=np.array([[0, 1]]), distance=np.zeros(1))
-    missing = [len(redundant(gram_of(r, x), active, order, RANK)) for r in (reference, told)]
+    missing = [
+        len(redundant(gram_of(r, x), active, order, RANK_TOLERANCE)) for r in (reference, told)
+    ]
     return missing[1] < missing[0]
 
 
@@ -145,9 +147,9 @@ def identified(
     no_length = open_scale(reference, x, kept.active, order)
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
-    gone = redundant(plain, kept.active, order, RANK)
+    gone = redundant(plain, kept.active, order, RANK_TOLERANCE)
     kept = kept.without(gone, SAME_MOTION).without([i for i in gone if i in keeper], SCALE)
-    told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK), 0.0))
+    told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
     anchors = {name.partition("_")[0] for name in names.all if name.startswith("anchor")}
     return kept.identification(gram, scale, anchors, "all anchors moved together")
@@ -157,7 +159,7 @@ def generic_count(robot: Robot, instrument: Instrument, x: State, allowed: Array
     """How many of the allowed parameters plenty of poses would determine."""
     plain = gram_of(reference_of(robot, instrument, x), x)
     moving = allowed & (np.sqrt(np.diag(plain)) > STILL * np.sqrt(np.diag(plain).max()))
-    gone = redundant(plain, moving, order_of(robot, instrument.names), RANK)
+    gone = redundant(plain, moving, order_of(robot, instrument.names), RANK_TOLERANCE)
     return int(moving.sum()) - len(gone)
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.fitting.checks import EXPLAINED, FEW, POOR_FIT
-from minimax_cal.fitting.claims import GROSS
+from minimax_cal.fitting.checks import EXPLAINED, MAX_TRIAL_POSES, POOR_FIT
+from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.identify import plenty_of_poses
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import (
@@ -66,13 +66,15 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
 
 
 def some(data: RelativeData) -> Array:
-    """(m,) True for rows that are enough to find a slip: of closures all, of each wire `FEW`."""
+    """(m,) True for rows enough to find a slip: all closures, `MAX_TRIAL_POSES` of each wire."""
     if data.kind != "distances":
         return np.ones(data.poses, dtype=bool)
     chosen = np.zeros(data.poses, dtype=bool)
     for length in data.length.T:
         seen = np.flatnonzero(np.isfinite(length))
-        chosen[seen[np.linspace(0, len(seen) - 1, min(len(seen), FEW)).astype(int)]] = True
+        chosen[seen[np.linspace(0, len(seen) - 1, min(len(seen), MAX_TRIAL_POSES)).astype(int)]] = (
+            True
+        )
     return chosen
 
 
@@ -162,13 +164,14 @@ def contradiction(
 
     offset: what the lengths say of offsets that were not fitted, see `offset_told`.
     """
-    closing, limit_mm = data.kind == "closures", 1e3 * GROSS * robot.reach()
+    closing, limit_mm = data.kind == "closures", 1e3 * MAX_MISS_OF_REACH * robot.reach()
     which = "the labels of the sockets" if closing else "which length is which wire's"
     for key, what in (("train", "training"), ("holdout", "held-out")):
         miss_mm = result.accuracy[key].rms_mm
         if miss_mm > limit_mm:
             return (
-                f"the fit misses the {what} rows by {miss_mm:.3g} mm, more than {100 * GROSS:g} % "
+                f"the fit misses the {what} rows by {miss_mm:.3g} mm, more than "
+                f"{100 * MAX_MISS_OF_REACH:g} % "
                 "of the arm's reach: it is no calibration of this arm; check the robot file, joint "
                 f"signs, units and {which}"
             )

@@ -12,7 +12,7 @@ import numpy as np
 
 from minimax_cal.fitting.identify import (
     NOT_TOLD,
-    RANK,
+    RANK_TOLERANCE,
     SAME_MOTION,
     Identification,
     Kept,
@@ -111,7 +111,7 @@ def identified(
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
     keeper = [] if len(model.board) else scale_keeper(robot, kept.active & names.links, wanted)
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
-    gone = redundant(plain, kept.active & ~lens, order, RANK)
+    gone = redundant(plain, kept.active & ~lens, order, RANK_TOLERANCE)
     by_drawing = set(keeper) & set(gone)  # nothing but the drawing tells the scale
     kept = kept.without([i for i in gone if i not in by_drawing], SAME_MOTION)
     known = lens | (bool(by_drawing) & lengths_of(names))

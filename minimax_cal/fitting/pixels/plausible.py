@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from minimax_cal.fitting.checks import POOR_FIT
-from minimax_cal.fitting.claims import GROSS
+from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.camera import INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
@@ -82,7 +82,7 @@ def contradiction(robot: Robot, data: PixelData, fit: PixelFit, options: PixelOp
     size = np.linalg.norm(fit.model.errors(fit.scene), axis=0) * depth / focal
     miss, aside = float(np.median(size)), float((fit.model.weight == 0.0).mean())
     said = ""
-    if miss > GROSS * robot.reach():
+    if miss > MAX_MISS_OF_REACH * robot.reach():
         said = f"the calibrated arm misses by {1e3 * miss:.3g} mm at the target"
     elif aside > MOST_ASIDE:
         said = f"{100 * aside:.0f} % of the pixels are outliers"

@@ -16,7 +16,7 @@ from minimax_cal.ground.tables import Cell as TableCell
 from minimax_cal.ground.tables import Table
 from minimax_cal.judging.iso9283.formulas import mean_of
 from minimax_cal.judging.iso9283.visits import (
-    MOST,
+    MAX_PAIRED_POSES,
     Scatter,
     Stops,
     Values,
@@ -383,8 +383,10 @@ def remarks(data: Measurements, stops: Stops, parts: Mapping[str, Part]) -> list
             "stop with it; label them in a column pose if the arm had moved away between"
         )
     for key, part in parts.items():
-        if len(part.names) > MOST:
-            out.append(f"AD of the {PARTS[key]} poses: pairs of {MOST} of {len(part.names)}")
+        if len(part.names) > MAX_PAIRED_POSES:
+            out.append(
+                f"AD of the {PARTS[key]} poses: pairs of {MAX_PAIRED_POSES} of {len(part.names)}"
+            )
         if not np.isfinite(part.values[next(iter(part.values))].position).any():
             out.append(
                 f"the TCP was measured at none of the {PARTS[key]} poses: choose one target for it "

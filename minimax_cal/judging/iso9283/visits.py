@@ -27,7 +27,7 @@ from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.modelling.cell import Cell
 
 LOCK = 0.1  # |cos b| below which a and c exaggerate a turn more than tenfold
-MOST = 3000  # poses whose pairs are all formed
+MAX_PAIRED_POSES = 3000  # poses whose pairs are all formed
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,9 @@ def values_of(poses: View, each: View, stops: Stops) -> Values:
     deviation = euler_deviation(poses.turn, poses.goal)
     deviation[:, ::2][locked(poses)] = np.nan
     known = np.flatnonzero(np.isfinite(poses.attained[:, 0]))
-    thin = known[np.unique(np.linspace(0, len(known) - 1, min(len(known), MOST)).astype(int))]
+    thin = known[
+        np.unique(np.linspace(0, len(known) - 1, min(len(known), MAX_PAIRED_POSES)).astype(int))
+    ]
     after = stops.linked[1:] & (np.diff(stops.place) == 1) & (stops.pose[1:] != stops.pose[:-1])
     step = [np.linalg.norm(np.diff(at, axis=0), axis=1) for at in (each.attained, each.commanded)]
     moved = (step[0] - step[1])[after]

@@ -18,11 +18,11 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from minimax_cal.ground.arrays import Array
 
-ROUNDS = 40  # of the fixed point that finds the variances, at most
-SETTLED = 0.02  # share of every variance by which a last round may change it
+MAX_ROUNDS = 40  # of the fixed point that finds the variances, at most
+VARIANCE_TOLERANCE = 0.02  # share of every variance by which a last round may change it
 RIDGE = 1e-10  # of a column's own square: what no pose tells stays where it is
-LEAST = 1e-8  # of the noise's variance, in its own unit
-SMALL = 1e-4  # of a factor's variance: a turn of a microradian tells nothing
+MIN_NOISE = 1e-8  # of the noise's variance, in its own unit
+MIN_FACTOR = 1e-4  # of a factor's variance: a turn of a microradian tells nothing
 OLD, NEW, FOOT = range(3)  # where rows come from
 KNOWN = -1  # component of factors whose variance is 1
 
@@ -236,7 +236,7 @@ def likeliest(both: Both) -> Variances:
         counts[part.source] += part.count
     noise, factor = np.ones(3), np.append(both.near, np.ones(r))[:r]
     kinds = [both.component == kind for kind in np.unique(both.component) if kind >= 0]
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         prior = np.append(np.zeros(f), 1.0 / factor)
         gram = np.tensordot(1.0 / noise, grams, 1)
         cover = inverse(gram[:-1, :-1] + np.diag(prior))
@@ -247,15 +247,15 @@ def likeliest(both: Both) -> Variances:
         free = np.maximum(counts - paid, 0.5)
         ratio = noise[NEW] / noise[OLD]
         common = (square[OLD] + square[NEW] / ratio) / (free[OLD] + free[NEW])
-        common = max(float(common), LEAST if counts[OLD] else 1.0)
+        common = max(float(common), MIN_NOISE if counts[OLD] else 1.0)
         if counts[OLD] and counts[NEW]:
             ratio = max(float(square[NEW] / free[NEW]) / common, 1.0)
         before, noise = np.append(noise, factor), np.array([common, common * ratio, 1.0])
         told = np.clip(1.0 - np.diag(cover)[f:] / factor, 1e-12, 1.0)
         for some in kinds:
             one = float(np.sum(value[f:][some] ** 2) / np.sum(told[some]))
-            factor[some] = max(one, SMALL)
-        if np.all(np.abs(np.log(np.append(noise, factor) / before)) < SETTLED):
+            factor[some] = max(one, MIN_FACTOR)
+        if np.all(np.abs(np.log(np.append(noise, factor) / before)) < VARIANCE_TOLERANCE):
             break
     deviance = (
         float(counts @ np.log(noise) + np.log(factor).sum())

@@ -110,7 +110,7 @@ def gauge(fit: Fit) -> tuple[Array, Array]:
     gram = identify.gram_of(model, state)
     order = identify.drop_order(fit.before.robot, model.names)
     everything = np.ones(model.names.count, dtype=bool)
-    gone = np.array(identify.redundant(gram, everything, order, identify.RANK), dtype=int)
+    gone = np.array(identify.redundant(gram, everything, order, identify.RANK_TOLERANCE), dtype=int)
     size = np.sqrt(np.maximum(np.diag(gram), TINY))
     _, vectors = np.linalg.eigh(gram / np.outer(size, size))
     null = vectors[:, : len(gone)] / size[:, None]

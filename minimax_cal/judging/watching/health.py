@@ -20,7 +20,14 @@ from minimax_cal.fitting.set_aside import WithThem, errors_of, with_them
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.seeds import check_seed
-from minimax_cal.judging.tolerance import CHANCE, FEWEST, KINDS, REFUSED, Limit, limits_of
+from minimax_cal.judging.tolerance import (
+    KINDS,
+    MAX_EXCEED_CHANCE,
+    MIN_POSES,
+    REFUSED,
+    Limit,
+    limits_of,
+)
 from minimax_cal.judging.watching.moved import Search, search, sized
 from minimax_cal.judging.watching.opening import in_names, watched_of
 from minimax_cal.judging.watching.placing import Placing
@@ -35,10 +42,10 @@ from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.modelling.cell import Cell
 
 KNOWN = ("frame", "targets")  # what may still be where it was
-SURE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
-STATED = (0.5, 0.9995)  # confidences that are told
-NOISIER = 5.0  # standard deviations of a mean square that are worth a word
-WIDE = 1.5  # so much wider sigmas are too
+MIN_CONFIDENCE = 0.975  # one-sided: the 95 % interval lies on one side of what is required
+CONFIDENCE_RANGE = (0.5, 0.9995)  # confidences that are told
+MIN_NOISIER_SIGMAS = 5.0  # standard deviations of a mean square that are worth a word
+MIN_WIDER = 1.5  # so much wider sigmas are too
 
 
 def check(
@@ -75,7 +82,7 @@ def check(
     exact = replace(data, simulated=data.simulated or simulated)
     if why := refused(fit, exact, residual(error, used)):
         verdicts = tuple(
-            replace(one, valid=False, confidence=STATED[1], why=why) for one in verdicts
+            replace(one, valid=False, confidence=CONFIDENCE_RANGE[1], why=why) for one in verdicts
         )
     after = refit(fit, watched, found)
     spread, enough, asked = prospects(watched, found)
@@ -163,29 +170,30 @@ def verdict(limit: Limit, error: Array, data: Measurements, used: float, seed: i
 
     found = accuracy(larger)
     value = found.rms_mm if rms else found.max_mm
-    ends = interval(2.0 * SURE - 1.0)
+    ends = interval(2.0 * MIN_CONFIDENCE - 1.0)
     low, high = 1e3 * ends.low, max(1e3 * ends.high, value)
     poses = len(np.unique(group))
     told = partial(Verdict, limit, value, low, high)
     seen = f"{KINDS[limit.kind]} {value:.3f} mm, at most {limit.size_mm:g} mm is required"
     if math.isnan(low):
-        return told(None, STATED[0], f"{seen}, and {poses} poses are too few to say")
+        return told(None, CONFIDENCE_RANGE[0], f"{seen}, and {poses} poses are too few to say")
     if not rms and accuracy(error).max_mm > limit.size_mm:
         return told(
-            False, STATED[1],
+            False, CONFIDENCE_RANGE[1],
             f"{KINDS[limit.kind]} {accuracy(error).max_mm:.3f} mm was seen, at most "
             f"{limit.size_mm:g} mm is required",
         )  # fmt: skip
-    if not rms and chance_of_larger(poses) > CHANCE:
-        return told(None, STATED[0], f"{seen}, and a maximum needs at least {FEWEST} poses")
+    if not rms and chance_of_larger(poses) > MAX_EXCEED_CHANCE:
+        said = f"{seen}, and a maximum needs at least {MIN_POSES} poses"
+        return told(None, CONFIDENCE_RANGE[0], said)
     sure = confidence(interval, 1e-3 * limit.size_mm, above=value > limit.size_mm)
-    decided = None if sure < SURE else value <= limit.size_mm
+    decided = None if sure < MIN_CONFIDENCE else value <= limit.size_mm
     return told(decided, sure, seen if decided is not None else f"{seen}: more poses may decide")
 
 
 def confidence(interval: Any, size: float, *, above: bool) -> float:
     """The largest one-sided confidence at which an interval lies on one side of a size."""
-    low, high = STATED
+    low, high = CONFIDENCE_RANGE
     for _ in range(12):
         middle = 0.5 * (low + high)
         ends = interval(2.0 * middle - 1.0)
@@ -197,13 +205,13 @@ def confidence(interval: Any, size: float, *, above: bool) -> float:
 def remarks(watched: Watched, found: Search) -> Iterator[str]:
     """What the reader should know."""
     ratio, dof = found.first.noise_ratio, found.first.variances.dof
-    if ratio**2 > 1.0 + NOISIER * math.sqrt(2.0 / dof):
+    if ratio**2 > 1.0 + MIN_NOISIER_SIGMAS * math.sqrt(2.0 / dof):
         yield (
             f"the new poses are {ratio:.2g} times as noisy as the calibration: the instrument is "
             "noisier now, or more changed than is named"
         )
     wider = found.first.widest()
-    if wider > WIDE:
+    if wider > MIN_WIDER:
         yield (
             f"the model lacks something: sigmas are up to {wider:.2g} times what noise alone would "
             "leave; a diagnosis says what"

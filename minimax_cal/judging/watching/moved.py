@@ -25,16 +25,18 @@ from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.modelling.parameters import links_of
 
-LEVEL = 0.005  # chance that anything at all is named on an arm that did not move
+FALSE_ALARM = 0.005  # chance that anything at all is named on an arm that did not move
 ZEROS = (
     0.8  # share of it for zero positions, which a knock or a service changes; links have the rest
 )
-APART = 1e-6  # share of a motion that frame and reflectors do not imitate, of what can be told
+MIN_OWN_MOTION = (
+    1e-6  # share of a motion that frame and reflectors do not imitate, of what can be told
+)
 CLEARER = 9.0  # by how much a link must explain more than a zero position, in squared sigmas
 LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
 OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases
 NOTHING = np.zeros(0, dtype=int)
-MOST = 4  # parameters that are named; where more moved, the arm wants a calibration
+MAX_MOVED = 4  # parameters that are named; where more moved, the arm wants a calibration
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def joint_of(parameter: str) -> str:
 def levels(zero: Array) -> Array:
     """(c,) chance that each parameter is named where nothing moved; zero: (c,) as `Candidates`."""
     counts = [max(int(kind.sum()), 1) for kind in (zero, ~zero)]
-    return LEVEL * np.where(zero, ZEROS / counts[0], (1.0 - ZEROS) / counts[1])
+    return FALSE_ALARM * np.where(zero, ZEROS / counts[0], (1.0 - ZEROS) / counts[1])
 
 
 def picked(square: Array, passed: Array, zero: Array) -> tuple[int, list[int]]:
@@ -119,7 +121,7 @@ class Candidates:
         """
         zeros = watched.zeros
         others = np.setdiff1d(np.flatnonzero(links & watched.names.links), zeros)
-        kinds = [kind[rows.share(kind, watched.open) > APART] for kind in (zeros, others)]
+        kinds = [kind[rows.share(kind, watched.open) > MIN_OWN_MOTION] for kind in (zeros, others)]
         zero = np.repeat([True, False], [len(kind) for kind in kinds])
         return Candidates(np.concatenate(kinds), zero, levels(zero))
 
@@ -132,7 +134,7 @@ class Candidates:
         """p-value of nothing having moved: of the clearest, shared among all [Bonferroni]."""
         by, sigma, dof = both.scores(NOTHING)
         _, p_value = tested(by, sigma, dof)
-        return float(np.min(LEVEL * p_value / self.level, initial=1.0))
+        return float(np.min(FALSE_ALARM * p_value / self.level, initial=1.0))
 
     def clearest(self, both: Both, chosen: Array) -> tuple[int, float, list[int]] | None:
         """The one that explains most, its p-value and its rivals; None where all may be chance.
@@ -202,7 +204,7 @@ def search(watched: Watched, links: Array) -> Search:
     both = first = joined(watched, rows, looked.column)
     names = watched.names
     chosen, told = NOTHING, []
-    while len(chosen) < MOST and (found := looked.clearest(both, chosen)):
+    while len(chosen) < MAX_MOVED and (found := looked.clearest(both, chosen)):
         pick, p_value, others = found
         chosen = np.append(chosen, pick)
         told.append((p_value, tuple(names.all[looked.column[i]] for i in others)))

@@ -16,7 +16,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.modelling.parameters import State
 
-TOLD = 1e-10  # share of the largest singular value below which a direction is not told
+RANK_TOLERANCE = 1e-10  # share of the largest singular value below which a direction is not told
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Placing:
         """(f, N) from errors to what is free."""
         norm = np.linalg.norm(self.matrix, axis=0)
         norm = np.where(norm > 0.0, norm, 1.0)
-        return np.asarray(np.linalg.pinv(self.matrix / norm, rcond=TOLD) / norm[:, None])
+        return np.asarray(np.linalg.pinv(self.matrix / norm, rcond=RANK_TOLERANCE) / norm[:, None])
 
     @cached_property
     def state(self) -> State:

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from minimax_cal.judging.watching.moved import (
-    APART,
+    MIN_OWN_MOTION,
     Search,
     joint_of,
 )
 from minimax_cal.judging.watching.result import SHIFT, Hidden
 from minimax_cal.judging.watching.watched import Watched
 
-FEWEST = 2  # poses that place an arm
+MIN_POSES = 2  # poses that place an arm
 
 
 def hidden(watched: Watched, found: Search) -> Iterator[Hidden]:
@@ -26,10 +26,10 @@ def hidden(watched: Watched, found: Search) -> Iterator[Hidden]:
     base = watched.open & (place < 5 * n + 6)
     for i in lost:
         alone = np.array([i])
-        if base.any() and found.before.rows.share(alone, base)[0] <= APART:
+        if base.any() and found.before.rows.share(alone, base)[0] <= MIN_OWN_MOTION:
             needs = "reflectors on the foot, or the old frame (known frame)"
             yield Hidden(names.all[i], "the measurement frame", needs)
-        elif found.before.rows.share(alone, watched.open & ~base)[0] <= APART:
+        elif found.before.rows.share(alone, watched.open & ~base)[0] <= MIN_OWN_MOTION:
             needs = "reflectors that were not touched (known targets)"
             yield Hidden(names.all[i], "the tool", needs)
         else:
@@ -49,5 +49,5 @@ def prospects(watched: Watched, found: Search) -> tuple[dict[str, float], int | 
     if not turning.any():
         return findable, None, None
     worst = float(np.max(least[turning]))
-    wanted = max(math.ceil(watched.data.poses * (worst / SHIFT) ** 2), FEWEST)
+    wanted = max(math.ceil(watched.data.poses * (worst / SHIFT) ** 2), MIN_POSES)
     return findable, (wanted if worst <= SHIFT else None), wanted

@@ -18,9 +18,9 @@ from minimax_cal.modelling.effects.scene import (
 )
 from minimax_cal.robots.kinematics import THETA, D
 
-STEPS = 12  # moments at which something may have changed
+MAX_MOMENTS = 12  # moments at which something may have changed
 NEARBY = 24  # moments before one that was chosen, and after it
-FEWEST = 12  # poses among which a moment is looked for
+MIN_POSES = 12  # poses among which a moment is looked for
 
 
 def session_number(scene: Scene) -> Array:
@@ -43,9 +43,9 @@ def later_sessions(scene: Scene) -> tuple[Choice, ...]:
 def moments(scene: Scene) -> tuple[Choice, ...]:
     """Moments spread over the measurement, with poses enough on both sides."""
     clock = np.sort(scene.column("clock"))
-    if not scene.has("clock") or len(clock) < FEWEST:
+    if not scene.has("clock") or len(clock) < MIN_POSES:
         return ()
-    at = np.unique(np.linspace(5, len(clock) - 5, STEPS).astype(int))
+    at = np.unique(np.linspace(5, len(clock) - 5, MAX_MOMENTS).astype(int))
     return tuple({"since": float(clock[i])} for i in at)
 
 
@@ -91,7 +91,7 @@ def finer_moments(scene: Scene, choice: Choice) -> Sequence[Choice]:
         return ()
     clock = np.sort(scene.column("clock"))
     at = int(np.searchsorted(clock, choice["since"]))
-    step = max(1, len(clock) // STEPS)
+    step = max(1, len(clock) // MAX_MOMENTS)
     away = np.unique(np.geomspace(1, step, NEARBY).astype(int))  # fine nearby, coarse afar
     near = at + np.concatenate([-away[::-1], [0], away])
     near = near[(near >= 3) & (near < len(clock) - 3)]

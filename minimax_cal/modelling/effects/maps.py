@@ -22,7 +22,7 @@ from minimax_cal.modelling.effects.scene import (
 
 LENGTH, SIZE = float(np.radians(5.0)), 3e-4  # of a usual curve [rad]
 FINEST = float(np.radians(6.0))  # wavelength of the shortest sine
-SHOWN = float(np.radians(2.0))  # from one point of a curve that is told to the next
+CURVE_STEP = float(np.radians(2.0))  # from one point of a curve that is told to the next
 MARGIN = float(np.radians(4.0))  # beyond the measured angles the curve goes to nothing
 
 
@@ -94,7 +94,7 @@ def curve_of(choice: Choice, sign: float, values: Array, covariance: Array) -> A
     sign: of the joint in the robot file.  values: (d,), covariance: (d, d) [rad].
     """
     low, high = choice["low"], choice["high"]
-    x = np.linspace(low, high, int((high - low) / SHOWN) + 2)
+    x = np.linspace(low, high, int((high - low) / CURVE_STEP) + 2)
     wave = sines(x, low, high, len(values))
     band = np.sqrt(np.maximum(np.einsum("dg,de,eg->g", wave, covariance, wave), 0.0))
     out = np.stack([sign * x, sign * (values @ wave), band])

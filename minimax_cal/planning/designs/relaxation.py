@@ -37,11 +37,13 @@ SOLVERS: dict[str, dict[str, float]] = {  # by cvxpy's name, tried in turn
     "SCS": {"eps_abs": 1e-4, "eps_rel": 1e-4, "max_iters": 1000},
     "CLARABEL": {},
 }
-FEW = 160  # experiments beyond the number to choose that the solver sees at a time
+MAX_EXTRA_EXPERIMENTS = (
+    160  # experiments beyond the number to choose that the solver sees at a time
+)
 WORST = 60  # predictions of `Largest` that it sees at a time
 GAP = 3e-3  # relative, between size and bound, at which no more rounds are needed
 STALE = 0.8  # of the gap that a round leaves: more, and further ones are in vain
-ROUNDS = 6
+MAX_ROUNDS = 6
 NOTHING = 1e-6  # a smaller weight is none
 
 
@@ -68,7 +70,7 @@ def relax(
     begin: Array,
     solvers: tuple[str, ...] = tuple(SOLVERS),
     gap: float = GAP,
-    rounds: int = ROUNDS,
+    rounds: int = MAX_ROUNDS,
 ) -> Relaxed:
     """The best weights for as many experiments as there are in a design, and a bound.
 
@@ -84,7 +86,7 @@ def relax(
     given, posed, found = begin[:0], begin[:0], weights
     for _ in range(rounds):
         support = np.flatnonzero(weights + found > NOTHING)
-        newer = union(begin, support, highest(menu.scores(latest), count + FEW))
+        newer = union(begin, support, highest(menu.scores(latest), count + MAX_EXTRA_EXPERIMENTS))
         worse = union(posed, minimax_problem(criterion, cov))
         known = np.isin(newer, given).all() and np.isin(worse, posed).all()
         if bound >= size * (1.0 - gap) or known:
