@@ -244,13 +244,16 @@ def test_a_list_tells_where_and_how_far(robot: mc.Robot) -> None:
 
 def test_the_table_has_a_row_a_suspect() -> None:
     one = Suspect(7, "smr2", 5, 1.2e-3, 40.0, 1e-30, together=True)
-    table = table_of([one])
-    assert table.rows == ((7, "smr2", pytest.approx(1.2), 40.0, 1e-30, "training", "all targets"),)
+    data = simulate("irb120", 10, seed=1).data
+    table = table_of([one], data)
+    assert table.rows == (
+        (data.called(7), "smr2", pytest.approx(1.2), 40.0, 1e-30, "training", "all targets"),
+    )
     assert one.to_dict() == {
         "line": 7, "target": "smr2", "distance_mm": pytest.approx(1.2), "score": 40.0,
         "chance": 1e-30, "together": True, "held": False,
     }  # fmt: skip
-    assert table_of([]).rows == ()
+    assert table_of([], data).rows == ()
 
 
 def test_the_list_is_the_least_likely_first(robot: mc.Robot) -> None:
