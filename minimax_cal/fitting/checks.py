@@ -118,7 +118,7 @@ def check_fresh(robot: Robot, data: Measurements) -> None:
 def check_scale(robot: Robot, data: Measurements, given: BaseFit) -> None:
     """Raise DataError where a common factor on all points, and no error of links, fits the arm."""
     moving = np.count_nonzero(np.ptp(data.q, axis=0) > 0.0)
-    if moving < LEAST_MOVING or len(np.unique(data.q, axis=0)) < LEAST_HEAD:
+    if moving < LEAST_MOVING or len({row.tobytes() for row in data.q}) < LEAST_HEAD:
         return
     if np.sqrt(given.mean_square) > MOST_SCALE * robot.reach():
         return
@@ -282,9 +282,7 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     model, good = model_of(robot, data), np.ones(data.poses, dtype=bool)
     for _ in range(MAX_ROUNDS):
         state = fitted(robot, data.take(good)).state
-        measured, predicted = measured_and_predicted(model, state)
-        squares = (np.where(model.seen[:, None], measured - predicted, 0.0) ** 2).sum(axis=(0, 1))
-        miss = np.sqrt(squares / np.maximum(model.seen.sum(axis=0), 1))
+        miss = misses(robot, data, state)
         typical = float(np.median(miss[good]))
         limit = max(MIN_STRAY_RATIO * typical, MIN_STRAY_OF_REACH * robot.reach())
         if not (miss > limit).any() and good.all():
@@ -298,6 +296,7 @@ def misplaced(robot: Robot, data: Measurements) -> tuple[Array, Array]:
     )
     if not len(bad) or len(bad) > data.poses // 5:
         return NO_ROWS, NO_ROWS
+    measured, predicted = measured_and_predicted(model, state)
     off = measured[:, :, None, bad] - predicted[:, :, bad, None]  # of points b at pose a
     both = model.seen[:, None, bad] & model.seen[:, bad, None]
     distance = np.sqrt((off**2).sum(axis=1) * both).sum(axis=0) / np.maximum(both.sum(axis=0), 1)

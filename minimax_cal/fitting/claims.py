@@ -12,7 +12,7 @@ from minimax_cal.fitting.crossed import MIN_HELD_POSES, crossed
 from minimax_cal.fitting.options import Options
 from minimax_cal.fitting.solve import Solved
 from minimax_cal.fitting.stations import steps_of
-from minimax_cal.fitting.suspects import Suspect, aside, held_suspects
+from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside, held_suspects
 from minimax_cal.fitting.uncertainty import Estimator
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
@@ -32,7 +32,6 @@ MAX_MISS_OF_REACH = 0.01  # of the reach: a fit that misses by more contradicts 
 MAX_MISS_OF_FLOOR = 50.0  # times the floor, likewise
 YIELDS = 0.001  # of the reach: so much a sound arm may bend, however well it comes back
 MAX_NAMED = 5  # lines that a notice names
-MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 
 
 def unseen_suspects(
@@ -53,7 +52,7 @@ def bad_rows(suspects: Sequence[Suspect], source: str) -> Iterator[str]:
     """Notice of held-out points that stand out: they judge the fit."""
     held = [one for one in suspects if one.held]
     if held:
-        named = [f"line {s.line} {s.target} {1e3 * s.distance:.3g} mm" for s in held]
+        named = [one.text for one in held]
         yield (
             f"{source}: outliers among the held-out points: {name_first(named, MAX_NAMED)}; they "
             "count in the held-out accuracy, which is also given without them"

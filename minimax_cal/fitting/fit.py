@@ -22,7 +22,7 @@ from minimax_cal.fitting.changed import Change
 from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
-from minimax_cal.fitting.minimax_problem import Distances, measured_distances
+from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
 from minimax_cal.fitting.options import Options, options_from
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
@@ -60,7 +60,6 @@ ACCURACIES = (  # where accuracy is told: title, key
     ("training, nominal", "nominal_train"),
     ("training, calibrated", "train"),
 )
-DOUBTED = 0.5  # a point of less weight tells no distance between targets
 ROUGH = 1e-6  # a QP answered worse than this is told
 NOT_IDENTIFIED = "not identified because"
 CORRECTIONS = {  # parameters that are no values but corrections, and of what
@@ -505,8 +504,7 @@ class Fit:
     @cached_property
     def distances(self) -> Distances:
         """Between targets, as the believed training points tell them."""
-        believed = np.where(self.weights.T[..., None] > DOUBTED, self.train.y, np.nan)
-        return measured_distances(self.train.with_y(believed), self.options.distance_tolerance)
+        return trusted_distances(self.train, self.weights, self.options.distance_tolerance)
 
     @cached_property
     def estimator(self) -> Estimator:

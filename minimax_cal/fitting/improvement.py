@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.fitting.suspects import Suspect, aside
+from minimax_cal.fitting.suspects import MIN_POINTS_LEFT, Suspect, aside
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.words import name_first
 from minimax_cal.measuring.accuracy import accuracy
@@ -21,7 +21,7 @@ from minimax_cal.measuring.measurements import Measurements
 # A point that both arms miss by so many times what lies between them there does not say which of
 # them is right; a point that only the calibrated arm misses does, and counts.
 MIN_COMMON_MISS = 2.0
-MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are left, all count
+
 MAX_NAMED = 5  # points that a reason names
 
 
@@ -112,7 +112,7 @@ def points_of(data: Measurements, which: Array, error: Array) -> str:
 
 def no_better(found: Improvement, suspects: Sequence[Suspect]) -> str:
     """The sentence for an arm that is no better than the drawn one, and what to do."""
-    off = [f"line {one.line} {one.target} {1e3 * one.distance:.3g} mm" for one in suspects]
+    off = [one.text for one in suspects]
     rows = f"; check the outliers ({name_first(off, MAX_NAMED)})" if off else ""
     return (
         f"The calibrated arm is no better than the drawn one ({found.numbers} on new poses): keep "

@@ -21,6 +21,7 @@ from minimax_cal.modelling.parameters import State
 from minimax_cal.solvers.minimax import Linear
 
 DISTANCE_FORMS = ("two-sided", "squared", "off")
+MIN_TRUSTED_WEIGHT = 0.5  # a point of less weight tells no distance between targets
 LEAST_TOLERANCE = 1e-6  # a distance is never asked to hold better than a micrometre [m]
 
 
@@ -62,6 +63,14 @@ def measured_distances(data: Measurements, tolerance: float | None = None) -> Di
         np.array(mean),
         np.maximum(scatter, LEAST_TOLERANCE),
     )
+
+
+def trusted_distances(
+    data: Measurements, weights: Array, tolerance: float | None = None
+) -> Distances:
+    """`measured_distances` of the points that a fit gave weight.  weights: (k, m)."""
+    trusted = np.where(weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
+    return measured_distances(data.with_y(trusted), tolerance)
 
 
 @dataclass(frozen=True, eq=False)

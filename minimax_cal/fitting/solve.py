@@ -11,7 +11,7 @@ from minimax_cal.fitting import identify, start
 from minimax_cal.fitting.certificate import Certificate, certify
 from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.identify import Identification
-from minimax_cal.fitting.minimax_problem import Distances, measured_distances, minimax_problem
+from minimax_cal.fitting.minimax_problem import Distances, minimax_problem, trusted_distances
 from minimax_cal.fitting.options import OFFSETS, Options, Progress, objective_of, silent, solver_of
 from minimax_cal.fitting.robust import Robust, flatness, robust_fit
 from minimax_cal.fitting.start import BaseFit
@@ -54,7 +54,6 @@ EFFECT_PASSES = 2  # of a fit with effects: the second takes finite turns into a
 PRIOR_ROUNDS = 20  # of weighing a prior against the noise that remains
 MIN_TARGET_WEIGHT = 1e-3  # least weight of a target in a covariance, as in the SQP's Hessian
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
-MIN_TRUSTED_WEIGHT = 0.5  # a point of less weight tells no distance between targets
 AT_BOUND = "at its bound"
 MAX_ROUNDING = 1e-9  # an error below is rounding: data that were computed, not measured [m]
 MIN_HOPELESS_MISS = (
@@ -266,8 +265,7 @@ def fit_cell(
         mix = pose_weights(data, options.lever)
         model = stage.robust.by_pose
         stage = replace(stage, squares=of_poses(task, with_poses(model, mix), stage))
-    believed = np.where(stage.robust.weights.T[..., None] > MIN_TRUSTED_WEIGHT, data.y, np.nan)
-    distances = measured_distances(data.with_y(believed), options.distance_tolerance)
+    distances = trusted_distances(data, stage.robust.weights, options.distance_tolerance)
     optimum, certificate, said = worst_case(task, model, stage.state, distances, progress)
     state, identification = optimum.x if optimum else stage.state, stage.identification
     if len(model.room):

@@ -28,6 +28,7 @@ MIN_VARIANCE_SHARE = (
     0.01  # a fit that leaves less of a direction's variance hides what is wrong there
 )
 RIDGE = 1e-10  # of each parameter's own weight: one that the kept points do not tell is open
+MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 MIN_HELD_EXCESS = 1.5  # times what any point of the fit is off: a held-out point that is suspect
 LEAST_SCALE = 1e-7  # no instrument tells less [m]
 TAIL_DOFS = (3.0, 4.0, 6.0, 10.0, 20.0)  # degrees of freedom of Student's t: heavy tails to light
@@ -255,6 +256,11 @@ class Suspect:
     p_value: float
     together: bool
     held: bool = False
+
+    @property
+    def text(self) -> str:
+        """Which, and how far off, for people."""
+        return f"line {self.line} {self.target} {1e3 * self.distance:.3g} mm"
 
     def to_dict(self) -> dict[str, object]:
         """For JSON, in millimetres."""
