@@ -202,5 +202,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Public names, also those that nobody used yet."""
-    return sorted({*globals(), *__all__, "__version__"})
+    """The public names alone."""
+    return sorted((*__all__, "__version__"))

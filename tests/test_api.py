@@ -38,9 +38,9 @@ def after(code: str, *modules: str) -> dict[str, bool]:
 
 def test_every_name_is_there() -> None:
     assert set(mc.MODULES) == set(mc.__all__)
+    assert set(dir(mc)) == {*mc.__all__, "__version__"}
     for name in mc.__all__:
         assert getattr(mc, name) is not None
-        assert name in dir(mc)
     assert mc.__version__ == version("minimax-cal")
     with pytest.raises(AttributeError, match="'calibrat'"):
         mc.calibrat  # type: ignore[attr-defined] # noqa: B018
@@ -88,6 +88,8 @@ def test_help_explains_the_arguments_and_shows_an_example(name: str) -> None:
     text = inspect.getdoc(function) or ""
     assert re.search(rf"^>>> .*\bmc\.{name}\(", text, re.M)
     told = text.partition(">>>")[0]
+    assert "Parameters\n----------\n" in told
+    assert "Examples\n--------\n" in told
     for argument in inspect.signature(function).parameters:
         if argument not in ("fun", "x0", "jac"):
             assert re.search(rf"\b{argument}\b", told), f"{name}: {argument}"

@@ -18,7 +18,9 @@ HELPS = ("minimax_cal/cli/", "experiments/", "examples/")  # docstrings there ar
 PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "paper.md")
 FENCE = re.compile(r"^( *)(`{3,}|~{3,}).*?^\1\2[^\n]*$", re.S | re.M)
 SPAN = re.compile(r"(`+)[^`]+\1|\b\w+\[")  # and JSON keys, as rungs[2]
-ARGUMENTS = re.compile(r"\b\w+(?:, \w+)*:(?=\s)")  # of a docstring: their names are code
+ARGUMENTS = re.compile(  # of a docstring: their names are code
+    r"\b\w+(?:, \w+)*:(?=\s)|^ {4}\w+(?:, \w+)*$", re.MULTILINE
+)
 HIDDEN = re.compile(r"<(script|style)\b.*?</\1>|\{[%#].*?[%#]\}|\{\{.*?\}\}|<[^>]*>", re.S)
 
 

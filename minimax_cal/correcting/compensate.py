@@ -187,18 +187,46 @@ def compensate(
 ) -> Compensation:
     """Joints that bring the calibrated arm to where the nominal one would stand.
 
-    fit: a calibration, its cell, a diagnosis, a relative calibration, or its file.  targets: (m, n)
-    commanded joints in the order of the path [rad, m], or measurements, whose columns (payload,
-    approach ...) then count.  nominal: the arm the controller believes in, its file or its name;
-    that of the fit unless given.  frame: where the nominal arm stands, one of FRAMES.  tolerance:
-    of the position, and of the orientation times the lever [m].  most_change: of a joint [rad; half
-    as many m for a slide].  lever: what a radian counts as [m], NaN for the targets' own.  clock:
-    the moment of the calibration's session, 0 to 1, that the arm is in: what follows that session's
-    time is then corrected as it was at that moment, and not at all where NaN.  rung: of a
-    diagnosis, the last unless given, of which the confirmed effects count.  The arm is fitted again
-    for exactly the effects that joints can correct (`deliver`).  keep_anyway: also where the
-    calibrated arm is no better than the drawn one.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    fit
+        A calibration, its cell, a diagnosis, a relative calibration, or its file.
+    targets
+        (m, n) commanded joints in the order of the path [rad, m], or measurements, whose
+        columns (payload, approach ...) then count.
+    nominal
+        The arm the controller believes in, its file or its name; that of the fit unless
+        given.
+    frame
+        Where the nominal arm stands, one of FRAMES.
+    tolerance
+        Of the position, and of the orientation times the lever [m].
+    most_change
+        Of a joint [rad; half as many m for a slide].
+    lever
+        What a radian counts as [m], NaN for the targets' own.
+    clock
+        The moment of the calibration's session, 0 to 1, that the arm is in: what follows
+        that session's time is then corrected as it was at that moment, and not at all where
+        NaN.
+    rung
+        Of a diagnosis, the last unless given, of which the confirmed effects count. The arm
+        is fitted again for exactly the effects that joints can correct (`deliver`).
+    keep_anyway
+        Also where the calibrated arm is no better than the drawn one.
 
+    Returns
+    -------
+    Compensation
+        Corrected joints, with a status of each target.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> q = mc.compensate(fit, targets, tolerance=2e-5).q
     """
     check_choices(frame, tolerance, most_change, lever, clock)

@@ -164,13 +164,34 @@ def deliver(
 ) -> Delivered:
     """What a format of `export`, or `compensate`, holds of a result, fitted for exactly that.
 
-    fit: a calibration, its cell, a diagnosis (of which the confirmed effects count), a relative
-    calibration, or the file of one.  to: a format of `export`, or compensate.  rung: of a
-    diagnosis, with all effects up to it.  clock: the moment of the measurements' session, 0 to 1,
-    that corrected targets are for; without it what follows that session's time is not corrected.
-    progress: called with a word on each stage.  Data, objective, losses, priors, fixed parameters
-    and held-out poses are those of the result.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    fit
+        A calibration, its cell, a diagnosis (of which the confirmed effects count), a
+        relative calibration, or the file of one.
+    to
+        A format of `export`, or compensate.
+    rung
+        Of a diagnosis, with all effects up to it.
+    clock
+        The moment of the measurements' session, 0 to 1, that corrected targets are for;
+        without it what follows that session's time is not corrected.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    Delivered
+        The result as the format holds it, with its own accuracy. Data, objective, losses,
+        priors, fixed parameters and held-out poses are those of the result.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> mc.deliver(fit, "urdf").to_dict()
     """
     if to not in DELIVERABLES:

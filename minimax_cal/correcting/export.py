@@ -54,17 +54,45 @@ def export(
     """The robot of a calibration in a format that other programs load.
 
     The geometry is fitted again for exactly the effects that the format carries, with the same
-    data and options; `deliver` tells its accuracy, and so does a notice where effects are missing.
-    fit: a calibration, its cell, a diagnosis, a relative calibration or a robot, or the file or
-    name of one.  to: urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.  path:
-    written to as well, where given.  urdf: a file whose joint origins are corrected, all else left
-    as it is; mjcf: one whose bodies, gains and springs are.  tip: last link of the chain in that
-    file.  experimental: agree to a format whose frames its maker does not document (moc).  rung: of
-    a diagnosis, the last unless given.  keep_anyway: also where the calibrated arm is no better
-    than the drawn one.  notify: called with what the format cannot hold and other
-    notices.  Lengths and angles are in the units of the format.  Raises CalibrationError for wrong
-    input.
+    data and options; `deliver` tells its accuracy, and so does a notice where effects are
+    missing.
 
+    Parameters
+    ----------
+    fit
+        A calibration, its cell, a diagnosis, a relative calibration or a robot, or the file
+        or name of one.
+    to
+        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.
+    path
+        Written to as well, where given.
+    urdf
+        A file whose joint origins are corrected, all else left as it is.
+    mjcf
+        One whose bodies, gains and springs are.
+    tip
+        Last link of the chain in that file.
+    experimental
+        Agree to a format whose frames its maker does not document (moc).
+    rung
+        Of a diagnosis, the last unless given.
+    keep_anyway
+        Also where the calibrated arm is no better than the drawn one.
+    notify
+        Called with what the format cannot hold and other notices.
+
+    Returns
+    -------
+    str
+        The file as text; lengths and angles are in the units of the format.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> text = mc.export(fit, to="urdf", path="arm.urdf")
     """
     if path is not None:

@@ -114,16 +114,41 @@ def diagnose(
 ) -> Diagnosis:
     """Say what is still wrong with a calibrated robot, and why, as far as the data can tell.
 
-    robot, data: loaded, or a name or path; data also as a list of paths, the campaigns of one arm,
-    each a session. seed, holdout: of the poses kept out of the fit, and their share;
-    holdout_by: a column (session, group ...) or region, whose poses are held out together.
-    instrument: u95 of a coordinate as 10um+2.5um/m, where the data do not say. exclude: effects
-    that are not to be considered. quick: leave no parts of the poses out in turn, so that there
-    is no claim outside the measured poses. jobs: processes that search parts of the poses, -1
-    for one a core. cluster: address of a Dask scheduler, as tcp://host:port, whose workers then
-    do it. progress: called with a word on each stage. Lengths of the result are in m, in mm where
-    a name says so. Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    robot, data
+        Loaded, or a name or path; data also as a list of paths, the campaigns of one arm,
+        each a session.
+    seed, holdout
+        Of the poses kept out of the fit, and their share.
+    holdout_by
+        A column (session, group ...) or region, whose poses are held out together.
+    instrument
+        u95 of a coordinate as 10um+2.5um/m, where the data do not say.
+    exclude
+        Effects that are not to be considered.
+    quick
+        Leave no parts of the poses out in turn, so that there is no claim outside the
+        measured poses.
+    jobs
+        Processes that search parts of the poses, -1 for one a core.
+    cluster
+        Address of a Dask scheduler, as tcp://host:port, whose workers then do it.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    Diagnosis
+        The causes and the error budget. Its lengths are in m, in mm where a name says so.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.diagnose("irb2600", "poses.csv", exclude=["backlash"]).summary())
     """
     began = time.perf_counter()

@@ -23,12 +23,31 @@ def diagnose_many(
 ) -> tuple[Diagnosis | CalibrationError, ...]:
     """Diagnose many sets of measurements.
 
-    robots: one for all, or one for each set.  data: as `diagnose` takes each.  jobs: processes, -1
-    for one a core, 1 for this one alone.  cluster: address of a Dask scheduler, as
-    tcp://host:port, whose workers then do it.  options: of `diagnose`, for all.  Returns a
-    diagnosis for each set in its order, or the error that says why there is none.  Raises
-    OptionError.
+    Parameters
+    ----------
+    robots
+        One for all, or one for each set.
+    data
+        As `diagnose` takes each.
+    jobs
+        Processes, -1 for one a core, 1 for this one alone.
+    cluster
+        Address of a Dask scheduler, as tcp://host:port, whose workers then do it.
+    options
+        Of `diagnose`, for all.
 
+    Returns
+    -------
+    tuple[Diagnosis | CalibrationError, ...]
+        A diagnosis for each set in its order, or the error that says why there is none.
+
+    Raises
+    ------
+    OptionError
+        For wrong input.
+
+    Examples
+    --------
     >>> found = mc.diagnose_many("irb120", ["cell1.csv", "cell2.csv"], holdout=0.2)
     """
     return do_many(diagnose, robots, data, jobs, cluster, options)

@@ -42,8 +42,7 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     return tuple(
         sentence
         for sentence in (
-            opening(found),
-            main,
+            *((main, opening(found)) if found.main else (opening(found), main)),
             minor(found),
             shrunk(found),
             remaining(found),
@@ -88,7 +87,7 @@ def unexplained(found: Diagnosis) -> str:
     guess = "the causes listed are a best guess" if sure else "the cause is unknown"
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
         return f"{left}: {guess}."
-    after = "after the causes below" if sure else "after geometry"
+    after = "after the causes above" if sure else "after geometry"
     return (
         f"the error {after} is not random ({left}: p = {found.structure:.1g}, significant below "
         f"{STRUCTURE:g}), and no known effect explains it; {guess}."
@@ -146,7 +145,8 @@ def minor(found: Diagnosis) -> str:
     few = len(small) <= MAX_NAMED_MINOR
     names = f" ({names_of(small)})" if few else ""
     many = "" if len(small) == 1 else "s, together"
-    keep = "" if few else f"; keep the {len(found.main)} above, the others gain {gain:.3f} mm"
+    above = "cause" if len(found.main) == 1 else f"{len(found.main)} causes"
+    keep = "" if few else f"; keep the {above} above, the others gain {gain:.3f} mm"
     return f"{len(small)} minor effect{many}{names} {size:.3f} mm{keep}."
 
 

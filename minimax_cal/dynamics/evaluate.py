@@ -73,9 +73,25 @@ def evaluate_motion(
 ) -> MotionEvaluation:
     """RMS torque that a motion diagnosis misses on other logs; nothing is fitted.
 
-    motion: loaded, or its path.  logs: files or runs.  Both sides pass the 8 Hz zero-phase filter,
-    at 25 rows a second.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    motion
+        Loaded, or its path.
+    logs
+        Files or runs.
 
+    Returns
+    -------
+    MotionEvaluation
+        Both sides pass the 8 Hz zero-phase filter, at 25 rows a second.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.evaluate_motion("motion.json", ["other.csv"]).table())
     """
     found = motion if isinstance(motion, MotionDiagnosis) else load_motion(motion)

@@ -362,8 +362,25 @@ def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
 
 
 def load_motion(path: Path | str) -> MotionDiagnosis:
-    """A motion diagnosis that `save` wrote.  path: of its JSON.  Raises CalibrationError.
+    """A motion diagnosis from its file.
 
+    Parameters
+    ----------
+    path
+        Of the JSON that `save` or `minimax-cal torques -o` wrote.
+
+    Returns
+    -------
+    MotionDiagnosis
+        The diagnosis.
+
+    Raises
+    ------
+    CalibrationError
+        For a file that is none.
+
+    Examples
+    --------
     >>> motion = mc.load_motion("motion.json")
     """
     try:

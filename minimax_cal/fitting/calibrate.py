@@ -81,27 +81,71 @@ def calibrate(
 ) -> Fit:
     """Calibrate a robot from measurements.
 
-    robot, data: loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
-    3), or a list of paths: the campaigns of one arm, each a session. objective: sum, minimax
-    (the worst target), point (the worst point), pose, or smr:K. qp: backend of the minimax QPs,
-    or a function from Problem to a verified Solution. holdout: share of the poses kept out of
-    the fit; seed: of that choice; holdout_by: a column (session, group ...) or region, whose
-    poses are held out together. instrument: u95 of a coordinate, as 10um+2.5um/m, where the
-    data do not say. cv: judge every pose by a fit without it, which is done anyway where fewer
-    than 20 poses are held out. fix, free: parameters as ``beta*``, a list or a text with
-    commas. only: offsets, for the joints' zero positions alone. priors: sigma of a parameter's
-    deviation from nominal, by name [m, rad], or a text as 0.5mm. method: of the least squares.
-    lever: what a radian counts as in the pose objective [m], the targets' own unless given.
-    hessian: gauss-newton or bfgs. distance: form of the distance constraints, two-sided,
-    squared or off; distance_tolerance: theirs [m], as measured unless given. resolution:
-    relative singular value that counts as not measured. effects: beyond geometry, as
-    joint_compliance:J2, or a diagnosis (or its file), whose confirmed effects are taken.
-    loss: square, huber, cauchy or tukey. trim: share of the points that may be set aside.
-    allow_large_changes: accept links that differ from the drawing by more than 5 % of the
-    reach, 5 degrees (alpha, beta) or 30 degrees (theta). simulated: the points may be exact.
-    progress: called with a word on each stage. Raises CalibrationError for wrong input; how the
-    numbers ended is in the result's `status`.
+    Parameters
+    ----------
+    robot, data
+        Loaded, or a name or path; data also as joints (m, n) and points (m, 3) or (m, k,
+        3), or a list of paths: the campaigns of one arm, each a session.
+    objective
+        sum, minimax (the worst target), point (the worst point), pose, or smr:K.
+    qp
+        Backend of the minimax QPs, or a function from Problem to a verified Solution.
+    holdout
+        Share of the poses kept out of the fit.
+    seed
+        Of that choice.
+    holdout_by
+        A column (session, group ...) or region, whose poses are held out together.
+    instrument
+        u95 of a coordinate, as 10um+2.5um/m, where the data do not say.
+    cv
+        Judge every pose by a fit without it, which is done anyway where fewer than 20 poses
+        are held out.
+    fix, free
+        Parameters as ``beta*``, a list or a text with commas.
+    only
+        offsets, for the joints' zero positions alone.
+    priors
+        Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 0.5mm.
+    method
+        Of the least squares.
+    lever
+        What a radian counts as in the pose objective [m], the targets' own unless given.
+    hessian
+        gauss-newton or bfgs.
+    distance
+        Form of the distance constraints, two-sided, squared or off.
+    distance_tolerance
+        Theirs [m], as measured unless given.
+    resolution
+        Relative singular value that counts as not measured.
+    effects
+        Beyond geometry, as joint_compliance:J2, or a diagnosis (or its file), whose
+        confirmed effects are taken.
+    loss
+        square, huber, cauchy or tukey.
+    trim
+        Share of the points that may be set aside.
+    allow_large_changes
+        Accept links that differ from the drawing by more than 5 % of the reach, 5 degrees
+        (alpha, beta) or 30 degrees (theta).
+    simulated
+        The points may be exact.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    Fit
+        The calibration; how the numbers ended is in its `status`.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.calibrate("irb2600", "poses.csv", objective="sum", holdout=0.3).summary())
     """
     options = Options(

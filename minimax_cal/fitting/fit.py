@@ -772,10 +772,25 @@ class Fit:
 
 
 def load_fit(path: Path | str) -> Fit:
-    """A fit, whole.  path: what `Fit.save` or `minimax-cal calibrate -o` wrote.
+    """A calibration from its file, whole.
 
-    Raises CalibrationError.
+    Parameters
+    ----------
+    path
+        What `Fit.save` or `minimax-cal calibrate -o` wrote.
 
+    Returns
+    -------
+    Fit
+        The calibration, whole.
+
+    Raises
+    ------
+    CalibrationError
+        For a file that is none.
+
+    Examples
+    --------
     >>> print(mc.load_fit("fit.json").summary())
     """
     return Fit.from_dict(saved_content(path), str(path))

@@ -28,11 +28,31 @@ def calibrate_many(
 ) -> tuple[Fit | CalibrationError, ...]:
     """Calibrate from many sets of measurements.
 
-    robots: one for all, or one for each set.  data: as `calibrate` takes each.  jobs: processes, -1
-    for one a core, 1 for this one alone.  cluster: address of a Dask scheduler, as
-    tcp://host:port, whose workers then do it.  options: of `calibrate`, for all.  Returns a fit for
-    each set in its order, or the error that says why there is none.  Raises OptionError.
+    Parameters
+    ----------
+    robots
+        One for all, or one for each set.
+    data
+        As `calibrate` takes each.
+    jobs
+        Processes, -1 for one a core, 1 for this one alone.
+    cluster
+        Address of a Dask scheduler, as tcp://host:port, whose workers then do it.
+    options
+        Of `calibrate`, for all.
 
+    Returns
+    -------
+    tuple[Fit | CalibrationError, ...]
+        A fit for each set in its order, or the error that says why there is none.
+
+    Raises
+    ------
+    OptionError
+        For wrong input.
+
+    Examples
+    --------
     >>> fits = mc.calibrate_many("irb120", ["monday.csv", "friday.csv"], objective="sum")
     """
     return do_many(calibrate, robots, data, jobs, cluster, options)

@@ -312,6 +312,8 @@ def qp_name(qp: QpSolver) -> str:
 
 def solver_of(qp: QpSolver, tolerance: float) -> tuple[Solver, tuple[str, ...]]:
     """The QP solver, and a notice where it is not the one that was named.  Raises OptionError."""
+    if not (isinstance(qp, str) or callable(qp)):
+        raise OptionError(f"qp={qp!r}: give the name of a backend, or a function")
     if not isinstance(qp, str):
         return from_nothing(named_answers(qp)), ()
     name, notices = usable(qp)
@@ -323,6 +325,11 @@ def named_answers(qp: QpFunction) -> QpFunction:
 
     def run(problem: Problem) -> Solution:
         answer = qp(problem)
+        if not isinstance(answer, Solution):
+            raise OptionError(
+                f"qp=: {qp_name(qp)} returned {type(answer).__name__}; return a "
+                "qp_backends.Solution"
+            )
         return answer if answer.backend else replace(answer, backend=qp_name(qp))
 
     return run

@@ -145,10 +145,31 @@ def bootstrap(
 ) -> Bootstrap:
     """Calibrate again on poses drawn from the training poses.
 
-    fit: of any objective but point.  replicates: draws of whole poses.  seed: of the draws.
-    progress: called with a word on progress.  Raises OptionError; DataError where most draws do not
-    determine the parameters.
+    Parameters
+    ----------
+    fit
+        Of any objective but point.
+    replicates
+        Draws of whole poses.
+    seed
+        Of the draws.
+    progress
+        Called with a word on progress.
 
+    Returns
+    -------
+    Bootstrap
+        Intervals of every parameter.
+
+    Raises
+    ------
+    OptionError
+        For wrong input.
+    DataError
+        Where most draws do not determine the parameters.
+
+    Examples
+    --------
     >>> print(mc.bootstrap(fit, replicates=200).table().text())
     """
     if not 2 <= replicates <= MAX_REPLICATES:

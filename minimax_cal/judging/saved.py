@@ -54,13 +54,31 @@ def evaluate(
 ) -> Accuracy:
     """Accuracy of a calibrated arm on new measurements in the same measurement frame.
 
-    source: a calibration, its cell, a diagnosis, a relative calibration, or the file of one.  data:
-    points, and the columns that effects look at; nothing is fitted to them, but for base and
-    targets of a relative calibration, which knows none.  rung: of a diagnosis (0 nominal, 1
-    geometric ...), the last unless given.  new_frame: the instrument or the base stands elsewhere
-    than in the calibration, so that its frame is fitted.  Errors of the result are in mm.  Raises
-    CalibrationError.
+    Parameters
+    ----------
+    source
+        A calibration, its cell, a diagnosis, a relative calibration, or the file of one.
+    data
+        Points, and the columns that effects look at; nothing is fitted to them, but for
+        base and targets of a relative calibration, which knows none.
+    rung
+        Of a diagnosis (0 nominal, 1 geometric ...), the last unless given.
+    new_frame
+        The instrument or the base stands elsewhere than in the calibration, so that its
+        frame is fitted.
 
+    Returns
+    -------
+    Accuracy
+        Errors, in mm.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.evaluate(fit, "new_poses.csv").rms_mm)
     """
     data = data if isinstance(data, Measurements) else read_measurements(data)

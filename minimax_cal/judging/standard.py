@@ -22,12 +22,31 @@ def iso9283(
 ) -> Iso9283:
     """Pose and distance accuracy of a calibration by the formulas of ISO 9283, before and after.
 
-    fit: a calibration, a diagnosis, a relative calibration, or the file of one.  data: file of the
-    measurements; the fit's own unless given.  nominal: robot before the calibration, file or name;
-    that of the fit unless given.  rung: of a diagnosis, the last unless given.  tcp: centroid of
-    the targets, one target (smr1), or a point (3,) in the last frame [m].  Raises CalibrationError
-    for wrong input.
+    Parameters
+    ----------
+    fit
+        A calibration, a diagnosis, a relative calibration, or the file of one.
+    data
+        File of the measurements; the fit's own unless given.
+    nominal
+        Robot before the calibration, file or name; that of the fit unless given.
+    rung
+        Of a diagnosis, the last unless given.
+    tcp
+        Centroid of the targets, one target (smr1), or a point (3,) in the last frame [m].
 
+    Returns
+    -------
+    Iso9283
+        Values by the clauses of the standard, before and after.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.iso9283("fit.json").summary())
     """
     saved = open_saved(fit, data or "", nominal, rung)

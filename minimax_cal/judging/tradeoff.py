@@ -264,11 +264,30 @@ def tradeoff(
 ) -> Tradeoff:
     """The choices between least squares and the worst point for a robot and its measurements.
 
-    robot, data: loaded, or a name or path; or a fit alone, whose measurements are taken as they
-    were split.  steps: compromises between the two.  qp, holdout, seed: as in `calibrate`.
-    progress: called with a word on each stage.  Raises CalibrationError for wrong input; how the
-    numbers ended is in the result's `status`.
+    Parameters
+    ----------
+    robot, data
+        Loaded, or a name or path; or a fit alone, whose measurements are taken as they were
+        split.
+    steps
+        Compromises between the two.
+    qp, holdout, seed
+        As in `calibrate`.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    Tradeoff
+        Fits between the sum and the worst target.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.tradeoff(mc.load_fit("fit.json"), steps=5).headline())
     """
     if not 0 <= steps <= MAX_STEPS:

@@ -21,8 +21,23 @@ LABELS = ("pose", "group")  # which mean something in their own file only
 def read_campaigns(paths: Sequence[Path | str]) -> Measurements:
     """The measurements of one file, or of several as sessions.
 
-    paths: in the order in which they were measured.  Raises DataError.
+    Parameters
+    ----------
+    paths
+        In the order in which they were measured.
 
+    Returns
+    -------
+    Measurements
+        Each file is a session.
+
+    Raises
+    ------
+    DataError
+        For wrong input.
+
+    Examples
+    --------
     >>> data = mc.read_campaigns(["march.csv", "june.csv"])
     """
     if not paths:

@@ -135,9 +135,27 @@ class Measurements:
 def measurements(q: Array, y: Array, **columns: Array) -> Measurements:
     """Measurements from arrays.
 
-    q: (m, n) [rad, m].  y: (m, 3) or (m, k, 3), NaN where not measured [m].  columns: optional
-    columns by their file name without the unit (`order`, `u95`), in SI.  Raises DataError.
+    Parameters
+    ----------
+    q
+        (m, n) [rad, m].
+    y
+        (m, 3) or (m, k, 3), NaN where not measured [m].
+    columns
+        Optional columns by their file name without the unit (`order`, `u95`), in SI.
 
+    Returns
+    -------
+    Measurements
+        Measurements in metres and radians.
+
+    Raises
+    ------
+    DataError
+        For wrong input.
+
+    Examples
+    --------
     >>> data = mc.measurements(q, y, order=range(len(q)))
     """
     q, y = real("q", q), real("y", y)
@@ -247,10 +265,24 @@ def check_u95(data: Measurements) -> Measurements:
 def read_measurements(path: Path | str) -> Measurements:
     """Measurements of a CSV file whose columns tell their units.
 
-    path: with joints q1_deg ... or q1_rad ... (slides q3_mm), points smr1_x_mm ... or smr1_x_m ...,
-    and what else is known (order, temperature_C ...).  The measurements have metres and radians.
-    Raises DataError.
+    Parameters
+    ----------
+    path
+        With joints q1_deg ... or q1_rad ... (slides q3_mm), points smr1_x_mm ... or
+        smr1_x_m ..., and what else is known (order, temperature_C ...).
 
+    Returns
+    -------
+    Measurements
+        The measurements have metres and radians.
+
+    Raises
+    ------
+    DataError
+        For wrong input.
+
+    Examples
+    --------
     >>> data = mc.read_measurements("poses.csv")
     """
     return measurements_in(read_rows(path))
@@ -340,8 +372,15 @@ def repeated(file: Rows, run: Array, source: Array) -> str:
 def write_measurements(path: Path | str, data: Measurements) -> None:
     """Write CSV that `read_measurements` reads.
 
-    path: of the file.  data: joints are written in radians (slides in mm), points in mm.
+    Parameters
+    ----------
+    path
+        Of the file.
+    data
+        Joints are written in radians (slides in mm), points in mm.
 
+    Examples
+    --------
     >>> mc.write_measurements("poses.csv", data)
     """
     write_whole(path, measurements_text(data))

@@ -251,8 +251,23 @@ def effects_from(content: Mapping[str, Any], source: str) -> Fitted:
 def load_cell(path: Path | str) -> Cell:
     """The calibrated cell of a file that `minimax-cal calibrate -o` wrote.
 
-    path: of the file.  Raises CalibrationError.
+    Parameters
+    ----------
+    path
+        Of the file.
 
+    Returns
+    -------
+    Cell
+        The arm in its place.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> mc.load_cell("fit.json").predict([[0, 0.3, 0.2, 0, 0.5, 0]])
     """
     return cell_from_dict(saved_content(path), str(path))

@@ -82,10 +82,29 @@ def simulate(
 ) -> Simulation:
     """Measure an imperfect copy of a robot at random poses, from a random place.
 
-    robot: loaded, or a name or path.  poses, targets: how many.  seed: of all that is random.
-    truth: how far the arm is from its drawing, and how well it is measured [m, rad].
-    Raises OptionError for counts that make no sense.
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path.
+    poses, targets
+        How many.
+    seed
+        Of all that is random.
+    truth
+        How far the arm is from its drawing, and how well it is measured [m, rad].
 
+    Returns
+    -------
+    Simulation
+        The measurements, and the true arm behind them.
+
+    Raises
+    ------
+    OptionError
+        For counts that make no sense.
+
+    Examples
+    --------
     >>> data = mc.simulate("irb2600", 60, truth=mc.Truth(noise=20e-6)).data
     """
     robot = robot if isinstance(robot, Robot) else load_robot(robot)

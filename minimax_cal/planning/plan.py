@@ -62,21 +62,71 @@ def plan(
 ) -> Plan:
     """Which poses of a robot to measure next, in which order, and how accurate they will make it.
 
-    robot: loaded, or a name or path.  poses: how many.  fit: a calibration whose robot, base,
-    targets and poses are the start.  data: poses measured already; without a fit they are
-    calibrated first.  criterion: D, A, E, G or I.  effects: fitted along with the geometry, as
-    joint_compliance:all.  separate: two effects that the poses are to tell apart instead.
-    tracker: (3,) in base axes [m], 3 m before the arm unless given.  targets: number on a circle of
-    100 mm; spots: (k, 3) in the flange instead [m].  normals: where reflectors look.  acceptance:
-    half angle of a reflector's cone [rad].  whole: every target seen at each pose.  reach,
-    elevation: limits of the instrument [m, rad].  joints: limits by joint index that narrow the
-    robot's [rad, m].  volume: (2, 3) corners of a box for the flange in base axes [m].  floor: its
-    height [m].  body: radius of the arm [m], a share of its reach unless given.  noise, per_metre:
-    of a coordinate and its growth with range [m, -]; jitter: of a joint [rad]; as the data show
-    them, else typical ones, unless given.  revisit: poses to go back to.  approach: both for
-    revisits from the other side.  candidates: how many poses to choose from.  seed: of all that is
-    random.  progress: called with a word on each stage.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path.
+    poses
+        How many.
+    fit
+        A calibration whose robot, base, targets and poses are the start.
+    data
+        Poses measured already; without a fit they are calibrated first.
+    criterion
+        D, A, E, G or I.
+    effects
+        Fitted along with the geometry, as joint_compliance:all.
+    separate
+        Two effects that the poses are to tell apart instead.
+    tracker
+        (3,) in base axes [m], 3 m before the arm unless given.
+    targets
+        Number on a circle of 100 mm.
+    spots
+        (k, 3) in the flange instead [m].
+    normals
+        Where reflectors look.
+    acceptance
+        Half angle of a reflector's cone [rad].
+    whole
+        Every target seen at each pose.
+    reach, elevation
+        Limits of the instrument [m, rad].
+    joints
+        Limits by joint index that narrow the robot's [rad, m].
+    volume
+        (2, 3) corners of a box for the flange in base axes [m].
+    floor
+        Its height [m].
+    body
+        Radius of the arm [m], a share of its reach unless given.
+    noise, per_metre
+        Of a coordinate and its growth with range [m, -].
+    jitter
+        Of a joint [rad]; as the data show them, else typical ones, unless given.
+    revisit
+        Poses to go back to.
+    approach
+        Both for revisits from the other side.
+    candidates
+        How many poses to choose from.
+    seed
+        Of all that is random.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    Plan
+        The poses in order, and the accuracy they promise.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.plan("irb2600", 40, tracker=(3.0, 0.0, 0.5)).headline())
     """
     options = PlanOptions(

@@ -51,20 +51,48 @@ def report(
 ) -> Path:
     """A page to sign of a calibration, a diagnosis, or both of the same measurements.
 
-    results: each itself or the file that it was saved to; a gap in a simulator may come with them,
-    a relative calibration and a motion diagnosis stand alone.  path: of the HTML, which needs no
-    network, or of a PDF, or of a PNG of the first page.  title: that of the robot unless given.
-    customer, author: who accepts, who measured.  date:
-    YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.  tolerance: what is required in mm, as
-    ``rms 0.2, max 0.5``; tolerance_for: inside or outside the measured poses. facts: a TOML file
-    with serial_number, controller, tool ...  rung: of a diagnosis, the last unless given.
-    deliver: formats of `export`, or compensate: the requirement is judged by what each reaches,
-    fitted for exactly what it carries; where a result holds effects and nothing is named, by
-    corrected targets.  pdf: printed to this file as well, by an installed Chromium, Chrome or Edge.
-    notify: called with what the reader should know of both together, which the page says too.
-    Lengths on the page are in mm, angles in mrad. Returns the path of the page.  Raises
-    CalibrationError for wrong input.
+    Parameters
+    ----------
+    results
+        Each itself or the file that it was saved to; a gap in a simulator may come with
+        them, a relative calibration and a motion diagnosis stand alone.
+    path
+        Of the HTML, which needs no network, or of a PDF, or of a PNG of the first page.
+    title
+        That of the robot unless given.
+    customer, author
+        Who accepts, who measured.
+    date
+        YYYY-MM-DD; SOURCE_DATE_EPOCH or today unless given.
+    tolerance
+        What is required in mm, as ``rms 0.2, max 0.5``.
+    tolerance_for
+        inside or outside the measured poses.
+    facts
+        A TOML file with serial_number, controller, tool ...
+    rung
+        Of a diagnosis, the last unless given.
+    deliver
+        Formats of `export`, or compensate: the requirement is judged by what each reaches,
+        fitted for exactly what it carries; where a result holds effects and nothing is
+        named, by corrected targets.
+    pdf
+        Printed to this file as well, by an installed Chromium, Chrome or Edge.
+    notify
+        Called with what the reader should know of both together, which the page says too.
 
+    Returns
+    -------
+    Path
+        The path of the page. Lengths on the page are in mm, angles in mrad.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> mc.report([fit, diagnosis], "report.html", author="A. Turing")
     """
     chosen = Chosen(title, customer, author, date, tolerance, tolerance_for, facts, rung,

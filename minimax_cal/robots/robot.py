@@ -569,9 +569,23 @@ PARSERS: dict[str, tuple[Callable[[str], Any], type[Exception]]] = {
 def load_robot(source: Path | str) -> Robot:
     """A built-in robot by name, or a robot file (.json, .toml, .yaml, .csv, .urdf).
 
-    source: name or path; ``robot.urdf#link`` names the last link of a chain.  The file says its
-    units; the robot has metres and radians.  Raises RobotError.
+    Parameters
+    ----------
+    source
+        Name or path; ``robot.urdf#link`` names the last link of a chain.
 
+    Returns
+    -------
+    Robot
+        The file says its units; the robot has metres and radians.
+
+    Raises
+    ------
+    RobotError
+        For wrong input.
+
+    Examples
+    --------
     >>> robot = mc.load_robot("irb2600")
     """
     path = Path(source)

@@ -37,9 +37,23 @@ class Commands:
 def load_commands(path: Path | str) -> Commands:
     """The command map that an export to mjcf wrote beside a file.
 
-    path: of the map.  It takes and gives the controller's joint values [rad, m].
-    Raises CalibrationError.
+    Parameters
+    ----------
+    path
+        Of the map.
 
+    Returns
+    -------
+    Commands
+        It takes and gives the controller's joint values [rad, m].
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> data.ctrl[:] = mc.load_commands("arm.commands.json")(q)
     """
     content = saved_content(path)

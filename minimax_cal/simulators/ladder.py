@@ -65,12 +65,35 @@ def simulator_gap(
 ) -> SimulatorGap:
     """Say how far a simulated arm is from the real one, and why, in the simulator itself.
 
-    model: an MJCF, or a URDF that MuJoCo loads.  data: measurements, or their file.  fit,
-    diagnosis: of the same arm; a diagnosis is made where neither is given.  write: where the
-    corrected model goes.  tip: last body of the arm, where the model has several.  holdout, seed:
-    of the poses kept out, for a new diagnosis.  progress: called with a word on each stage.
-    Lengths of the result are in mm, angles in mrad.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    model
+        An MJCF, or a URDF that MuJoCo loads.
+    data
+        Measurements, or their file.
+    fit, diagnosis
+        Of the same arm; a diagnosis is made where neither is given.
+    write
+        Where the corrected model goes.
+    tip
+        Last body of the arm, where the model has several.
+    holdout, seed
+        Of the poses kept out, for a new diagnosis.
+    progress
+        Called with a word on each stage.
 
+    Returns
+    -------
+    SimulatorGap
+        Lengths of the result are in mm, angles in mrad.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.simulator_gap("arm.xml", "poses.csv", write="corrected.xml").summary())
     """
     began = time.perf_counter()

@@ -64,23 +64,45 @@ def minimize_max(
 ) -> OptimizeResult:
     """Minimise over x the largest of several smooth functions.
 
-    fun: (n,) -> (m,).  x0: (n,).  jac: (n,) -> (m, n), or "cs" for the complex step (exact; fun
-    must take complex numbers), or "3-point" or "2-point" for finite differences (least accurate).
-    bounds, constraints: scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint; bounds also
-    as n pairs, None where open.
-    qp: name of a QP backend, or a function from Problem to a verified Solution.
-    args: further arguments of fun and jac.  tol: on the KKT residual, gradients taken relative to
-    the largest at x0.  maxiter: QPs at most.  callback: called with fun, nit, kkt after each QP.
+    Parameters
+    ----------
+    fun
+        (n,) -> (m,).
+    x0
+        (n,).
+    jac
+        (n,) -> (m, n), or "cs" for the complex step (exact; fun must take complex numbers),
+        or "3-point" or "2-point" for finite differences (least accurate).
+    bounds, constraints
+        scipy.optimize's Bounds, LinearConstraint, NonlinearConstraint; bounds also as n
+        pairs, None where open.
+    qp
+        Name of a QP backend, or a function from Problem to a verified Solution.
+    args
+        Further arguments of fun and jac.
+    tol
+        On the KKT residual, gradients taken relative to the largest at x0.
+    maxiter
+        QPs at most.
+    callback
+        Called with fun, nit, kkt after each QP.
 
-    A jac that is given is checked against differences of fun in a few directions, at x0 and at the
-    answer.
+    Returns
+    -------
+    OptimizeResult
+        x, fun (the largest), values (m,), success, status (as in `Status`, or unbounded, or
+        wrong_gradient), message, nit, nfev, njev, multipliers (m,) that sum to one,
+        constraint_multipliers (one row a bound or constraint, > 0 at the upper side and < 0
+        at the lower), kkt, violation, notes. A jac that is given is checked against
+        differences of fun in a few directions, at x0 and at the answer.
 
-    Returns x, fun (the largest), values (m,), success, status (as in `Status`, or unbounded, or
-    wrong_gradient), message, nit, nfev, njev,
-    multipliers (m,) that sum to one, constraint_multipliers (one row a bound or constraint, > 0
-    at the upper side and < 0 at the lower), kkt, violation, notes.
-    Raises OptionError for arguments that do not fit together.
+    Raises
+    ------
+    OptionError
+        For arguments that do not fit together.
 
+    Examples
+    --------
     >>> r = mc.minimize_max(lambda x: np.array([x[0] ** 2, (x[0] - 1.0) ** 2]), [3.0])
     >>> round(float(r.x[0]), 6)
     0.5

@@ -81,7 +81,11 @@ def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, findings=(first, *found.findings[1:]))
-        assert changed.headline().startswith(OPENINGS[verdict]), verdict
+        first_words = "Causes found" if verdict == "unknown" else OPENINGS[verdict]
+        if verdict in ("none", "not_repeatable"):
+            changed = replace(changed, findings=())
+        assert changed.headline().startswith(first_words), verdict
+        assert OPENINGS[verdict] in changed.headline()
         assert changed.summary().startswith(changed.headline())
     minor = replace(found.findings[-1], alternatives=(alternative,))
     main = replace(found, verdict="one_of", findings=(*found.findings[:-1], minor))
@@ -122,7 +126,7 @@ def test_minor_effects_take_one_line(found: Diagnosis) -> None:
         if "minor" in text
     ]  # fmt: skip
     assert line.startswith("6 minor effects, together ")
-    assert line.endswith("; keep the 3 above, the others gain 0.060 mm.")
+    assert line.endswith("; keep the 3 causes above, the others gain 0.060 mm.")
 
 
 def test_a_single_cause_is_one(found: Diagnosis) -> None:
@@ -204,7 +208,7 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
     told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
     assert "p = 1e-07, significant below 0.005" in told.headline()
-    assert told.headline().startswith("Unexplained: the error after the causes below is not random")
+    assert "Unexplained: the error after the causes above is not random" in told.headline()
     assert replace(told, findings=()).headline().startswith("Unexplained: the error after geometry")
     assert "below 0.005 are significant" in told.effects_table().title
     assert "the power is below 25" in told.rival_table().title

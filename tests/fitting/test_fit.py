@@ -200,3 +200,13 @@ def test_a_frame_of_parameters(robot: mc.Robot, noisy: Simulation) -> None:
     frame = mc.calibrate(robot, noisy.data, "sum").parameters.frame()
     assert list(frame["name"][:2]) == ["a1", "d1"]
     assert frame["identifiable"].sum() == 33
+
+
+@pytest.mark.parametrize(
+    ("qp", "says"),
+    [(lambda problem: problem.q, "returned ndarray"), (7, "give the name of a backend")],
+)
+def test_a_wrong_qp_is_an_error_in_words(qp: Any, says: str) -> None:
+    data = mc.simulate("irb2600", 40, 2, seed=1).data
+    with pytest.raises(mc.OptionError, match=says):
+        mc.calibrate("irb2600", data, objective="minimax", qp=qp)

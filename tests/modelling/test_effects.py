@@ -681,3 +681,20 @@ def test_the_simulator_has_the_gravity_of_the_laws(name: str, rng: np.random.Gen
         slope = energy(random_poses(robot, 5, np.random.default_rng(1)) + 1e-30j * np.eye(n)[j])
         found = gravity(robot, random_poses(robot, 5, np.random.default_rng(1)))[:, j]
         assert_allclose(found, -slope.imag / 1e-30, rtol=0, atol=EXACT * 1e4)
+
+
+def test_a_law_of_the_wrong_shape_is_an_error_in_words() -> None:
+    from minimax_cal.ground.errors import OptionError
+    from minimax_cal.modelling.effects.scene import Columns
+    from minimax_cal.modelling.effects.table import check_columns
+    from minimax_cal.reporting.tables import bare_scene
+
+    scene = bare_scene()
+    right = np.zeros((1, scene.joints, scene.poses))
+    check_columns("mine:J1", Columns(("c",), ("rad",), turn=right), scene)
+    with pytest.raises(
+        OptionError, match=r"effect mine:J1: turn has the shape .*; give \(1, 6, 1\)"
+    ):
+        check_columns("mine:J1", Columns(("c",), ("rad",), turn=right[:, :-1]), scene)
+    with pytest.raises(OptionError, match="its law returned ndarray; give Columns"):
+        check_columns("mine:J1", right, scene)

@@ -74,7 +74,7 @@ def test_nothing_found_no_order_and_one_target(targets: int, tmp_path: Path) -> 
     assert len(left.errors) == 1
     assert len(curves.residual_curve(left).y) == 1
     assert "no order" in curves.order_curve(left).title
-    assert diagnosis.verdict_of(found) == "nothing beyond geometry and noise was found"
+    assert diagnosis.verdict_of(found) == "no cause beyond geometry and noise"
 
 
 def test_backlash_is_drawn_against_the_last_move_and_is_gone_after() -> None:

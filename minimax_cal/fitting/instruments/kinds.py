@@ -47,15 +47,43 @@ def relative(
 ) -> RelativeCalibration:
     """Calibrate a robot from lengths, closures or poses.
 
-    robot, data: loaded, or a name or path.  progress: called with a word on each stage.  holdout:
-    share kept out of the fit.  seed: of that choice.  fix, free: names or patterns as ``beta*``.
-    offset: of lengths, fit a constant one of each wire.  known_distances: of closures, sockets A, B
-    and the distance of their centres [m].  lever: of poses, what a radian counts as [m]; the
-    file's own unless given.  priors: sigma of a parameter's deviation from nominal, by name [m,
-    rad], or a text as 5mm.  method: of the least squares.  resolution: relative singular value
-    that counts as not measured.  Raises CalibrationError for wrong input; how the numbers ended is
-    in the result's `status`.
+    Parameters
+    ----------
+    robot, data
+        Loaded, or a name or path.
+    progress
+        Called with a word on each stage.
+    holdout
+        Share kept out of the fit.
+    seed
+        Of that choice.
+    fix, free
+        Names or patterns as ``beta*``.
+    offset
+        Of lengths, fit a constant one of each wire.
+    known_distances
+        Of closures, sockets A, B and the distance of their centres [m].
+    lever
+        Of poses, what a radian counts as [m]; the file's own unless given.
+    priors
+        Sigma of a parameter's deviation from nominal, by name [m, rad], or a text as 5mm.
+    method
+        Of the least squares.
+    resolution
+        Relative singular value that counts as not measured.
 
+    Returns
+    -------
+    RelativeCalibration
+        The calibration; how the numbers ended is in its `status`.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.relative("irb2600", "wires.csv", holdout=0.1).headline())
     """
     chosen = RelativeOptions(

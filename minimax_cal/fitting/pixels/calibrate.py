@@ -69,18 +69,51 @@ def calibrate_pixels(
 ) -> PixelCalibration:
     """Calibrate a robot from what cameras saw.
 
-    robot: loaded, or a name or path.  pixels: detections.csv (pose, camera, target, u_px, v_px).
-    joints: joint values by pose.  camera: files of K and D by the cameras' names (OpenCV or ROS,
-    YAML).  board: places of the targets (target, x_mm, y_mm, z_mm); without it they are fitted, and
-    the drawing alone tells the scale.  progress: called with a word on each stage.  camera_on:
-    flange or ground; what fits better unless given.  fix_camera: hold the lenses as their files
-    say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.  holdout: share of the poses
-    kept out of the fit; seed: of that choice.  fix, free: names or patterns as ``beta*``.
-    resolution: relative singular value that counts as not measured.  allow_large_changes: accept an
-    arm that is another than the one drawn.  Raises CalibrationError for wrong input; how the
-    numbers ended is in the result's `status`: no_better where the drawing is known better than
-    these pixels tell the arm.
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path.
+    pixels
+        detections.csv (pose, camera, target, u_px, v_px).
+    joints
+        Joint values by pose.
+    camera
+        Files of K and D by the cameras' names (OpenCV or ROS, YAML).
+    board
+        Places of the targets (target, x_mm, y_mm, z_mm); without it they are fitted, and
+        the drawing alone tells the scale.
+    progress
+        Called with a word on each stage.
+    camera_on
+        flange or ground; what fits better unless given.
+    fix_camera
+        Hold the lenses as their files say.
+    camera_prior
+        How well these know them, as ``f 0.1%, c 2px``.
+    holdout
+        Share of the poses kept out of the fit.
+    seed
+        Of that choice.
+    fix, free
+        Names or patterns as ``beta*``.
+    resolution
+        Relative singular value that counts as not measured.
+    allow_large_changes
+        Accept an arm that is another than the one drawn.
 
+    Returns
+    -------
+    PixelCalibration
+        The calibration; its `status` is no_better where the drawing is known better than
+        these pixels tell the arm.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> fit = mc.calibrate_pixels("ur5", "detections.csv", "joints.csv", {"cam": "camera.yaml"})
     """
     began = time.perf_counter()

@@ -40,9 +40,23 @@ ALIKE = 1e-9  # two drawings are one to this [m, rad]
 def compare(a: Fit | Path | str, b: Fit | Path | str) -> Comparison:
     """What differs between two calibrations of an arm.
 
-    a, b: calibrations with their covariance, or their files, the earlier first.  Instrument and
-    reflectors may have moved.  Raises CalibrationError for wrong input.
+    Parameters
+    ----------
+    a, b
+        Calibrations with their covariance, or their files, the earlier first.
 
+    Returns
+    -------
+    Comparison
+        What differs. Instrument and reflectors may have moved.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> print(mc.compare("may.json", "june.json").summary())
     """
     fits = tuple(fit if isinstance(fit, Fit) else load_fit(fit) for fit in (a, b))

@@ -59,13 +59,35 @@ def check(
 ) -> Health:
     """Whether a calibration is still valid, and what has moved, from a few new poses.
 
-    fit: a calibration with its covariance, or its file.  data: new measurements.  tolerance: what
-    is required of the error, in mm, as "rms 0.2, max 0.5".  known: what is where it was at the
-    calibration: frame (the instrument), targets (the reflectors); reflectors on the foot, columns
-    base1_x_mm ... of both, fix the frame too.  All else is fitted again.  seed: of samples behind
-    the intervals.  simulated: the new points may be exact.  Raises CalibrationError for wrong
-    input.
+    Parameters
+    ----------
+    fit
+        A calibration with its covariance, or its file.
+    data
+        New measurements.
+    tolerance
+        What is required of the error, in mm, as "rms 0.2, max 0.5".
+    known
+        What is where it was at the calibration: frame (the instrument), targets (the
+        reflectors); reflectors on the foot, columns base1_x_mm ... of both, fix the frame
+        too. All else is fitted again.
+    seed
+        Of samples behind the intervals.
+    simulated
+        The new points may be exact.
 
+    Returns
+    -------
+    Health
+        Whether it is valid, with its confidence, and what moved.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
     >>> mc.check("fit.json", "ten_poses.csv", "rms 0.2").valid
     """
     limits, known = required(tolerance), checked_known(known)

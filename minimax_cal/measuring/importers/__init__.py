@@ -186,11 +186,28 @@ def import_files(
 ) -> Imported:
     """Measurements from files as trackers and controllers write them.
 
-    files: their paths.  joints: a file of joint values, where the points stand alone.  columns,
-    units, layout, decimal: what the files do not tell (the error asks for it), as q=deg or smr=mm;
-    of columns, a mapping with joints and no points is that of the file of joints.
-    The measurements have metres and radians.  Raises DataError, OptionError.
+    Parameters
+    ----------
+    files
+        Their paths.
+    joints
+        A file of joint values, where the points stand alone.
+    columns, units, layout, decimal
+        What the files do not tell (the error asks for it), as q=deg or smr=mm; of columns,
+        a mapping with joints and no points is that of the file of joints.
 
+    Returns
+    -------
+    Imported
+        The measurements have metres and radians.
+
+    Raises
+    ------
+    DataError, OptionError
+        For wrong input.
+
+    Examples
+    --------
     >>> data = mc.import_files(["points.txt"], "joints.txt", units="q=deg,smr=mm").data
     """
     if not files:

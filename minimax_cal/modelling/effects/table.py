@@ -71,9 +71,23 @@ EFFECTS: dict[str, Effect] = {
 def register(effect: Effect) -> Effect:
     """Add an effect of one's own to the library of this process.
 
-    effect: its law gives metres and radians per unit of each parameter.  Returns it.  Raises
-    OptionError for facts that are none.
+    Parameters
+    ----------
+    effect
+        Its law gives metres and radians per unit of each parameter.
 
+    Returns
+    -------
+    Effect
+        The same effect.
+
+    Raises
+    ------
+    OptionError
+        For facts that are none.
+
+    Examples
+    --------
     >>> mc.register(effect)
     """
     for fact, known in (("moves", MOVED), ("follows", DRIVERS)):
@@ -84,6 +98,21 @@ def register(effect: Effect) -> Effect:
             )
     EFFECTS[effect.name] = effect
     return effect
+
+
+def check_columns(label: str, found: object, scene: Scene) -> None:
+    """Raise OptionError for a law that gives no `Columns`, or of another shape than the scene's."""
+    if not isinstance(found, Columns):
+        raise OptionError(f"effect {label}: its law returned {type(found).__name__}; give Columns")
+    count = len(found.names)
+    wanted = {
+        "turn": (count, scene.joints, scene.poses),
+        "shift": (count, scene.targets, 3, scene.poses),
+    }
+    for name, shape in wanted.items():
+        part = np.shape(getattr(found, name))
+        if 0 not in part and part != shape:
+            raise OptionError(f"effect {label}: {name} has the shape {part}; give {shape}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +160,9 @@ class Term:
         if text not in scene.laws:
             if len(scene.laws) >= LAWS:  # a search looks at thousands, each a few times in a row
                 del scene.laws[next(iter(scene.laws))]
-            scene.laws[text] = EFFECTS[self.effect].columns(scene, self.place, self.choice)
+            found = EFFECTS[self.effect].columns(scene, self.place, self.choice)
+            check_columns(self.label, found, scene)
+            scene.laws[text] = found
         return scene.laws[text]
 
 

@@ -102,12 +102,34 @@ def fleet(
 ) -> Fleet:
     """Calibrate, or check, a folder of cells in one go; a cell that fails is one row.
 
-    path: a TOML file with ``[[cells]]``, each with name, robot and data, or fit and check, and what
-    ``[defaults]`` gives all; files are named from its folder.  out: folder for each cell's
-    calibration.  page: of the overview, HTML.  processes: on this machine, -1 for one a core.
-    cluster: address of a Dask scheduler instead.  progress: called for each cell.  Raises
-    CalibrationError for what is wrong with the file itself.
+    Parameters
+    ----------
+    path
+        A TOML file with ``[[cells]]``, each with name, robot and data, or fit and check,
+        and what ``[defaults]`` gives all; files are named from its folder.
+    out
+        Folder for each cell's calibration.
+    page
+        Of the overview, HTML.
+    processes
+        On this machine, -1 for one a core.
+    cluster
+        Address of a Dask scheduler instead.
+    progress
+        Called for each cell.
 
+    Returns
+    -------
+    Fleet
+        A row for each cell.
+
+    Raises
+    ------
+    CalibrationError
+        For what is wrong with the file itself.
+
+    Examples
+    --------
     >>> print(mc.fleet("cells.toml", page="fleet.html").summary())
     """
     if processes == 0 or not -1 <= processes <= MOST:

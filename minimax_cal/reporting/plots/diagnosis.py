@@ -11,6 +11,7 @@ import numpy as np
 from minimax_cal.diagnosing.curves import VIEWS, Curve, Leftover, order_curve, residual_curve
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.words import name_first
 from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.plots.figures import (
     AFTER,
@@ -33,20 +34,17 @@ COLOURS = dict(zip(VIEWS, (BEFORE, AFTER, "#999999"), strict=True))
 
 
 def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
-    """The gap as a waterfall, from the nominal robot down to the noise."""
+    """The error step by step, from the nominal robot down to the noise."""
     steps = diagnosis.ladder
     held = np.array([step.holdout.rms_mm for step in steps])
     train = np.array([step.train.rms_mm for step in steps])
     worst = np.array([step.holdout.max_mm for step in steps])
     at = np.arange(len(steps))
-    low, high = np.minimum(held[1:], held[:-1]), np.maximum(held[1:], held[:-1])
-    colours = [AFTER if fell else BEFORE for fell in held[1:] <= held[:-1]]
-    axes.barh(at[1:], high - low, left=low, height=0.5, color=colours, alpha=0.25)
-    axes.plot(held, at, "o", color="black", label="held-out RMS")
+    axes.plot(held, at, "o-", color=AFTER, lw=1.0, label="held-out RMS")
     axes.plot(train, at, "o", color="black", mfc="none", ms=9, label="training RMS")
     axes.plot(worst, at, "|", color="black", ms=11, mew=2, label="largest, held out")
     if diagnosis.floor.value > 0.0:
-        axes.axvline(diagnosis.floor.value, color="grey", ls="--", label="noise floor")
+        axes.axvline(diagnosis.floor.value, color="grey", ls="--", label="noise")
     numbers = np.concatenate([held, train, worst, [diagnosis.floor.value]])
     numbers = numbers[np.isfinite(numbers)]
     if numbers.min() > 0.0 and numbers.max() > 10.0 * numbers.min():
@@ -64,7 +62,7 @@ def draw_ladder(axes: Any, diagnosis: Diagnosis) -> None:
     right.tick_params(length=0)
     axes.set_xlabel("error (mm); on the right: held-out RMS")
     axes.grid(visible=True, axis="x", alpha=0.3)
-    outside(axes, 4)
+    outside(axes, 2)
 
 
 def outside(axes: Any, columns: int) -> None:
@@ -136,14 +134,14 @@ def draw_maps(part: Any, left: Leftover) -> None:
 
 def verdict_of(diagnosis: Diagnosis) -> str:
     """The verdict in a few words."""
-    names = [f.name for f in diagnosis.by_rung if f.established]
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    found = ", ".join(names[:3]) + more
+    names = [f.name for f in diagnosis.main]
+    shares = sum(f.share for f in diagnosis.main if f.share > 0.0)
+    found = f"{name_first(names, 3)} explains {100.0 * shares:.0f} % of the remaining error"
     return {
-        "none": "nothing beyond geometry and noise was found",
+        "none": "no cause beyond geometry and noise",
         "named": found,
         "one_of": f"{found} (or what looks like it)",
-        "unknown": f"cause not known; best guess {found}" if found else "cause not known",
+        "unknown": f"unexplained in part; {found}" if names else "unexplained",
         "not_repeatable": "does not return to the same place",
     }[diagnosis.verdict]
 
@@ -159,7 +157,9 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path | str) -> None:
     title = textwrap.fill(f"{diagnosis.robot}: {verdict_of(diagnosis)}", 110)
     figure.suptitle(title, fontweight="bold")
     parts: Any = figure.subfigures(2, 2, height_ratios=(4, 5), wspace=0.03, hspace=0.03)
-    titles = ("a  the gap, step by step", f"b  {residual.title}", f"c  {order.title}",
+    ends = (diagnosis.ladder[i].holdout.rms_mm for i in (0, -1))
+    fall = "a  RMS error from {:.3f} to {:.3f} mm".format(*ends)
+    titles = (fall, f"b  {residual.title}", f"c  {order.title}",
               "d  errors over the workspace (base frame)")  # fmt: skip
     for part, title in zip(parts.flat, titles, strict=True):
         part.suptitle(title, x=0.01, ha="left")
