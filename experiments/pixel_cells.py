@@ -7,7 +7,7 @@ no fit is judged by its own formulas.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,9 +17,12 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.judge import arms_apart
+from minimax_cal.fitting.pixels.judge import missed, tool_points
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.gravity import masses_of, torques
+from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
 
 SIZE = (2448, 2048)  # five megapixels
@@ -30,6 +33,11 @@ NOISE = 0.106  # of u and v [px]: 0.15 px together
 OFF_LENGTH, OFF_ANGLE = 0.5e-3, 1e-3  # of each link parameter [m, rad]
 MARGIN = 20.0  # from the edge of the image [px]
 POSES = 1000  # that an arm is judged by
+GEARS = 3e-4  # error of a gear once a turn, half of it twice a turn [rad]
+SPRINGS = np.array([0.0, 1.0, 1.0, 0.5, 0.0, 0.0]) * 1e-5  # bending of the joints [rad/Nm]
+ALL_OVER, WITHIN = 1.5, 0.05  # joints about a middle where poses are sought [rad]
+ASIDE = np.array([0.3, -1.2, 1.2, -1.0, -1.5, 0.3])  # the middle of poses to one side [rad]
+Law = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +58,7 @@ class Cell:
     """drawn, true: the arm.  q: (m, n).  points: (k, 3) targets in their own frame [m].
 
     place: (4, 4) of that frame in the base or on the flange.  pixel: (c, m, k, 2) [px], NaN where
-    a target is not in the image.
+    a target is not in the image.  law: where the joints truly are.
     """
 
     drawn: mc.Robot
@@ -62,6 +70,7 @@ class Cell:
     q: Array
     pixel: Array
     names: tuple[str, ...] = field(default_factory=tuple)
+    law: Law = np.asarray
 
 
 def board_points(corners: tuple[int, int] = BOARD, square: float = SQUARE) -> Array:
@@ -114,6 +123,24 @@ def looking(rng: np.random.Generator, distance: tuple[float, float], tilt: float
     return transform(turn, aim - away * turn[:, 2])
 
 
+def geared(rng: np.random.Generator) -> Law:
+    """Errors of six gears, once and twice a turn."""
+    size = GEARS * rng.uniform(0.5, 1.5, (2, 6)) * [[1.0], [0.5]]
+    phase = rng.uniform(0.0, 2.0 * np.pi, (2, 6))
+    return lambda q: q + size[0] * np.sin(q + phase[0]) + size[1] * np.sin(2.0 * q + phase[1])
+
+
+def bent(robot: mc.Robot, rng: np.random.Generator) -> Law:
+    """Joints that are compliant under gravity."""
+    spring = SPRINGS * rng.uniform(0.5, 1.5, 6)
+
+    def law(q: Array) -> Array:
+        links = kinematics.chain(robot.mdh, robot.turned(q), robot.prismatic)
+        return np.asarray(q + spring * torques(links, *masses_of(robot), robot.up).T)
+
+    return law
+
+
 def make_cell(
     rng: np.random.Generator,
     *,
@@ -127,11 +154,14 @@ def make_cell(
     tilt: float = 0.7,
     off: tuple[float, float] = (OFF_LENGTH, OFF_ANGLE),
     least: float = 0.6,
+    law: Law = np.asarray,
+    aside: bool = False,
 ) -> Cell:
     """A cell: poses where every camera sees most of the targets.
 
     distance: of the camera from the targets [m].  off: of the arm's links from their drawing [m,
-    rad].  least: share of the targets in an image.
+    rad].  least: share of the targets in an image.  law: where the joints truly are.  aside:
+    whether all poses are to one side.
     """
     drawn = mc.load_robot(robot)
     true = off_drawing(drawn, rng, *off)
@@ -142,6 +172,7 @@ def make_cell(
                        np.array([0.5 * drawn.reach(), 0.1, 0.05]))  # fmt: skip
     views = tuple(views) or (View(mounted if on_flange else stands),)
     place = stands if on_flange else mounted
+    away, middle = (WITHIN, ASIDE) if aside else (ALL_OVER, np.zeros(drawn.joints))
     q = np.zeros((0, drawn.joints))
     world = points @ place[:3, :3].T + place[:3, 3]
     while len(q) < poses:
@@ -152,16 +183,18 @@ def make_cell(
             goal = views[0].pose @ np.linalg.inv(relative) @ np.linalg.inv(place)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = drawn.inverse(goal, near=rng.uniform(-1.5, 1.5, (poses, drawn.joints)))
+            found = drawn.inverse(
+                goal, near=rng.uniform(-away, away, (poses, drawn.joints)) + middle
+            )
         found = (found + np.pi) % (2 * np.pi) - np.pi
-        share = np.mean([np.isfinite(seen_by(v, true, found, world, on_flange)[..., 0]).mean(axis=1)
-                         for v in views], axis=0)  # fmt: skip
+        seen = (seen_by(view, true, law(found), world, on_flange) for view in views)
+        share = np.mean([np.isfinite(each[..., 0]).mean(axis=1) for each in seen], axis=0)
         q = np.concatenate([q, found[share >= least]])
     q = q[:poses]
-    pixel = np.stack([seen_by(view, true, q, world, on_flange) for view in views])
+    pixel = np.stack([seen_by(view, true, law(q), world, on_flange) for view in views])
     pixel = pixel + noise * rng.normal(size=pixel.shape)
     names = tuple(f"c{i}" for i in range(len(points)))
-    return Cell(drawn, true, on_flange, views, points, place, q, pixel, names)
+    return Cell(drawn, true, on_flange, views, points, place, q, pixel, names, law)
 
 
 def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:
@@ -232,4 +265,5 @@ def camera_text(view: View) -> str:
 
 def arm_error(cell: Cell, arm: mc.Robot) -> float:
     """RMS error of an arm over the joints' whole range, base and tool fitted [mm]."""
-    return 1e3 * arms_apart(cell.true, arm, POSES)
+    q = random_joints(cell.true, (POSES,), np.random.default_rng(0))
+    return 1e3 * missed(arm, q, tool_points(cell.true, cell.law(q)))

@@ -25,8 +25,10 @@ from experiments.pixel_cells import (
     Cell,
     View,
     arm_error,
+    bent,
     board_points,
     data_of,
+    geared,
     make_cell,
     projected,
 )
@@ -56,6 +58,7 @@ REACHED = 0.1  # an arm so near to the true one has found its minimum [mm]
 WEAK_FOCAL, WEAK_DISTANCE = 8000.0, (1.8, 2.2)  # a tele lens: 0.25 mm a pixel [px], [m]
 WEAK_NOISES = (0.1, 0.3, 1.0)  # [px]
 WEAK_OFF = ((3e-4, 5e-4), (1e-4, 2e-4), (3e-5, 5e-5))  # of links from their drawing [m, rad]
+NARROW = 0.25  # tilt of the camera where all poses are to one side [rad]
 SIDE = 0.05  # of the one tag that a tele lens sees [m]
 
 
@@ -175,6 +178,14 @@ def outliers(job: Job) -> Found:
     return replace(found, named=f"{found.named}, {wrong.sum()} wrong")
 
 
+def lacking(job: Job, *, bends: bool, aside: bool) -> Found:
+    """An arm whose gears err, or whose joints bend, which no link holds."""
+    rng = np.random.default_rng([job.seed, 1])
+    law = bent(mc.load_robot("ur5"), rng) if bends else geared(rng)
+    cell = cell_of(job, law=law, aside=aside, **({"tilt": NARROW} if aside else {}))
+    return judged(cell, data_of(cell))
+
+
 WAYS: dict[str, Callable[[Job], Found]] = {
     "hand-eye alone, arm as drawn": hand_eye,
     "poses by PnP, then whole poses": whole_poses,
@@ -190,6 +201,10 @@ WAYS: dict[str, Callable[[Job], Found]] = {
     "two cameras, lenses freed": two_cameras,
     "tags of unknown place": unknown_tags,
     "5 % outliers, lenses freed": outliers,
+    "gear errors": partial(lacking, bends=False, aside=False),
+    "gear errors, poses to one side": partial(lacking, bends=False, aside=True),
+    "bending": partial(lacking, bends=True, aside=False),
+    "bending, poses to one side": partial(lacking, bends=True, aside=True),
 }
 
 
@@ -273,8 +288,8 @@ class Weak:
     seed: int
 
 
-def weak(job: Weak) -> tuple[float, float, float, bool]:
-    """Error of the drawn, the fitted and the delivered arm [mm]; whether the drawn one is kept."""
+def weak(job: Weak) -> tuple[float, float, float, float, bool]:
+    """Error of the drawn, fitted and delivered arm, and with a prior; whether the drawn is kept."""
     stands = transform(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
                        np.array([2.5, 0.0, 0.4]))  # fmt: skip
     view = View(stands, (WEAK_FOCAL, WEAK_FOCAL, *LENS[2:]), (-0.02, 0.1, 0.0, 0.0, 0.0))
@@ -283,13 +298,18 @@ def weak(job: Weak) -> tuple[float, float, float, bool]:
         points=board_points((2, 2), SIDE), distance=WEAK_DISTANCE, off=job.off, noise=job.noise,
         least=0.5,
     )  # fmt: skip
-    fit = fitted(cell.drawn, data_of(cell), PixelOptions(camera_on="ground"))
-    arms = (cell.drawn, fit.calibrated or fit.robot, fit.robot)
-    drawn, calibrated, out = (arm_error(cell, arm) for arm in arms)
-    return drawn, calibrated, out, fit.status is Status.NO_BETTER
+    fit, beside = (
+        fitted(cell.drawn, data_of(cell), PixelOptions(camera_on="ground", drawn_prior=prior))
+        for prior in (False, True)
+    )
+    arms = (cell.drawn, fit.calibrated or fit.robot, fit.robot, beside.robot)
+    drawn, calibrated, out, prior = (arm_error(cell, arm) for arm in arms)
+    return drawn, calibrated, out, prior, fit.status is Status.NO_BETTER
 
 
-def weak_table(jobs: Sequence[Weak], found: Sequence[tuple[float, float, float, bool]]) -> Table:
+def weak_table(
+    jobs: Sequence[Weak], found: Sequence[tuple[float, float, float, float, bool]]
+) -> Table:
     """What comes out where pixels are weak."""
     rows = []
     for off, noise in dict.fromkeys((job.off, job.noise) for job in jobs):
@@ -298,17 +318,18 @@ def weak_table(jobs: Sequence[Weak], found: Sequence[tuple[float, float, float, 
             for job, one in zip(jobs, found, strict=True)
             if (job.off, job.noise) == (off, noise)
         ]
-        drawn, calibrated, out = np.array([one[:3] for one in mine]).T
-        kept = sum(one[3] for one in mine)
+        drawn, calibrated, out, prior = np.array([one[:4] for one in mine]).T
+        kept = sum(one[4] for one in mine)
         drawing = f"{1e3 * off[0]:g} mm, {1e3 * off[1]:g} mrad"
         means = (drawn.mean(), calibrated.mean(), out.mean())
-        rows.append((drawing, noise, *means, (out / drawn).max(), kept, len(mine)))
+        rows.append((drawing, noise, *means, (out / drawn).max(), prior.mean(),
+                     (prior / drawn).max(), kept, len(mine)))  # fmt: skip
     return Table(
         "one tag before a tele lens at 2 m, 0.25 mm a pixel: arm errors, RMS mm",
         ("drawing off by", "noise px", "drawn", "fitted", "delivered", "worst over drawn",
-         "drawn kept", "of"),
+         "with the prior", "its worst over drawn", "drawn kept", "of"),
         tuple(rows),
-        ("", "g", ".3f", ".3f", ".3f", ".3f", "d", "d"),
+        ("", "g", ".3f", ".3f", ".3f", ".3f", ".3f", ".3f", "d", "d"),
     )  # fmt: skip
 
 
@@ -334,8 +355,9 @@ def main(study: Study) -> None:
         },
         "starts": [{"depths_mm": one, "pixels_mm": other} for one, other in reached],
         "weak": [
-            {"drawn_mm": drawn, "fitted_mm": own, "delivered_mm": out, "kept": bool(held)}
-            for drawn, own, out, held in kept
+            {"drawn_mm": drawn, "fitted_mm": own, "delivered_mm": out, "prior_mm": prior,
+             "kept": bool(held)}
+            for drawn, own, out, prior, held in kept
         ],
     }  # fmt: skip
     study.save(tables, plain(content))

@@ -73,7 +73,7 @@ PIXEL_FILES = stacked(
         help="The places of the targets on a board (CSV): target, x_mm, y_mm, z_mm [default: tags "
         "of unknown place].",
     ),
-    options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior"),
+    options_from(PixelOptions, "camera_on", "fix_camera", "camera_prior", "drawn_prior"),
 )
 
 
@@ -112,6 +112,7 @@ def calibrate_command(
     camera_on: str,
     fix_camera: bool,
     camera_prior: str,
+    drawn_prior: bool,
     details: bool,
     to: Output,
     **chosen: Any,
@@ -122,7 +123,12 @@ def calibrate_command(
     """
     if pixels or joints or camera or board:
         files = PixelFiles(data, pixels, joints, tuple(camera), board)
-        lens = {"camera_on": camera_on, "fix_camera": fix_camera, "camera_prior": camera_prior}
+        lens = {
+            "camera_on": camera_on,
+            "fix_camera": fix_camera,
+            "camera_prior": camera_prior,
+            "drawn_prior": drawn_prior,
+        }
         return by_cameras(robot, files, to, lens, chosen, details=details)
     if not data:
         raise click.UsageError(

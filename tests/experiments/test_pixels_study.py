@@ -40,9 +40,10 @@ def test_a_bad_start_is_reached_from_the_poses_of_images() -> None:
 
 def test_weak_pixels_leave_the_drawn_arm() -> None:
     job = Weak(WEAK_OFF[1], 1.0, 0)
-    drawn, fitted, out, kept = weak(job)
+    drawn, fitted, out, prior, kept = weak(job)
     assert kept
     assert out == pytest.approx(drawn)
     assert fitted > drawn
-    (row,) = weak_table([job], [(drawn, fitted, out, kept)]).rows
+    assert prior < 1.03 * drawn
+    (row,) = weak_table([job], [(drawn, fitted, out, prior, kept)]).rows
     assert np.allclose(row[5], 1.0)

@@ -15,6 +15,7 @@ from experiments.pixel_cells import (
     arm_error,
     board_points,
     data_of,
+    geared,
     make_cell,
     projected,
 )
@@ -302,12 +303,60 @@ def test_a_change_that_noise_makes_up_is_kept_back(ground: Cell) -> None:
     assert arm_error(still, fit.robot) < 1e-6 < arm_error(still, fit.calibrated)
 
 
-def test_claims_compare_sigma_drawing_and_change() -> None:
-    assert Claim(0.1, 1.0, 1.0).is_better
-    assert not Claim(1.1, 1.0, 5.0).is_better
-    assert not Claim(0.1, 1.0, 0.15).is_better
-    assert "the calibrated arm is better" in Claim(1e-4, 1e-3, 1e-3).sentence()
-    assert "keep the drawn arm" in Claim(1e-4, 1e-3, 1e-4).sentence()
+@pytest.mark.parametrize("aside", [False, True], ids=["all over", "to one side"])
+def test_sigmas_count_what_no_link_holds(aside: bool) -> None:
+    """Gears err: the arm's errors are as large as is claimed, also where no pose was measured."""
+    more = {"aside": aside, "tilt": 0.25 if aside else 0.7}
+    cells = [cell_of(seed, law=geared(np.random.default_rng(seed)), **more) for seed in range(4)]
+    fits = [fitted(cell.drawn, data_of(cell), PixelOptions()) for cell in cells]
+    ratio = np.array([
+        arm_error(cell, fit.calibrated) / (1e3 * fit.claim.sigma)
+        for cell, fit in zip(cells, fits, strict=True)
+    ])  # fmt: skip
+    assert 0.7 < np.sqrt((ratio**2).mean()) < 1.4
+
+
+def test_a_drawing_as_a_prior_helps_weak_pixels() -> None:
+    errors, ratio = [], []
+    for seed in range(6):
+        cell = cell_of(seed, noise=5.0, off=(0.3e-3, 0.5e-3))
+        plain = fitted(cell.drawn, data_of(cell), PixelOptions())
+        fit = fitted(cell.drawn, data_of(cell), PixelOptions(drawn_prior=True))
+        arms = (fit.calibrated, plain.calibrated, cell.drawn)
+        errors.append([arm_error(cell, arm) for arm in arms])
+        ratio.append(errors[-1][0] / (1e3 * fit.claim.sigma))
+        assert fit.claim.sigma < plain.claim.sigma
+        assert fit.pixels["holdout"][0] < 1.1 * plain.pixels["holdout"][0]
+    prior, pixels, drawn = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert prior < 0.9 * min(pixels, drawn)
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.5
+
+
+def test_a_drawing_without_error_stays_with_a_prior() -> None:
+    cell = cell_of(5, off=(0.0, 0.0))
+    fit = fitted(cell.drawn, data_of(cell), PixelOptions(drawn_prior=True))
+    assert fit.status is Status.NO_BETTER
+    assert fit.robot is cell.drawn
+
+
+@pytest.mark.parametrize("size", [1.003, 0.997])
+def test_a_board_slightly_off_is_named_with_its_size(size: float) -> None:
+    cell = cell_of(3, on_flange=False, off=(0.3e-3, 0.5e-3))
+    data = data_of(cell)
+    fit = fitted(cell.drawn, replace(data, board=size * data.board), PixelOptions())
+    assert any("measure its squares" in text for text in (*fit.notices, fit.reason))
+    found = fit.instrument["lengths_over_drawn"]
+    assert abs(1.0 + found["share"] - size) < 3.0 * found["sigma"] < 2e-3
+    right = fitted(cell.drawn, data, PixelOptions())
+    assert not any("measure its squares" in text for text in (*right.notices, right.reason))
+
+
+def test_claims_compare_sigma_and_drawing() -> None:
+    assert Claim(0.1, 1.0, 1.0, 0.9).is_better
+    assert not Claim(1.1, 1.0, 5.0, 1.0).is_better
+    assert not Claim(0.1, 1.0, 0.15, 0.05).is_better
+    assert "the calibrated arm is better" in Claim(1e-4, 1e-3, 1e-3, 1e-3).sentence()
+    assert "keep the drawn arm" in Claim(1e-4, 1e-3, 1e-4, 0.0).sentence()
 
 
 def test_a_result_comes_back_from_its_file(ground: Cell) -> None:

@@ -17,11 +17,10 @@ from minimax_cal.fitting.instruments.options import Progress, silent
 from minimax_cal.fitting.options import listed
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
+from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
 from minimax_cal.fitting.pixels.fit import (
     PixelFit,
-    covariance_of,
     fit_pixels,
-    link_covariance,
     right,
 )
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
@@ -30,11 +29,12 @@ from minimax_cal.fitting.pixels.options import PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import (
     check_start,
     contradiction,
-    lens_notices,
+    file_notices,
     outlier_notices,
 )
 from minimax_cal.fitting.pixels.result import PIXELS, PixelCalibration
 from minimax_cal.fitting.pixels.start import from_far, start_scene
+from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
@@ -60,6 +60,7 @@ def calibrate_pixels(
     camera_on: str = "",
     fix_camera: bool = False,
     camera_prior: str = "",
+    drawn_prior: bool = False,
     holdout: float = 0.2,
     seed: int = 0,
     fix: str | Sequence[str] = (),
@@ -90,6 +91,8 @@ def calibrate_pixels(
         Hold the lenses as their files say.
     camera_prior
         How well these know them, as ``f 0.1%, c 2px``.
+    drawn_prior
+        Take the drawing as a prior, as well as the robot's `drawn_within` says or better.
     holdout
         Share of the poses kept out of the fit.
     seed
@@ -121,6 +124,7 @@ def calibrate_pixels(
         camera_on=camera_on,
         fix_camera=fix_camera,
         camera_prior=camera_prior,
+        drawn_prior=drawn_prior,
         holdout=holdout,
         seed=seed,
         fix=listed(fix),
@@ -151,18 +155,18 @@ def fitted(
     fit = fitted_on(robot, train, options, progress)
     progress("sigmas")
     _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
-    covariance = covariance_of(fit, group.reshape(-1))
+    sure = uncertainty_of(robot, fit, group.reshape(-1))
+    length = np.arange(5 * robot.joints) < 2 * robot.joints  # known already where by_drawing
+    drawing = Drawing.of(robot, fit, sure, ~(length & fit.by_drawing))
+    scale = scale_of(robot, fit, sure)
+    if options.drawn_prior:
+        fit, sure = drawing.beside(fit, sure)
     seen = judged_pixels(robot, data, held, fit)
     arm = robot.with_mdh(fit.scene.mdh[0])
-    claim = Claim(
-        position_sigma(arm, link_covariance(robot, fit, covariance)),
-        drawn_sigma(robot),
-        arms_apart(robot, arm),
-    )
-    status = fit.found.status[0]
-    wrong = contradiction(robot, train, fit, options)
-    reason = wrong
-    if wrong:
+    claim = claimed(robot, arm, sure, drawing.share)
+    reason, status = contradiction(robot, train, fit, scale, options), fit.found.status[0]
+    told = () if reason else file_notices(train, fit, scale)
+    if reason:
         status = Status.FAILED
     elif not claim.is_better and status is not Status.FAILED:
         status, reason = Status.NO_BETTER, kept_because(claim)
@@ -174,20 +178,16 @@ def fitted(
         status=status,
         iterations=int(fit.found.iterations[0]),
         seconds=time.perf_counter() - began,
-        parameters=parameters_of(robot, fit, covariance),
+        parameters=parameters_of(robot, fit, sure.covariance),
         errors=seen.errors,
         numbers={key: 2 * sum(accuracy(error).counts) for key, error in seen.errors.items()},
         turns={},
-        instrument=placed(data, fit),
+        instrument=placed(data, fit, scale),
         identification=fit.identification,
         position_sigma=claim.sigma,
         beyond=(),
         notices=(
-            *data.notices,
-            *limit_notices(robot, data.at),
-            *said,
-            *notices_of(fit, held),
-            *([] if wrong else lens_notices(robot, train, fit)),
+            *data.notices, *limit_notices(robot, data.at), *said, *notices_of(fit, held), *told,
             *outlier_notices(data, seen.aside),
         ),
         provenance=Provenance.of(
@@ -199,21 +199,31 @@ def fitted(
         set_aside=set_aside(data, seen.aside),
         with_them=accuracy(seen.whole) if len(seen.aside) else None,
         reason=reason,
-    )
+    )  # fmt: skip
+
+
+def claimed(robot: Robot, arm: Robot, sure: Uncertainty, share: float) -> Claim:
+    """What is known of the drawn and the calibrated arm.  share: as in `Drawing`."""
+    shown = drawn_sigma(robot, sure.lack, share) if share else 0.0
+    drawn = drawn_sigma(robot, sure.lack)
+    return Claim(position_sigma(arm, sure), drawn, arms_apart(robot, arm), shown)
 
 
 def kept_because(claim: Claim) -> str:
     """Why the drawn arm is kept."""
+    mm = claim.texts()
+    why = (
+        f"the calibrated arm, known to {mm['sigma']}, differs from the drawn one by "
+        f"{mm['change']}, which shows the drawing to be off by {mm['shown']}: too little to be sure"
+    )
     if claim.sigma >= claim.drawn:
-        return (
-            f"the drawing is known better ({1e3 * claim.drawn:#.3g} mm) than these pixels tell the "
-            f"arm ({1e3 * claim.sigma:#.3g} mm): the drawn arm is kept; take more images, nearer "
-            "and more tilted, or say how well the drawing is known (drawn_within)"
+        why = (
+            f"the drawing is known better ({mm['drawn']}) than these pixels tell the arm "
+            f"({mm['sigma']})"
         )
     return (
-        f"the calibrated arm differs from the drawn one by {1e3 * claim.change:#.3g} mm, no more "
-        f"than pixels that tell it to {1e3 * claim.sigma:#.3g} mm make up: the drawn arm is kept; "
-        "take more images, nearer and more tilted"
+        f"{why}: the drawn arm is kept; take more images, nearer and more tilted, or say how well "
+        "the drawing is known (drawn_within)"
     )
 
 
@@ -324,7 +334,7 @@ def parameters_of(robot: Robot, fit: PixelFit, covariance: Array) -> tuple[Param
     return tuple(p for p in every if not p.name.startswith("base_"))
 
 
-def placed(data: PixelData, fit: PixelFit) -> dict[str, Any]:
+def placed(data: PixelData, fit: PixelFit, scale: Scale | None) -> dict[str, Any]:
     """For JSON: the cameras, the lenses, and the board or the targets."""
     x = fit.scene
     cameras = {}
@@ -343,6 +353,8 @@ def placed(data: PixelData, fit: PixelFit) -> dict[str, Any]:
     else:
         out["targets_mm"] = dict(zip(data.targets, (1e3 * x.points[0]).tolist(), strict=True))
         out["scale"] = "as drawn" if fit.by_drawing else "given"
+    if scale is not None:
+        out["lengths_over_drawn"] = {"share": scale.share, "sigma": scale.sigma}
     return out
 
 

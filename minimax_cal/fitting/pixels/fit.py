@@ -9,7 +9,7 @@ import numpy as np
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.options import Progress
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.identify import gram_of_pixels, identified, lengths_of
+from minimax_cal.fitting.pixels.identify import identified, lengths_of
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started
@@ -20,7 +20,7 @@ from minimax_cal.modelling.model import Prior
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
-from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits, solve_normal
+from minimax_cal.solvers.least_squares import METHODS, LeastSquares, Limits
 from minimax_cal.solvers.status import Status
 
 TYPICAL = 1.1774  # median of the length of two normal errors over their sigma [Rayleigh]
@@ -261,74 +261,3 @@ def check_count(train: PixelData, unknowns: int, links: int) -> None:
             f"{unknowns} unknown parameters, {links} of links, need at least {needed} poses; take "
             "more images, hold out fewer or fix parameters (fix)"
         )
-
-
-def scores(model: PixelModel, x: Scene, group: Array) -> tuple[Array, Array]:
-    """Gradients (g, free) and Gram matrices (g, free, free) of the pixels of each group.
-
-    group: (N,) numbers from 0.
-    """
-    error, rows = model.rows(x, model.active)
-    root = np.sqrt(model.weight)
-    error, rows = error * root, rows * root
-    count = int(group.max()) + 1
-    gradient, gram = np.zeros((count, len(rows))), np.zeros((count, len(rows), len(rows)))
-    for each in range(count):
-        mine = group == each
-        part = rows[..., mine].reshape(len(rows), -1)
-        gradient[each], gram[each] = part @ error[:, mine].reshape(-1), part @ part.T
-    return gradient, gram
-
-
-def covariance_of(fit: PixelFit, group: Array) -> Array:
-    """Covariance (p, p) of all parameters [SI, px], NaN where not identified.
-
-    The jackknife over groups of pixels [Bell and McCaffrey 2002], since the errors of one image go
-    together; a prior on a lens is as uncertain as it says; so is a lens that is held.
-    group: (N,) of the training pixels, numbers from 0.
-    """
-    model, x, active = fit.model, fit.scene, fit.active
-    gradient, gram = scores(model, x, group)
-    prior = model.prior.weight[active]
-    bread = gram.sum(axis=0) + np.diag(prior)
-    cover = solve_normal(bread, np.eye(len(bread)))
-    counted = [i for i in range(len(gram)) if gram[i].any()]
-    change = np.stack([solve_normal(bread - gram[i], gradient[i][:, None])[:, 0] for i in counted])
-    share = (len(counted) - 1) / len(counted)
-    found = share * change.T @ change + cover @ np.diag(fit.noise**2 * prior) @ cover
-    lens = np.arange(len(active)) >= len(active) - x.lens[0].size
-    if fit.held:
-        shift = shift_by(fit, lens, fit.lens_sigma.reshape(-1))
-        found = found + shift @ shift.T
-    covariance = np.full((len(active),) * 2, np.nan)
-    covariance[np.ix_(active, active)] = found
-    return covariance
-
-
-def shift_by(fit: PixelFit, held: Array, sigma: Array) -> Array:
-    """(free, h) how far the parameters go when each of the held ones is wrong by its sigma.
-
-    held: (p,) mask of h that were not fitted.  sigma: (h,).
-    """
-    model = fit.model
-    gram = gram_of_pixels(model, fit.scene, fit.active | held)
-    bread = gram + np.diag(np.where(fit.active, model.prior.weight, 0.0))
-    mixed = gram[np.ix_(fit.active, held)]
-    return np.asarray(-solve_normal(bread[np.ix_(fit.active, fit.active)], mixed) * sigma)
-
-
-def link_covariance(robot: Robot, fit: PixelFit, covariance: Array) -> Array:
-    """Covariance (5n, 5n) of all links: those that were not fitted are off as drawings are.
-
-    What pixels take for others moves these along; where it moves no position, it counts for none.
-    covariance: (p, p), NaN where not fitted.
-    """
-    links = fit.model.names.links
-    held = links & ~fit.active
-    length = lengths_of(fit.model.names)[held]
-    sigma = np.where(length, *robot.drawn_within)
-    off = np.zeros((len(links), int(held.sum())))
-    off[fit.active] = shift_by(fit, held, sigma)
-    off[held] = np.diag(sigma)
-    whole = np.nan_to_num(covariance) + off @ off.T
-    return np.asarray(whole[np.ix_(links, links)])

@@ -10,53 +10,89 @@ from dataclasses import dataclass
 import numpy as np
 
 from minimax_cal.fitting.instruments.rows import arm_at, state_of
+from minimax_cal.fitting.pixels.uncertainty import Lack, Uncertainty
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import measurements
+from minimax_cal.modelling.lack import by_pose
 from minimax_cal.modelling.model import model_of
+from minimax_cal.modelling.parameters import zero_positions
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.sampling import random_joints
 
 POSES = 300  # over the joints' whole range
+MARGIN = 2.0 / 3.0  # of the drawing's sigma: an arm less sure may be worse than drawn
 TOOL = np.array([0.0, 0.0, 0.1])  # a point beside the last axes, in the flange [m]
-CLEAR = 2.0  # times its sigma: a change of the arm that pixels cannot have made up (1 of 100)
 
 
-def arms_apart(one: Robot, other: Robot, poses: int = POSES, tool: Array = TOOL) -> float:
-    """RMS distance of a tool's point on two arms, base and tool of the other fitted [m]."""
+def missed(robot: Robot, q: Array, point: Array) -> float:
+    """RMS distance of points of a tool from where an arm has them, base and tool fitted [m].
+
+    q: (m, n).  point: (m, 3) [m].
+    """
+    fit = fit_base(model_of(robot, measurements(q, point)), robot.mdh)
+    return float(np.sqrt(fit.mean_square))
+
+
+def tool_points(robot: Robot, q: Array) -> Array:
+    """(m, 3) of a tool's point at joint values (m, n) [m]."""
+    pose = robot.pose(q)
+    return np.asarray(pose[:, :3, :3] @ TOOL + pose[:, :3, 3])
+
+
+def arms_apart(one: Robot, other: Robot, poses: int = POSES) -> float:
+    """`missed` by one arm of the points of another, over the joints' range [m]."""
     q = random_joints(one, (poses,), np.random.default_rng(0))
-    pose = one.pose(q)
-    point = pose[:, :3, :3] @ tool + pose[:, :3, 3]
-    data = measurements(q, point)
-    return float(np.sqrt(fit_base(model_of(other, data), other.mdh).mean_square))
+    return missed(other, q, tool_points(one, q))
 
 
-def position_rows(robot: Robot, tool: Array = TOOL) -> Array:
-    """(5n, 3m) motion of a tool's point by each link parameter, without what base and tool take."""
+def position_error(robot: Robot, links: Array, moved: Array, lack: Lack) -> float:
+    """RMS over the joints' range of a position's standard deviation, base and tool fitted [m].
+
+    links: (5n, 5n) covariance of the link parameters, besides what the lack does.  moved: (5n, c)
+    how each factor of the lack moves them.
+    """
     q = random_joints(robot, (POSES,), np.random.default_rng(0))
     arm = arm_at(robot, q)
-    every = arm.jacobian(state_of(robot.mdh, tool, np.zeros(0)))[0].reshape(3 * len(q), -1)
-    links = 5 * robot.joints
-    u, size, _ = np.linalg.svd(every[:, links:], full_matrices=False)
+    every = arm.jacobian(state_of(robot.mdh, TOOL, np.zeros(0)))[0]
+    joints = every[..., zero_positions(robot.prismatic)]
+    turned, _ = by_pose(robot, arm.q, joints)
+    parts = (every, turned, joints)
+    every, turned, joints = (part.reshape(3 * len(q), -1) for part in parts)
+    u, size, _ = np.linalg.svd(every[:, 5 * robot.joints :], full_matrices=False)
     taken = u[:, size > 1e-9 * size[0]]
-    rows = every[:, :links]
-    return np.asarray((rows - taken @ (taken.T @ rows)).T)
+
+    def left(rows: Array) -> Array:
+        return np.asarray(rows - taken @ (taken.T @ rows))
+
+    every = left(every[:, : 5 * robot.joints])
+    by_lack = every @ moved
+    by_lack[:, : lack.functions] -= left(turned)
+    square = np.sum((every @ links) * every) + np.sum((by_lack @ lack.moment) * by_lack)
+    square += np.sum(left(joints) ** 2 @ lack.scatter)
+    return float(np.sqrt(max(square, 0.0) / POSES))
 
 
-def position_sigma(robot: Robot, covariance: Array) -> float:
-    """RMS over the joints' range of a position's standard deviation [m].
-
-    covariance: (5n, 5n) of the links.
-    """
-    rows = position_rows(robot)
-    return float(np.sqrt(max(np.trace(rows @ rows.T @ covariance) / POSES, 0.0)))
+def position_sigma(robot: Robot, sure: Uncertainty) -> float:
+    """`position_error` of a calibrated arm [m]."""
+    n = 5 * robot.joints
+    links = np.nan_to_num(sure.noise) + sure.drawn @ sure.drawn.T
+    return position_error(robot, links[:n, :n], sure.moved[:n], sure.lack)
 
 
-def drawn_sigma(robot: Robot) -> float:
-    """RMS position error that a drawing as good as `drawn_within` leaves [m]."""
+def drawn_covariance(robot: Robot) -> Array:
+    """(5n, 5n) of the links of a drawing as good as `drawn_within`."""
     length, angle = robot.drawn_within
-    sigma = np.repeat([length, angle], [2 * robot.joints, 3 * robot.joints])
-    return position_sigma(robot, np.diag(sigma**2))
+    return np.diag(np.repeat([length, angle], [2 * robot.joints, 3 * robot.joints]) ** 2)
+
+
+def drawn_sigma(robot: Robot, lack: Lack, share: float = 1.0) -> float:
+    """`position_error` that a drawing leaves, which holds no more of the lack [m].
+
+    share: of the variance that `drawn_within` says.
+    """
+    nothing = np.zeros((5 * robot.joints, len(lack.moment)))
+    return position_error(robot, share * drawn_covariance(robot), nothing, lack)
 
 
 @dataclass(frozen=True)
@@ -64,21 +100,26 @@ class Claim:
     """What is known of positions of the arm, RMS over the joints' range, base and tool fitted [m].
 
     sigma: of the calibrated arm.  drawn: of the drawing, by `drawn_within`.  change: between the
-    two.
+    two.  shown: of the drawing, by how far the pixels show it to be off; 0 where they do not.
     """
 
     sigma: float
     drawn: float
     change: float
+    shown: float
 
     @property
     def is_better(self) -> bool:
-        """Whether the calibrated arm is known better than the drawn one, which it contradicts."""
-        return self.sigma < self.drawn and self.change > CLEAR * self.sigma
+        """Whether the calibrated arm is known clearly better than the drawn one."""
+        return self.sigma < MARGIN * self.shown
+
+    def texts(self) -> dict[str, str]:
+        """Each number for people."""
+        return {name: f"{1e3 * value:#.3g} mm" for name, value in vars(self).items()}
 
     def sentence(self) -> str:
         """For people."""
-        mm = {name: f"{1e3 * value:#.3g} mm" for name, value in vars(self).items()}
+        mm = self.texts()
         said = (
             f"These pixels determine a position of the arm to {mm['sigma']} RMS (sigma over the "
             "joints' whole range, lack of fit and the lenses' doubt included); the drawing knows "
@@ -89,4 +130,7 @@ class Claim:
             return f"{said}: the calibrated arm is better."
         if self.sigma >= self.drawn:
             return f"{said}: keep the drawn arm; take more images, nearer, with more tilt."
-        return f"{said}, no more than the pixels make up: keep the drawn arm."
+        return (
+            f"{said}. By that the drawing is off by {mm['shown']}, too little to be sure: keep the "
+            "drawn arm."
+        )

@@ -53,10 +53,10 @@ class PixelOptions:
     """How to calibrate.
 
     camera_on: flange or ground; "" for what fits better.  fix_camera: hold the lenses as their
-    files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.  holdout: share of the
-    poses kept out of the fit; seed: of that choice.  fix, free: names or patterns as ``beta*``.
-    resolution: relative singular value that counts as not measured.  allow_large_changes: accept an
-    arm that is another than the one drawn.
+    files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.  drawn_prior: whether
+    the drawing is a prior.  holdout: share of the poses kept out of the fit; seed: of that choice.
+    fix, free: names or patterns as ``beta*``.  resolution: relative singular value that counts as
+    not measured.  allow_large_changes: accept an arm that is another than the one drawn.
     """
 
     camera_on: str = option(
@@ -75,6 +75,11 @@ class PixelOptions:
         "How well the files know the lenses: focal length, centre, radial and tangential "
         "distortion [default: f 0.1%, c 2px, k 0.005, p 0.0005].",
         metavar='"f 0.1%, c 2px"',
+        group=CAMERAS,
+    )
+    drawn_prior: bool = option(
+        False,
+        "Take the drawing as a prior, as well as the robot's drawn_within says or better.",
         group=CAMERAS,
     )
     holdout: float = Options.holdout

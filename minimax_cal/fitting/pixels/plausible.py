@@ -11,6 +11,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.pixels.camera import INTRINSICS
 from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.drawing import Scale
 from minimax_cal.fitting.pixels.fit import FAR_LENS, PixelFit
 from minimax_cal.fitting.pixels.options import PixelOptions
 from minimax_cal.fitting.pixels.start import Started, start_scene
@@ -25,9 +26,8 @@ MOST_ASIDE = 1.0 / 3.0  # of the pixels: where more stand out, none of them is t
 LISTED = 5  # lines, or images, that a notice names
 WHOLE_IMAGE = 0.5  # of an image: where more pixels stand out, its pose is wrong, not its pixels
 OTHER_LENS = 0.05  # of the focal length: no lens changes so much, it is another one
-OTHER_SIZE, ODD_SIZE = 8.0, 5.0  # times what the drawing allows: a board of another size
-LEAST_SIZE = 2e-3  # share of a board's size: less may be the warmth of the arm, or of the board
-OTHER_SHAPE = 0.25  # of the squared changes of lengths: where more is no common factor, none is
+OTHER_SIZE, ODD_SIZE = 1e-6, 0.01  # p-values of a board of another size: it fails, a notice
+LEAST_SIZE = 3e-3  # share of a board's size: by less it is no other board
 UNITS = (1e-3, 1e3, 0.1, 10.0, 25.4, 1.0 / 25.4)  # slips of a board's unit
 
 
@@ -75,7 +75,9 @@ def extent_of(data: PixelData, camera: int) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def contradiction(robot: Robot, data: PixelData, fit: PixelFit, options: PixelOptions) -> str:
+def contradiction(
+    robot: Robot, data: PixelData, fit: PixelFit, scale: Scale | None, options: PixelOptions
+) -> str:
     """Why a fit contradicts its own data; empty where it does not."""
     depth = np.abs(fit.model.seen(fit.scene).point[2])
     focal = fit.model.intrinsic[fit.model.camera, 0]
@@ -94,7 +96,7 @@ def contradiction(robot: Robot, data: PixelData, fit: PixelFit, options: PixelOp
     links = fit.active[: 5 * robot.joints]
     return (
         other_lens(data, fit)
-        or other_size(robot, data, fit)
+        or other_size(scale, OTHER_SIZE, LEAST_SIZE)
         or (
             ""
             if options.allow_large_changes
@@ -116,35 +118,24 @@ def other_lens(data: PixelData, fit: PixelFit) -> str:
     return ""
 
 
-def other_size(robot: Robot, data: PixelData, fit: PixelFit, limit: float = OTHER_SIZE) -> str:
+def other_size(scale: Scale | None, limit: float, least: float = 0.0) -> str:
     """That the board is of another size than its file says; empty where it is not.
 
-    Pixels leave it open how large all is: with a board of another size the arm comes out larger by
-    the same factor, in all its lengths alike.
+    limit: p-value from which on it is.  Pixels leave it open how large all is: with a board of
+    another size the arm comes out larger by the same factor, in all its lengths alike.
     """
-    n = robot.joints
-    known = fit.active[: 2 * n] & (np.arange(2 * n) % n < n - 1)  # the tool may be anywhere
-    drawn, change = (
-        part[:, :2].T.reshape(-1)[known] for part in (robot.mdh, fit.scene.mdh[0] - robot.mdh)
-    )
-    square = float(drawn @ drawn)
-    if not len(data.board) or robot.rough or not square > 0.0:
+    if scale is None or scale.p_value > limit or abs(scale.share) < least:
         return ""
-    scale = float(drawn @ change) / square
-    left = float(((change - scale * drawn) ** 2).sum())
-    if abs(scale) <= max(limit * robot.drawn_within[0] / np.sqrt(square), LEAST_SIZE):
-        return ""
-    if left > OTHER_SHAPE * float(change @ change):
-        return ""
-    larger, board = ("longer", "smaller") if scale > 0.0 else ("shorter", "larger")
+    larger, board = ("longer", "smaller") if scale.share > 0.0 else ("shorter", "larger")
+    own = abs(scale.share / (1.0 + scale.share))
     return (
-        f"all lengths of the arm come out {100 * abs(scale):.2f} % {larger} than drawn: the board "
-        f"is {100 * abs(scale / (1.0 + scale)):.2f} % {board} than its file "
-        "says (board): measure its squares"
+        f"all lengths of the arm come out {100 * abs(scale.share):.2f} % {larger} than drawn: the "
+        f"board is {100 * own:.2f} % (sigma {100 * scale.sigma:.2f} %) {board} than its file says "
+        "(board): measure its squares"
     )
 
 
-def lens_notices(robot: Robot, data: PixelData, fit: PixelFit) -> list[str]:
+def file_notices(data: PixelData, fit: PixelFit, scale: Scale | None) -> list[str]:
     """Notices of lenses that are far from their files, and of a board of another size."""
     file = fit.model.intrinsic[:, : len(INTRINSICS)]
     off = np.abs(fit.lens - file) / fit.doubt
@@ -160,7 +151,7 @@ def lens_notices(robot: Robot, data: PixelData, fit: PixelFit) -> list[str]:
                 f"{off[i, far].max():.0f} times its doubt away from its file: {named}; is it the "
                 "file of this camera?"
             )
-    odd = other_size(robot, data, fit, ODD_SIZE)
+    odd = other_size(scale, ODD_SIZE)
     return [*out, odd] if odd else out
 
 

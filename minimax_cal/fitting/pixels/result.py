@@ -19,7 +19,7 @@ from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
 PIXELS = "pixels"  # what was measured
-NO_CLAIM = Claim(math.nan, math.nan, math.nan)
+NO_CLAIM = Claim(*[math.nan] * 4)
 
 
 class ArmPart(Part):
@@ -28,6 +28,7 @@ class ArmPart(Part):
     sigma_mm: Number = math.nan
     drawn_sigma_mm: Number = math.nan
     change_mm: Number = math.nan
+    drawn_shown_mm: Number = math.nan
 
 
 class AsidePart(Part):
@@ -89,6 +90,7 @@ class PixelCalibration(RelativeCalibration):
         rows = (
             ("calibrated arm, sigma", 1e3 * self.claim.sigma),
             ("drawn arm, sigma (drawn_within)", 1e3 * self.claim.drawn),
+            ("drawn arm, as pixels show it", 1e3 * self.claim.shown),
             ("calibrated against drawn", 1e3 * self.claim.change),
         )
         title = "positions over the joints' whole range, base and tool fitted"
@@ -137,6 +139,7 @@ class PixelCalibration(RelativeCalibration):
                     "sigma_mm": 1e3 * self.claim.sigma,
                     "drawn_sigma_mm": 1e3 * self.claim.drawn,
                     "change_mm": 1e3 * self.claim.change,
+                    "drawn_shown_mm": 1e3 * self.claim.shown,
                     "better": self.claim.is_better,
                 },
                 "set_aside": [point.to_dict() for point in self.set_aside],
@@ -151,11 +154,12 @@ class PixelCalibration(RelativeCalibration):
         part = checked(PixelPart, content, source)
         told = RelativeCalibration.from_dict(content, source)
         arm = part.arm_position
+        claimed = (arm.sigma_mm, arm.drawn_sigma_mm, arm.change_mm, arm.drawn_shown_mm)
         return PixelCalibration(
             **{each.name: getattr(told, each.name) for each in fields(told)},
             calibrated=robot_from_dict(part.calibrated_robot, f"{source}: calibrated_robot"),
             pixels={key: (each.rms_px, each.max_px) for key, each in part.accuracy.items()},
-            claim=Claim(1e-3 * arm.sigma_mm, 1e-3 * arm.drawn_sigma_mm, 1e-3 * arm.change_mm),
+            claim=Claim(*(1e-3 * value for value in claimed)),
             set_aside=tuple(SetAside(**each.model_dump()) for each in part.set_aside),
             reason=part.reason,
         )

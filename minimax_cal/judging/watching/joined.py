@@ -8,12 +8,12 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.both import FOOT, KNOWN, NEW, OLD, Both, Part
-from minimax_cal.judging.watching.lack import WAVES, by_pose, by_time
 from minimax_cal.judging.watching.old import Old
 from minimax_cal.judging.watching.rows import Rows
 from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.measuring.grouping import regions
 from minimax_cal.measuring.history import clock, is_timed
+from minimax_cal.modelling.lack import WAVES, by_pose, by_time
 
 
 def joined(watched: Watched, rows: Rows, column: Array) -> Both:
@@ -82,11 +82,11 @@ def free_columns(watched: Watched, rows: Rows) -> Array:
 def lacking(watched: Watched, rows: Rows) -> tuple[Array, Array]:
     """(N, l) new rows by what the model lacks, and (l,) which factors share a variance."""
     robot, (m, r, n) = watched.cell.robot, rows.arm.shape
-    by_angle, joint = by_pose(robot, robot.turned(watched.data.q), rows.arm)
+    by_angle, turned = by_pose(robot, robot.turned(watched.data.q), rows.arm)
     links = rows.jacobian[: m * r, : 5 * n].reshape(m, r, 5 * n)
     drift, kind = drifts(watched, links, rows.arm, when_of(watched), NEW)
     columns = np.concatenate([by_angle, drift], axis=2).reshape(m * r, -1)
-    return np.pad(columns, ((0, rows.foot), (0, 0))), np.append(joint, n + kind)
+    return np.pad(columns, ((0, rows.foot), (0, 0))), np.append(turned[:, 0], n + kind)
 
 
 def when_of(watched: Watched) -> Array | None:

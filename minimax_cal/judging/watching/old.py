@@ -11,10 +11,10 @@ from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Poses
 from minimax_cal.ground.arrays import Array
 from minimax_cal.judging.watching.both import KNOWN, OLD, Both, Part, likeliest
-from minimax_cal.judging.watching.lack import by_pose
 from minimax_cal.measuring.grouping import groups, regions
 from minimax_cal.measuring.history import clock, is_timed
 from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.lack import by_pose
 
 PLENTY = 500  # poses that tell what more would
 SHARES = 0.5 ** np.arange(6)  # of the joints' noise, of which one is taken
@@ -107,11 +107,11 @@ def old_at(fit: Fit, poses: Poses, some: Measurements, jitter: float) -> Old:
 
 def alone(fit: Fit, old: Old, near: Array) -> Both:
     """A calibration's poses by themselves.  near: as in `Both`."""
-    turned, joint = by_pose(fit.cell.robot, old.q, old.arm)
+    turned, kind = by_pose(fit.cell.robot, old.q, old.arm)
     f = old.jacobian.shape[2]
     whole = np.concatenate([old.jacobian, old.latent, turned, old.error[..., None]], axis=2)
     parts = tuple(old.parts(whole))
-    component = np.append(np.full(old.latent.shape[2], KNOWN), joint)
+    component = np.append(np.full(old.latent.shape[2], KNOWN), kind[:, 0])
     nothing = np.zeros(0, dtype=int)
     return Both(parts, f, len(component), component, nothing, nothing > 0, near)
 

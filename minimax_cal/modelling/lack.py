@@ -16,6 +16,7 @@ from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot
 
 UNIT = 1e-4  # turn by a factor of 1, so that variances are numbers of ordinary size [rad]
+OF_ITSELF, OF_OTHERS, OF_GRAVITY = range(3)  # what drives a function
 OWN = 2  # waves in a turn of the joint itself: gears err once and twice a turn
 WAVES = 2  # of the place in the session: a drift and a bow
 GONE_ON = float(np.sqrt(12.0))  # from one session's mean to the next, over the RMS of a drift
@@ -27,16 +28,17 @@ def joint_units(robot: Robot) -> Array:
 
 
 def by_pose(robot: Robot, q: Array, arm: Array) -> tuple[Array, Array]:
-    """(m, r, c) motion of the points by each function's factor, and (c,) the joint that it turns.
+    """(m, r, c) motion of the points by each function's factor, and (c, 2) its kind.
 
-    q: (m, n) joint values with signs applied.  arm: (m, r, n) motion per unit of each joint.
+    The kind is the joint that it turns, and what drives it.  q: (m, n) joint values with signs
+    applied.  arm: (m, r, n) motion per unit of each joint.
     """
     unit = joint_units(robot)
     angle, n = q / unit, robot.joints
     links = kinematics.chain(robot.mdh, q, robot.prismatic)
     load = torques(links, *masses_of(robot), robot.up).T
     size = float(np.sqrt(np.mean(load**2)))
-    columns, joint = [], []
+    columns, kind = [], []
     for j in range(n):
         others = np.delete(angle, j, axis=1)
         own = angle[:, j, None]
@@ -45,8 +47,10 @@ def by_pose(robot: Robot, q: Array, arm: Array) -> tuple[Array, Array]:
         pull = load[:, j, None] / size if size > 0.0 else np.zeros((len(q), 0))
         functions = np.concatenate([np.sin(phase), np.cos(phase), pull], axis=1)
         columns.append(UNIT * unit[j] * arm[:, :, j, None] * functions[:, None, :])
-        joint += [j] * functions.shape[1]
-    return np.concatenate(columns, axis=2), np.array(joint)
+        driven = np.repeat([OF_ITSELF, *[OF_OTHERS] * 3], [part.shape[1] for part in waves])
+        driver = np.concatenate([driven, driven, np.full(pull.shape[1], OF_GRAVITY)])
+        kind.append(np.stack([np.full(len(driver), j), driver], axis=1))
+    return np.concatenate(columns, axis=2), np.concatenate(kind)
 
 
 def by_time(robot: Robot, when: Array, arm: Array, growth: Array) -> tuple[Array, Array]:
