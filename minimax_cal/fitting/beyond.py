@@ -353,26 +353,28 @@ def one_step(
 ) -> dict[int, State]:
     """Where one step leads without a part, for parts after which a second would hardly matter.
 
-    It would where it moved the part's points by a share NEAR of their error in the whole fit; the
-    gradient on it is that at the first step's end, the normal matrix that of the whole fit.
+    It would where it moved the part's points by more than MAX_SECOND_STEP of their error in the
+    whole fit.
 
     parts: masks (m,), every: their sums.  allowed: (f,) False for parts that are not to be tried.
     Returns states by the number of the part.
     """
     model, whole, which = poses.estimator.model, poses.estimator.whole, np.flatnonzero(allowed)
-    rest, held = poses.normal_matrix - every.gram[which], poses.prior * poses.off
-    first = solve_normal(rest, (poses.gradient - every.gradient[which] + held)[..., None])[..., 0]
+    held = np.diag(poses.prior)
+    left = poses.gradient - every.gradient[which] + poses.prior * poses.off
+    first = solve_normal(poses.normal_matrix - every.gram[which], left[..., None])[..., 0]
     near = [moved(model, poses.state, step) for step in first]
-    gradient = np.zeros(first.shape)
+    gradient, (rest, own) = np.zeros(first.shape), np.zeros((2, *every.gram[which].shape))
     for i, at in enumerate(near):
-        left = whole.take(~parts[which[i]])
+        part = parts[which[i]]
         off = (model.prior.mean - model.values(at))[model.active]
-        gradient[i] = left.normal(at, model.active).gradient.sum(axis=0) + poses.prior * off
+        found = whole.take(~part).normal(at, model.active)
+        gradient[i] = found.gradient.sum(axis=0) + poses.prior * off
+        rest[i] = found.gram.sum(axis=0) + held
+        own[i] = whole.take(part).normal(at, model.active).gram.sum(axis=0)
     more = solve_normal(rest, gradient[..., None])
-    motion = (np.swapaxes(more, 1, 2) @ every.gram[which] @ more)[:, 0, 0]
-    arrived = (
-        motion <= MAX_SECOND_STEP**2 * every.square[which]
-    )  # not so where the step is no number
+    motion = (np.swapaxes(more, 1, 2) @ own @ more)[:, 0, 0]
+    arrived = motion <= MAX_SECOND_STEP**2 * every.square[which]  # not where it is no number
     return {
         int(i): at
         for i, at, done in zip(which, near, arrived, strict=True)
