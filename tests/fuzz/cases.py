@@ -17,6 +17,7 @@ from .material import material
 from .mutations import VALUES, Rng, broken, misspelt, pick
 
 # Command lines that work, each word that names a file of the material one that may be broken.
+PIXELS = "--pixels detections.csv --joints joints.csv --camera cam0=cam0.yaml --board board.csv"
 TEMPLATES = (
     "calibrate ROBOT data.csv --objective sum --json",
     "calibrate ROBOT data.csv --json -o out.json",
@@ -68,6 +69,19 @@ TEMPLATES = (
     "effects ROBOT data.csv --json",
     "gap robot.urdf data.csv --fit fit.json --diagnosis diagnosis.json --json",
     "gap arm.xml data.csv --fit fit.json --diagnosis diagnosis.json --write out.xml -o out.json",
+    "calibrate irb120 data.csv later.csv --json",
+    f"calibrate ur5 {PIXELS} --json",
+    f"calibrate ur5 {PIXELS} --fix-camera -o out.json",
+    "evaluate fit.json later.csv --new-frame --json",
+    "relative irb120 wires.csv --prior a*=0.5mm --json",
+    "identify sweeps.csv --joints revolute,revolute,revolute,revolute,revolute,revolute --json",
+    "import run1.csv run2.csv -o out.csv",
+    "import data.csv --preview",
+    "torques links.json run1.csv run2.csv --json",
+    "torques links.json run1.csv run2.csv --write out.xml -o out.json",
+    "gap links.xml run1.csv run2.csv --json",
+    "gap links.xml run1.csv run2.csv --write out.xml -o out.json",
+    "report motion.json -o out.html --date 2026-01-01",
     "robots --json",
     "backends --json",
 )
@@ -77,7 +91,7 @@ KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some chan
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
 RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08, "gap": 0.3}
-RATES |= {"robots": 0.2, "backends": 0.2}
+RATES |= {"robots": 0.2, "backends": 0.2, "torques": 0.3}
 NAMED = {"cells.toml": ("robot.json", "data.csv", "fit.json")}  # files that a file names
 PLACES = (
     "/dev/null",

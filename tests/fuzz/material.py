@@ -15,7 +15,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import minimax_cal as mc
+from experiments.pixel_cells import board_points, make_cell, write_cell
 from minimax_cal.cli import main
+from minimax_cal.dynamics.regressor import Motion, inertial_parameters, inverse_dynamics
 
 POSES = 24
 CELLS = """
@@ -73,6 +75,8 @@ def make() -> None:
     done(*few, "-o", "data.csv", "--truth", "truth.json")
     simulated = Path("data.csv")  # as a tracker's file: without the mark in its first line
     simulated.write_text(simulated.read_text().partition("\n")[2])
+    rows = list(csv.reader(simulated.read_text().splitlines()))
+    write("later.csv", [rows[0], *(later(row, 40.0) for row in rows[1:])])
     done("calibrate", "robot.json", "data.csv", "-o", "fit.json")
     sums = ("calibrate", "robot.json", "data.csv", "--objective", "sum")
     done(*sums, "--effects", "joint_compliance:all", "-o", "effects.json")
@@ -95,6 +99,62 @@ def make() -> None:
     write("wires.csv", [header, *(list(map(str, [*a, *w])) for a, w in zip(q, wires, strict=True))])
 
     motions()
+    trajectories()
+    images()
+    sweeps(robot)
+
+
+def later(row: list[str], shift: float) -> list[str]:
+    """A row of the same arm by an instrument that stands elsewhere; the first joint was moved."""
+    moved = [f"{float(cell) + shift:.6f}" for cell in row[6:15]]
+    return [repr(float(row[0]) + 0.001), *row[1:6], *moved, *row[15:]]
+
+
+def trajectories() -> None:
+    """Torque logs of an arm of two links with masses and friction, its diagnosis and MJCF."""
+    links = [
+        {"a": 0.5, "alpha": 1.5707963, "mass_kg": 6.0, "com_mm": [-240, 10, 60]},
+        {"a": 0.4, "alpha": 0.0, "mass_kg": 3.0, "com_mm": [-180, 0, 20]},
+    ]
+    for link, inertia in zip(links, (0.2, 0.06), strict=True):
+        link |= {"d": 0.1, "theta": 0.0, "inertia": [0.02, 0, 0, inertia, 0, inertia]}
+    plain = {"name": "links", "units": {"length": "m", "angle": "rad"}, "joints": links}
+    Path("links.json").write_text(json.dumps(plain))
+    robot = mc.load_robot("links.json")
+    t = np.arange(0.0, 8.0, 0.01)
+    rng = np.random.default_rng(4)
+    for name in ("run1.csv", "run2.csv"):
+        rate = 2.0 * np.pi * rng.uniform(0.1, 0.5, (3, 2))
+        phase = rate * t[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
+        size = rng.uniform(0.2, 0.5, (3, 2))
+        q, qd = (size * np.sin(phase)).sum(1), (size * rate * np.cos(phase)).sum(1)
+        motion = Motion(q, qd, -(size * rate**2 * np.sin(phase)).sum(1))
+        torque = inverse_dynamics(robot, motion, inertial_parameters(robot))
+        torque += np.sign(qd) * [3.0, 1.5] + 2.0 * qd + 0.1 * rng.normal(size=q.shape)
+        header = ["t_s", *(f"{kind.format(j)}" for kind in ("q{}_rad", "tau{}_Nm") for j in (1, 2))]
+        table = np.column_stack([t, q, torque])
+        write(name, [header, *([f"{value:.8g}" for value in row] for row in table)])
+    logs = ("run1.csv", "run2.csv")
+    done("torques", "links.json", *logs, "--write", "links.xml", "-o", "motion.json")
+
+
+def images() -> None:
+    """Corners of a board, seen by a camera on the flange."""
+    cell = make_cell(np.random.default_rng(2), points=board_points((4, 3), 0.06), poses=14)
+    write_cell(cell, Path())
+
+
+def sweeps(robot: mc.Robot) -> None:
+    """One reflector while each joint moves alone, of an arm that nobody has drawn."""
+    rng = np.random.default_rng(6)
+    q = np.repeat(rng.uniform(-0.5, 0.5, (1, 6)), 6 * 7, axis=0)
+    for j in range(6):
+        q[7 * j : 7 * (j + 1), j] += np.linspace(-0.5, 0.5, 7)
+    pose = robot.pose(q)
+    at = 1e3 * (pose[:, :3, 3] + pose[:, :3, :3] @ np.array([0.05, 0.03, 0.08]))
+    at += rng.normal(0.0, 0.02, at.shape)
+    header = [*(f"q{j + 1}_rad" for j in range(6)), *(f"smr1_{axis}_mm" for axis in "xyz")]
+    write("sweeps.csv", [header, *([f"{v:.9g}" for v in row] for row in np.hstack([q, at]))])
 
 
 def motions() -> None:
