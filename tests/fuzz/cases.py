@@ -91,7 +91,7 @@ KNOWN = ("calibrate", "evaluate", "check")  # commands whose answer to some chan
 ROBOTS = ("robot.json", "robot.yaml", "robot.toml", "robot.urdf", "irb120")
 # How often, beside the others: those that take seconds, and those that can hardly go wrong.
 RATES = {"calibrate": 0.15, "diagnose": 0.1, "tradeoff": 0.15, "plan": 0.08, "gap": 0.3}
-RATES |= {"robots": 0.2, "backends": 0.2, "torques": 0.3}
+RATES |= {"robots": 0.2, "backends": 0.2}
 NAMED = {"cells.toml": ("robot.json", "data.csv", "fit.json")}  # files that a file names
 PLACES = (
     "/dev/null",
