@@ -1,5 +1,6 @@
 """Links of the documentation lead somewhere, and its commands print what it says they print."""
 
+import ast
 import importlib
 import re
 import runpy
@@ -164,6 +165,7 @@ def chunks(text: str) -> Iterator[list[str]]:
     yield chunk
 
 
+PLAIN = {"mm", "deg", "mrad", "um"}  # units
 RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md"]
 
 
@@ -294,3 +296,25 @@ def test_the_versions_of_figures_are_commits() -> None:
     if len(known) < 100:
         pytest.skip("a shallow clone")
     assert {stamp for stamp in stamps if not any(one.startswith(stamp) for one in known)} == set()
+
+
+def test_the_glossary_has_every_word_that_heads_a_table() -> None:
+    """Some word of each header that the code writes out is in an entry."""
+    heads: set[str] = set()
+    for path in (ROOT / "minimax_cal").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            given = []
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Table":
+                given = [one for one in node.args[1:2] if isinstance(one, ast.Tuple)]
+            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "header":
+                given = [node.value] if isinstance(node.value, ast.Tuple) else []
+            heads |= {str(e.value) for t in given for e in t.elts if isinstance(e, ast.Constant)}
+    entries = [line.split("|")[1] for line in (DOCS / "glossary.md").read_text().splitlines()
+               if line.startswith("|")]  # fmt: skip
+    known = {word.lower() for entry in entries for word in re.findall(r"[A-Za-z]+", entry)} | PLAIN
+    words = {head: re.findall(r"[A-Za-z]{2,}", head) for head in heads}
+    unknown = {
+        head for head, found in words.items()
+        if found and not any(word.lower() in known for word in found)
+    }  # fmt: skip
+    assert not unknown, ", ".join(sorted(unknown))

@@ -22,6 +22,7 @@ from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import EFFECTS, Term
+from minimax_cal.modelling.effects.words import name_kinds
 from minimax_cal.modelling.reach import flange_terms
 from minimax_cal.solvers.status import Status
 
@@ -112,13 +113,13 @@ class Delivered:
     def holds(self) -> str:
         """What it holds, in words."""
         return (
-            f"{self.part} and {', '.join(self.carries)}" if self.carries else f"{self.part} alone"
+            f"{self.part} and {name_kinds(self.carries)}" if self.carries else f"{self.part} alone"
         )
 
     @property
     def lacks(self) -> str:
         """What of the full model it does not hold, in words; empty where it holds all."""
-        return ", ".join(filter(None, (self.rest, *self.not_carried)))
+        return ", ".join(filter(None, (self.rest, name_kinds(self.not_carried))))
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -448,7 +448,7 @@ def test_a_calibrated_ur10_by_command_in_an_independent_reader(
     result = run(path, "--to", "urdf", "--urdf", original, "-o", tmp_path / "out.urdf")
     assert result.exception is None, result.output
     assert result.stdout == ""
-    assert "fitted without joint_coupling:J3; the full model: held-out RMS" in result.stderr
+    assert "fitted without joint coupling; the full model: held-out RMS" in result.stderr
     robot, model = mc.load_robot(path), to_robot(parse_urdf(original.read_bytes()))
     q, poses = poses_of(robot)
     text = (tmp_path / "out.urdf").read_text()
@@ -506,7 +506,7 @@ def test_a_fit_from_before_nominal_robots(fit: tuple[Path, Simulation], tmp_path
     assert json.loads(found.file.content) == content["robot"]
     assert found.delivered
     assert found.delivered.nominal is None
-    assert "joint_coupling:J3" in found.notices[-1]
+    assert "joint coupling" in found.notices[-1]
     assert "does not tell its nominal robot" in found.notices[-1]
 
 

@@ -95,7 +95,7 @@ def test_it_is_fitted_diagnosed_drawn_compensated_and_reported(
     bent = measured.q[np.abs(measured.q[:, 4]) > 0.4][:8]  # a straight wrist can turn no way
     fixed = mc.compensate(fit, bent)
     assert fixed.distance.max() < 1e-5  # its tolerance
-    assert any("fitted without mast_sway:frame" in notice for notice in fixed.notices)
+    assert any("fitted without mast sway" in notice for notice in fixed.notices)
     assert fixed.delivered.carries == ("hose_pull:J5",)
 
     told.save(tmp_path / "told.json")

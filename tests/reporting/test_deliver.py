@@ -84,7 +84,7 @@ def test_the_page_and_the_command_say_for_which_file(
     assert any("hold for targets corrected by minimax-cal compensate" in line for line in rest)
     assert any(line.startswith("urdf: not passed: urdf holds geometry alone") for line in rest)
     page = (tmp_path / "page.html").read_text()
-    assert "What leaves the house" in page
+    assert "Files and corrected targets" in page
     assert run(*asked, "--deliver", "urdf", "--deliver", "ros-yaml") == 0
     first, *rest = capsys.readouterr().out.splitlines()
     assert first == NOT_PASSED

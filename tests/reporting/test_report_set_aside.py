@@ -65,8 +65,8 @@ def test_a_diagnosis_alone_says_it_as_well(files: Path) -> None:
     assert found.sentence.startswith(f"{PASSED} without {2 * BAD} points set aside by the user")
 
 
-def test_without_any_nothing_is_said(files: Path) -> None:
+def test_without_any_the_page_says_so(files: Path) -> None:
     sources = read_sources([files / "poses.json"])
     found = signed(sources, limits_of("rms 2"), "inside", None)
     assert (found.set_aside, found.judged_with) == ((), ())
-    assert "set aside" not in page.render(compose(sources, WORDING))
+    assert "No measured point was set aside." in page.render(compose(sources, WORDING))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from minimax_cal.modelling.effects.table import EFFECTS
 
@@ -31,6 +32,11 @@ def name_effect(effect: str, place: str = "") -> str:
     said = effect in EFFECTS and EFFECTS[effect].moves in PLACED
     at = f" {name_place(place, effect)}" if place and not said else ""
     return f"{effect.replace('_', ' ')}{at}"
+
+
+def name_kinds(labels: Iterable[str]) -> str:
+    """Kinds of effects, each once, of labels as joint_compliance:J2."""
+    return ", ".join(dict.fromkeys(name_effect(label.partition(":")[0]) for label in labels))
 
 
 def name_codes(text: str) -> str:

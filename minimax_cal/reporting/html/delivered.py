@@ -20,7 +20,7 @@ from minimax_cal.judging.tolerance import (
     judge,
     overall,
 )
-from minimax_cal.modelling.effects.words import name_effect
+from minimax_cal.modelling.effects.words import name_kinds
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.solvers.status import Status
 
@@ -131,19 +131,15 @@ def delivered_table(rows: Sequence[Row]) -> Table:
     whole = rows[0].delivered
     every = (*whole.carries, *whole.not_carried)
     shown: list[tuple[Cell, ...]] = [
-        ("full model, no file", kinds(every), "", whole.whole.rms, whole.whole.worst, "")
+        ("full model, no file", name_kinds(every), "", whole.whole.rms, whole.whole.worst, "")
     ]
     shown += [
-        (row.delivered.format, kinds(row.delivered.carries), kinds(row.delivered.not_carried),
+        (row.name, name_kinds(row.delivered.carries),
+         name_kinds(row.delivered.not_carried),
          row.delivered.figures.rms, row.delivered.figures.worst, row.verdict)
         for row in rows
     ]  # fmt: skip
     header = ("delivered as", "carries", "does not carry", "inside, RMS mm",
               "outside, worst RMS mm", "verdict")  # fmt: skip
-    title = "What leaves the house, each fitted for exactly what it carries"
+    title = "Files and corrected targets, each fitted for exactly what it carries"
     return Table(title, header, tuple(shown), ("", "", "", ".3f", ".3f", ""))
-
-
-def kinds(labels: Sequence[str]) -> str:
-    """Effects in words, each kind once."""
-    return ", ".join(dict.fromkeys(name_effect(each.partition(":")[0]) for each in labels))

@@ -39,7 +39,7 @@ from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
 from minimax_cal.modelling.effects.words import name_effect
 from minimax_cal.modelling.parameters import Names, links_of
-from minimax_cal.reporting.html.content import Block, Note, text
+from minimax_cal.reporting.html.content import Block, Note, caveat, text
 from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
 from minimax_cal.reporting.html.sources import Sources
 from minimax_cal.reporting.html.verdict import fit_warnings, number, trouble
@@ -51,6 +51,7 @@ CLOSES = 0.005  # share of the gap that is told as 1 %: a cause of less does not
 NEAR_NOISE = 1.5  # times the noise floor: what is left is noise
 MAX_NAMED = 5  # more kinds of effects than this are counted, not listed
 SHOWN_REASONS = 3  # why points were set aside
+NOTHING_ASIDE = "No measured point was set aside."
 NO_LIMIT = "No requirement was given: the result is stated, and nothing is passed or failed."
 
 
@@ -294,15 +295,18 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     lines += [text(found.holds_for)] if found.row else []
     lines += [result_table(sources, found), text(basis(found))]
     lines += [Note(f"{said}.", alarm) for said in found.besides]
-    lines += [Note(f"{aside_of(found)}.", alarm)] if found.set_aside else []
+    if sources.results:
+        lines.append(Note(f"{aside_of(found)}.", alarm) if found.set_aside else text(NOTHING_ASIDE))
     lines += [delivered_table(found.rows)] if found.rows else []
     lines += [Note(one.sentence() + ".") for one in found.judged if not one.plain]
     if limiting := limits_now(sources, found):
         lines.append(text(f"What limits it now: {limiting}"))
     lines += [text(which) for which in which_is_which(sources, found)]
     lines += [Note(notice, alarm) for notice in sources.notices]
-    lines += fit_warnings(sources.fit) if sources.fit else ()
-    lines += trouble(sources.gap.status, "") if sources.gap and not sources.fit else ()
+    wrong = fit_warnings(sources.fit) if sources.fit else ()
+    if sources.gap and not sources.fit:
+        wrong = trouble(sources.gap.status, "")
+    lines += [caveat(one.text) if kind == "passed" else one for one in wrong]
     return tuple(lines)
 
 
