@@ -16,6 +16,8 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
+HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times over [kg, m]
+
 Payload = tuple[float, tuple[float, float, float]]
 
 
@@ -58,9 +60,15 @@ def runs_of(
 
 
 def with_payload(runs: Sequence[Run], payload: Payload | None) -> list[Run]:
-    """The runs with the mass at the flange, where they say none themselves."""
+    """The runs with the mass at the flange, where they say none themselves.  Raises OptionError."""
     if payload is None:
         return [replace(run, payload=None) for run in runs]
+    mass, at = payload
+    if not (0.0 < mass <= HEAVIEST and np.abs(at).max() <= FARTHEST):
+        raise OptionError(
+            f"payload of {mass:.3g} kg at {tuple(at)} m: give at most {HEAVIEST:g} kg within "
+            f"{FARTHEST:g} m of the flange"
+        )
     return [run if run.payload is not None else replace(run, payload=payload[0]) for run in runs]
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from minimax_cal.dynamics.laws import LAWS, USUAL, Term
 from minimax_cal.dynamics.model import Body, TorqueModel
@@ -17,8 +18,8 @@ from minimax_cal.dynamics.probes import Unexplained
 from minimax_cal.dynamics.scene import Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
-from minimax_cal.ground.files import finite, json_of, json_text, number, read_text, write_whole
-from minimax_cal.ground.records import reading
+from minimax_cal.ground.files import finite, json_of, json_text, read_text, write_whole
+from minimax_cal.ground.records import Number, Part, Recorded, checked, reading
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.effects.words import name_place
 from minimax_cal.robots.robot import robot_from_dict
@@ -67,9 +68,9 @@ class MotionEffect:
 
     effect: str
     place: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[Recorded[Parameter], ...]
     worth: Mapping[str, tuple[float, float]]
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[Recorded[Alternative], ...] = ()
     frequency: float = math.nan
     established: bool = True
     minor: bool = False
@@ -258,28 +259,17 @@ class MotionDiagnosis:
                 f"{source}: is no motion diagnosis of this version; write it with minimax-cal "
                 "torques"
             )
+        part = checked(MotionPart, content, source)
         with reading(source):
-            robot = robot_from_dict(content["robot"], source)
-            parts = (np.array([number(v) for v in content["arm"][k]]) for k in ARM)
-            arm = Arm(robot, *parts)
-            return MotionDiagnosis(
-                unit=content["unit"],
-                verdict=content["verdict"],
-                effects=tuple(effect_of(one) for one in content["effects"]),
-                budget=tuple(MotionStep(one["name"], tuple(one["holdout_rms"]),
-                                        tuple(one["holdout_rms_moving"]))
-                             for one in content["budget"]),
-                unexplained=tuple(Unexplained(**one) for one in content["unexplained"]),
-                not_testable=tuple(NotTestable(**one) for one in content["not_testable"]),
-                too_little=tuple(content["too_little_motion"]),
-                models=tuple(model_of(one, arm) for one in content["models"]),
-                runs=tuple(content["runs"]),
-                held_out=content["held_out"],
-                held_run=HeldRun(**content["held_run"]),
-                curves=tuple(FrictionCurve(**one) for one in content["curves"]),
-                notices=tuple(content["notices"]),
-                seconds=content["seconds"],
-            )  # fmt: skip
+            robot = robot_from_dict(part.robot, source)
+            arm = Arm(robot, *(np.array(part.arm[name]) for name in ARM))
+            found = MotionDiagnosis(
+                **{name: getattr(part, name) for name in KEPT},
+                too_little=part.too_little_motion,
+                models=tuple(model_of(one, arm) for one in part.models),
+            )
+            check_parts(found, robot.joints)
+            return found
 
 
 ARM = ("gain", "ratio", "soft", "fastest", "known")  # numbers of an arm beside its robot
@@ -315,17 +305,25 @@ def finite_only(content: Any) -> Any:
     return finite(content) if isinstance(content, float) else content
 
 
-def effect_of(content: Mapping[str, Any]) -> MotionEffect:
-    """An effect of a file."""
-    known = {f.name for f in fields(MotionEffect)}
-    kept = {key: value for key, value in content.items() if key in known}
-    kept["parameters"] = tuple(
-        Parameter(p["name"], p["value"], number(p["sigma"]), p["unit"]) for p in kept["parameters"]
-    )
-    kept["alternatives"] = tuple(Alternative(**a) for a in kept["alternatives"])
-    kept["worth"] = {key: (float(a), float(b)) for key, (a, b) in kept["worth"].items()}
-    kept["frequency"] = number(kept["frequency"])
-    return MotionEffect(**kept)
+def check_parts(found: MotionDiagnosis, joints: int) -> None:
+    """Raise ValueError for parts that are not of one arm, and for effects that do not exist."""
+    run = found.held_run
+    rows = [row for step in found.budget for row in (step.holdout_rms, step.holdout_rms_moving)]
+    if {len(row) for row in (*rows, run.measured, run.predicted)} != {joints}:
+        raise ValueError(f"its numbers are not of {joints} joints")
+    for trace in (*run.measured, *run.predicted):
+        if len(trace) != len(run.time):
+            raise ValueError("held_run: torques are not of the same times")
+    for curve in found.curves:
+        if not len(curve.speed) == len(curve.torque) == len(curve.sigma):
+            raise ValueError("curves: numbers of one curve differ in their count")
+    if len(found.curves) > joints or not found.models:
+        raise ValueError("its curves or models are not of the arm")
+    others = [other.effect for one in found.effects for other in one.alternatives]
+    named = [*(one.effect for one in found.effects), *others]
+    named += [untested.effect for untested in found.not_testable]
+    if unknown := [name for name in named if name not in WORDS]:
+        raise ValueError(f"no effect {unknown[0]!r:.40}")
 
 
 def model_dict(model: TorqueModel) -> dict[str, Any]:
@@ -359,6 +357,31 @@ def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
     return TorqueModel(content["name"], arm, body(content["body"]), terms, value,
                        body(content["context"]), np.array(content["held"], dtype=float),
                        float(content["delay"]))  # fmt: skip
+
+
+class MotionPart(Part):
+    """The file of `minimax-cal torques -o`."""
+
+    robot: dict[str, Any]
+    arm: dict[str, tuple[Number, ...]]
+    verdict: Literal["named", "one_of", "unknown", "none"]
+    unit: str
+    effects: tuple[Recorded[MotionEffect], ...]
+    budget: tuple[Recorded[MotionStep], ...] = Field(min_length=1)
+    unexplained: tuple[Recorded[Unexplained], ...]
+    not_testable: tuple[Recorded[NotTestable], ...]
+    too_little_motion: tuple[str, ...]
+    models: tuple[dict[str, Any], ...]
+    runs: tuple[str, ...]
+    held_out: str
+    held_run: Recorded[HeldRun]
+    curves: tuple[Recorded[FrictionCurve], ...]
+    notices: tuple[str, ...]
+    seconds: Number
+
+
+KEPT = ("unit", "verdict", "effects", "budget", "unexplained", "not_testable", "runs", "held_out",
+        "held_run", "curves", "notices", "seconds")  # fmt: skip
 
 
 def load_motion(path: Path | str) -> MotionDiagnosis:

@@ -482,3 +482,35 @@ def test_an_option_of_another_kind_in_a_result_is_refused(
         tmp_path, file, lambda content: content["provenance"]["settings"].update({name: value})
     )
     assert f"provenance.settings.{name}" in refused(capsys, "export", path, "--to", "ur-yaml")
+
+
+def lengthen_a_step(content: Any) -> None:
+    content["budget"][0]["holdout_rms"].append(1.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["curves"][0].update(sigma="x"),
+        lambda content: content["curves"][0]["torque"].pop(),
+        lambda content: content["held_run"]["measured"][0].pop(),
+        lambda content: content["not_testable"].append({"effect": "x", "place": "J1", "needs": ""}),
+        lengthen_a_step,
+    ],
+)
+def test_a_motion_diagnosis_of_other_parts_is_refused(
+    change: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = broken(tmp_path, "motion.json", change)
+    assert "motion.json" in refused(capsys, "report", path)
+
+
+def test_a_payload_beyond_all_arms_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("links.json", "run1.csv"):
+        (tmp_path / name).write_bytes(material()[name])
+    line = refused(
+        capsys, "torques", tmp_path / "links.json", tmp_path / "run1.csv", "--payload", "1e308"
+    )
+    assert "payload" in line

@@ -279,12 +279,13 @@ def least_within(
             held = (x <= least) & (pull > 0.0)
             new = x + damped_step(gram, pull, damping, ~held)
             new = np.maximum(new, least)
-            after = residual(new)
-            gained = float(left @ left - after @ after)
+            with np.errstate(over="ignore", invalid="ignore"):  # too far a step is refused
+                after = residual(new)
+                gained = float(left @ left - after @ after)
             if gained >= 0.0:
                 break
             damping *= 10.0
-        if gained < 0.0:
+        if not gained >= 0.0:
             return x
         x, left, damping = new, after, max(0.1 * damping, LEAST_DAMPING)
         if gained <= CLOSE * float(left @ left):
