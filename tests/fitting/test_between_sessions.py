@@ -56,7 +56,7 @@ def test_the_joint_that_moved_is_named_with_size_and_interval(knocked: mc.Fit) -
     assert abs(amount.value - SHIFT) < FIVE * amount.sigma < 0.1 * SHIFT
     assert amount.low95 < amount.value < amount.high95
     assert frame.place == "frame"
-    (said,) = (text for text in knocked.notices if "encoder_zero J3" in text)
+    (said,) = (text for text in knocked.notices if "encoder zero at joint 3" in text)
     assert "from june on by +0.5" in said
     assert "mrad (95 %)" in said
     assert joint.text in said
@@ -121,10 +121,10 @@ def test_campaigns_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFix
         mc.write_measurements(paths[-1], replace(data.take(rows), columns={}))
     assert outcome(["calibrate", ROBOT, *paths, "--objective", "sum"]) == 0
     said = capsys.readouterr().err
-    assert "moved between sessions: encoder_zero J3 from june on by +0.5" in said
+    assert "moved between sessions: encoder zero at joint 3 from june on by +0.5" in said
     found = mc.diagnose(ROBOT, paths, quick=True)
     assert found.verdict == "named"
     (finding,) = found.findings
     assert finding.term.label == "encoder_zero:J3"
     assert_allclose(finding.values[0], SHIFT, atol=FIVE * finding.sigmas[0], rtol=0)
-    assert any("encoder_zero J3: from june on by +0.5" in text for text in found.notices)
+    assert any("encoder zero at joint 3: from june on by +0.5" in text for text in found.notices)

@@ -225,5 +225,8 @@ def test_play_on_data_without_an_order_is_told() -> None:
     assert strangers(cell, ONE) == ()
     unordered = replace(ONE, columns={})
     (said,) = strangers(cell, unordered)
-    assert "backlash:all depends on the way to a pose, which these data do not tell" in said
+    assert (
+        "backlash of the whole arm depends on the way to a pose, which these data do not tell"
+        in said
+    )
     assert strangers(cell, replace(ONE, columns={"approach2": np.ones(ONE.poses)})) == ()
