@@ -19,6 +19,7 @@ SI = {  # what a unit of the command line is
     "mrad": 1e-3,
     "urad": 1e-6,
     "urad/Nm": 1e-6,
+    "kg": 1.0,
 }
 
 

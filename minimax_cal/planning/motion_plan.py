@@ -78,9 +78,8 @@ class MotionOptions:
     )
     payload: float | None = option(
         None,
-        "A known mass at the flange, kg; a part with it tells masses and drive gains apart.",
-        metavar="KG",
-        read=float,
+        "A known mass at the flange; a part with it tells masses and drive gains apart.",
+        "kg",
         group=GROUP,
     )
     rows: float = option(100.0, "Rows a second in the file.", flag="--rows-per-second", group=GROUP)

@@ -17,6 +17,7 @@ from numpy.testing import assert_allclose
 
 import minimax_cal as mc
 from minimax_cal.fitting.instruments import read_relative
+from minimax_cal.fitting.pixels.data import read_board
 from minimax_cal.ground.files import json_of
 from minimax_cal.ground.records import Packed, packed, unpacked
 from minimax_cal.measuring.checks import check_joints
@@ -514,3 +515,14 @@ def test_a_payload_beyond_all_arms_is_refused(
         capsys, "torques", tmp_path / "links.json", tmp_path / "run1.csv", "--payload", "1e308"
     )
     assert "payload" in line
+
+
+def test_a_payload_that_is_no_number_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "payload" in refused(capsys, "plan", "irb120", "--motion", "--payload", "null")
+
+
+def test_a_board_larger_than_a_hall_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "board.csv"
+    path.write_text("target,x_mm,y_mm,z_mm\na,0,0,0\nb,1e300,0,0\nc,0,40,0\n")
+    with pytest.raises(mc.DataError, match=r"board\.csv:3: target 'b' is more than 100 m"):
+        read_board(path)

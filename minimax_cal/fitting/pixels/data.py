@@ -24,6 +24,7 @@ MOST_PIXELS = 1e5  # no sensor has more in a row
 LEAST_SEEN = 2  # pixels of a target of unknown place: fewer say nothing
 LEAST_IMAGES = 4  # with fewer a camera's place says nothing of the arm
 SAME_PLACE = 1e-7  # no two corners are nearer [m]
+LARGEST_BOARD = 100.0  # half its side [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +175,11 @@ def read_board(path: Path | str) -> dict[str, Array]:
     place = np.stack([file.number(f"{axis}_{unit}", unit=unit) for axis in "xyz"], axis=1)
     names = file.text("target")
     for row, name in enumerate(names):
+        if not np.abs(place[row]).max() < LARGEST_BOARD:
+            raise DataError(
+                f"{path}:{file.line[row]}: target {name[:60]!r} is more than {LARGEST_BOARD:g} m "
+                "from the board's origin"
+            )
         if name in names[:row]:
             raise DataError(f"{path}:{file.line[row]}: target {name[:60]!r} stands twice")
     if len(names) < 3:
