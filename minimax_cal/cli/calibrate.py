@@ -216,7 +216,7 @@ def advice(
     diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
     yield f"Next, to find the cause of the remaining {left}", diagnose
     if written and fit.status is Status.CONVERGED:
-        yield "To write a file for MuJoCo", f"minimax-cal export {written} --to mjcf"
+        yield "To write a file for MuJoCo", f"minimax-cal export {written} --to mjcf -o arm.xml"
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

@@ -61,9 +61,9 @@ def export(
     ----------
     fit
         A calibration, its cell, a diagnosis, a relative calibration or a robot, or the file
-        or name of one.
+        or name of one; an MJCF is converted to sdf as it is.
     to
-        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc or mjcf.
+        urdf, ur-yaml, ros-yaml, ros2-control, dh-csv, json, moc, mjcf or sdf.
     path
         Written to as well, where given.
     urdf
@@ -122,6 +122,8 @@ def exported(
 ) -> Exported:
     """The bytes of the file, its notices, and what it delivers; arguments as of `export`."""
     table.exporter(to)
+    if isinstance(fit, Path | str) and Path(fit).suffix.lower() in table.CONVERTERS.get(to, ()):
+        return Exported(to, table.convert(Path(fit)))
     source, found = read_source(fit, rung), None
     if isinstance(source, Job):
         job = source

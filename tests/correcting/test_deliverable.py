@@ -103,7 +103,7 @@ def soft() -> mc.Fit:
 
 
 CARRIED = {
-    **dict.fromkeys(["urdf", "json", "dh-csv", "ros-yaml", "ros2-control", "ur-yaml"], ()),
+    **dict.fromkeys(["urdf", "json", "dh-csv", "ros-yaml", "ros2-control", "ur-yaml", "sdf"], ()),
     "moc": (EFFECTS,),
     "mjcf": (EFFECTS, "backlash:J3", "tool_flex:all"),
     "compensate": (EFFECTS, "backlash:J3"),

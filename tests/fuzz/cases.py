@@ -54,6 +54,8 @@ TEMPLATES = (
     "export fit.json --to ros2-control -o out.xml",
     "export ROBOT --to json -o out.json",
     "export effects.json --to ur-yaml -o out.yaml",
+    "export fit.json --to sdf -o out.sdf",
+    "export links.xml --to sdf -o out.sdf",
     "export fit.json --to urdf --urdf robot.urdf -o out.urdf",
     "report fit.json -o out.html --date 2026-01-01",
     "report effects.json -o out.html --date 2026-01-01 --customer Name",

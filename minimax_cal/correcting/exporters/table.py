@@ -50,7 +50,7 @@ def later(module: str, verb: str) -> Callable[..., Any]:
     return lambda *given: getattr(import_module(module), verb)(*given)
 
 
-MJCF = "minimax_cal.simulators.exporter"
+MJCF, SDF = "minimax_cal.simulators.exporter", "minimax_cal.simulators.sdf"
 EXPORTERS: dict[str, Exporter] = {
     "urdf": Exporter(urdf.write, couples=True),
     "ur-yaml": Exporter(ur_yaml.write),
@@ -60,7 +60,12 @@ EXPORTERS: dict[str, Exporter] = {
     "json": Exporter(robot_json.write, couples=True),
     "moc": Exporter(moc.write, moc.carries),
     "mjcf": Exporter(later(MJCF, "write"), later(MJCF, "carries")),
+    "sdf": Exporter(later(SDF, "write")),
 }
+
+
+CONVERTERS = {"sdf": (".xml", ".mjcf")}  # formats that a simulator's own model is converted to
+convert = later(SDF, "convert")
 
 
 def exporter(to: str) -> Exporter:
