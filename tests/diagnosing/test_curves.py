@@ -92,7 +92,7 @@ def test_play_is_a_turn_of_its_joint_by_the_side_it_came_from() -> None:
     assert_allclose(curve.x, np.degrees(came), rtol=0, atol=1e-9)
     assert curve.xlabel == "last move of joint 5 (deg)"
     assert curve.ylabel == "equivalent turn of joint 5 (mrad)"
-    assert curve.title == "errors as a turn of joint 5, for backlash J5"
+    assert curve.title == "errors as a turn of joint 5, for backlash at joint 5"
     plain, whole, bare = curve.y
     assert_array_equal(np.sign(plain[:-1]), np.sign(came[:-1]))
     assert 0.2 < np.abs(plain[:-1]).max() < 0.6  # half of a milliradian, less the ridge
@@ -163,12 +163,12 @@ def test_time_and_heat_are_drawn_along_their_motion() -> None:
     assert_allclose(np.abs(curve.y[0]), warm.distances()[0], rtol=0, atol=1e-6)
     jump = left_by(fitted("session_jump", "frame", [1e-3, 0, 0, 0, 0, 0], since=0.5))
     curve = residual_curve(jump)
-    assert curve.title == "error of all targets, for session_jump frame"
+    assert curve.title == "error of all targets, for session jump"
     assert_allclose(curve.x[0], np.linspace(1.0, 0.0, M), rtol=0, atol=1e-12)
     assert_allclose(curve.y[0], 1.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
     shift = left_by(fitted("target_shift", "smr2", [0.0, 2e-3, 0.0], since=0.5))
     curve = residual_curve(shift)
-    assert curve.title == "error of smr2, for target_shift smr2"
+    assert curve.title == "error of smr2, for target shift at smr2"
     assert curve.y[0].shape == curve.x.shape == (1, M)
     assert_allclose(curve.y[0], 2.0 * (curve.x >= 0.5), rtol=0, atol=1e-9)
 

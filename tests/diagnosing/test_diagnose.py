@@ -318,7 +318,7 @@ def test_the_whole_law_is_told_and_a_point_that_the_gap_hid() -> None:
     assert len(gear.names) == len(gear.values) == len(gear.sigmas) == 4
     assert all(sigma > 0.0 for sigma in gear.sigmas)
     (said,) = [notice for notice in found.notices if "that no effect found explains" in notice]
-    assert f"line {held[3]} smr1" in said
+    assert f"{made.data.called(held[3])} smr1" in said
     last = found.ladder[-1]
     assert sum(last.holdout.counts) - sum(last.trusted.counts) == len(made.data.target_names)
     assert last.holdout.max_mm > 3.0 * last.trusted.max_mm

@@ -141,7 +141,7 @@ def test_a_diagnosis_tells_the_curve_and_a_fit_compensates_it(robot: Robot, tmp_
     fit = mc.calibrate(robot, data, objective="sum", effects=tmp_path / "diagnosis.json")
     assert fit.accuracy["holdout"].rms_mm < 0.5 * told.ladder[1].holdout.rms_mm
     rows = fit.effect_table().rows
-    assert [row[0] for row in rows] == ["joint_error_map:J2 RMS"]
+    assert [row[0] for row in rows] == ["joint error map at joint 2, RMS"]
     fit.save(tmp_path / "fit.json")
     loaded = mc.load_fit(tmp_path / "fit.json")
     assert_allclose(loaded.predict(q), fit.predict(q), atol=1e-12)

@@ -259,7 +259,7 @@ def test_what_a_gap_hid_is_marked_once_it_is_closed() -> None:
     marked, found = judges.marked(first, last)
     assert np.argwhere(marked.far.any(axis=0)).tolist() == [[2]]
     assert marked.far[:, 2].all()
-    assert found == tuple(f"line {held.line[2]} {name}" for name in held.target_names)
+    assert found == tuple(f"{held.called(int(held.line[2]))} {name}" for name in held.target_names)
     step = marked.step("last", last)
     assert step.holdout.max_mm > 5.0 * step.trusted.max_mm
     mine, _ = judges.marked(last, first)  # what only a model misses is its own

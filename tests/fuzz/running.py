@@ -161,7 +161,7 @@ def truth(one: Case, code: int, out: str, err: str) -> tuple[str, str] | None:
         return "silently wrong", "a page that runs what a file holds"
     if one.expect == "noticed" and not DOUBT.search(err):
         return "silently wrong", f"not a word on {one.broke}"
-    if not out.startswith("{") or "data.csv" not in one.arguments:
+    if not out.startswith("{") or "data.csv" not in one.arguments or "later.csv" in one.arguments:
         return None
     fit = one.arguments[1] if one.command == "evaluate" else ""
     if one.command == "calibrate" or fit in one.files:
