@@ -17,6 +17,7 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 
 HEAVIEST, FARTHEST = 1e4, 10.0  # payload of the largest arms, several times over [kg, m]
+LARGEST = 1e6  # a gear ratio, or a torque for one ampere [N m/A], and 1 / the least
 
 Payload = tuple[float, tuple[float, float, float]]
 
@@ -88,8 +89,11 @@ def gains_of(robot: Robot, runs: Sequence[Run], given: Sequence[float] | None) -
         return np.ones(n)
     own = robot.drive_gain
     gain = np.array(own if given is None else given, dtype=float)
-    if given is not None and (gain.shape != (n,) or not np.all(gain > 0.0)):
-        raise OptionError(f"drive_gain must be {n} positive numbers, N m per A, one for each joint")
+    if given is not None and (gain.shape != (n,) or not np.all(gain > 0.0) or extreme(gain)):
+        raise OptionError(
+            f"drive_gain must be {n} positive numbers up to {LARGEST:g}, N m per A, one for each "
+            "joint"
+        )
     return gain if gain.size and np.isfinite(gain).all() else np.zeros(0)
 
 
@@ -109,6 +113,15 @@ def ratios_of(robot: Robot, given: float | Sequence[float] | None) -> Array:
     if given is None:
         return robot.ratio
     values = np.atleast_1d(np.array(given, dtype=float))
-    if values.shape not in ((1,), (robot.joints,)) or not np.all(values != 0.0):
-        raise OptionError(f"ratio must be a number, or one for each of {robot.joints} joints")
+    if values.shape not in ((1,), (robot.joints,)) or extreme(values):
+        raise OptionError(
+            f"ratio must be a number, or one for each of {robot.joints} joints, between "
+            f"{1.0 / LARGEST:g} and {LARGEST:g}"
+        )
     return np.array(np.broadcast_to(values, robot.joints))
+
+
+def extreme(values: Array) -> bool:
+    """Whether a number is zero, none, or of a size that no drive has."""
+    size = np.abs(values)
+    return not bool(np.all((size >= 1.0 / LARGEST) & (size <= LARGEST)))

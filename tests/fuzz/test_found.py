@@ -506,15 +506,16 @@ def test_a_motion_diagnosis_of_other_parts_is_refused(
     assert "motion.json" in refused(capsys, "report", path)
 
 
-def test_a_payload_beyond_all_arms_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("option", ["payload", "ratio"])
+def test_numbers_beyond_all_arms_are_refused(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("links.json", "run1.csv"):
         (tmp_path / name).write_bytes(material()[name])
     line = refused(
-        capsys, "torques", tmp_path / "links.json", tmp_path / "run1.csv", "--payload", "1e308"
+        capsys, "torques", tmp_path / "links.json", tmp_path / "run1.csv", f"--{option}", "1e308"
     )
-    assert "payload" in line
+    assert option in line
 
 
 def test_a_payload_that_is_no_number_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
