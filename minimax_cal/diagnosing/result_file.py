@@ -237,14 +237,12 @@ def read(content: Mapping[str, Any], source: str) -> Diagnosis:
     if content.get("kind") != "diagnosis":
         raise CalibrationError(f"{source}: is no diagnosis; {AGAIN} diagnose")
     part = checked(DiagnosisPart, content, source)
-    key = "rungs" if content.get("rungs") else "cells"  # an earlier version kept two of them
-    cells = tuple(
-        cell_from_dict(cell, f"{source}: {key}[{i}]") for i, cell in enumerate(content.get(key, ()))
-    )
+    listed = enumerate(content.get("rungs", ()))
+    cells = tuple(cell_from_dict(cell, f"{source}: rungs[{i}]") for i, cell in listed)
     if len({(cell.robot.joints, cell.target_names) for cell in cells}) > 1:
         raise CalibrationError(f"{source}: its cells are not of one arm; {AGAIN} diagnose")
-    if key == "cells":
-        return assembled(content, source, part, cells)
+    if not cells:
+        raise CalibrationError(f"{source}: holds no arm; {AGAIN} diagnose")
     return replace(assembled(content, source, part, cells[1:]), nominal=cells[0])
 
 

@@ -64,9 +64,6 @@ from minimax_cal.measuring.spans import Span
 from minimax_cal.modelling.cell import Cell, cell_from_dict
 from minimax_cal.modelling.parameters import Names
 from minimax_cal.robots.frames import CONVENTION
-from minimax_cal.robots.kinematics import rotation
-from minimax_cal.robots.robot import robot_from_dict
-from minimax_cal.robots.transforms import transform
 from minimax_cal.solvers.minimax import Kkt, Step
 from minimax_cal.solvers.status import Status
 
@@ -397,7 +394,7 @@ def read(content: Mapping[str, Any], source: str) -> Fit:
     data, held, told = measured_poses(content, source, cell, "nominal")
     exact = restored(data.y, arrays.get("measured"))
     data = replace(data, y=exact, digest=part.provenance.data_sha256)
-    nominal = nominal_of(content, source, cell, arrays)
+    nominal = nominal_of(content, source, arrays)
     before, after = errors_of(nominal, data, told[0]), errors_of(cell, data, told[1])
     made = assembled(content, source, part, arrays, cell, nominal, data, held, before, after)
     return replace(made, stated_geometric=geometric)
@@ -500,34 +497,12 @@ def refined_pose(pose: Array, exact: Array | None) -> Array:
 CELL = ("mdh", "com", "up", "base", "targets")
 
 
-def nominal_of(
-    content: Mapping[str, Any], source: str, cell: Cell, arrays: Mapping[str, Array]
-) -> Cell | None:
-    """The nominal robot in its place; from the table of parameters where an old file has no more.
-
-    Base entries are told there along the nominal base's axes.
-    """
+def nominal_of(content: Mapping[str, Any], source: str, arrays: Mapping[str, Array]) -> Cell | None:
+    """The nominal robot in its place; None where the file tells none."""
     if "nominal_robot" not in content:
         return None
-    robot = robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot")
-    if "nominal_cell" in content:
-        whole = {"robot": content["nominal_robot"], **content["nominal_cell"]}
-        return refined(cell_from_dict(whole, f"{source}: nominal_cell"), arrays, "nominal")
-    told = {p["name"]: p for p in content["parameters"]}
-    try:
-        at, was = (
-            np.array([told[f"base_{axis}"][key] for axis in "xyz"], dtype=float) * 1e-3
-            for key in ("value", "nominal")
-        )
-        turn = np.array([told[f"base_r{axis}"]["value"] for axis in "xyz"], dtype=float)
-        targets = [[told[f"{name}_{a}"]["nominal"] for a in "xyz"] for name in cell.target_names]
-    except FAULTS:
-        return None
-    axes = cell.base[:3, :3] @ rotation(-turn)
-    base = transform(axes, axes @ was)
-    if not np.abs(axes @ at - cell.base[:3, 3]).max() < 1e-5:
-        return None
-    return Cell(robot, base, cell.target_names, 1e-3 * np.array(targets, dtype=float))
+    whole = {"robot": content["nominal_robot"], **content["nominal_cell"]}
+    return refined(cell_from_dict(whole, f"{source}: nominal_cell"), arrays, "nominal")
 
 
 def measured_poses(

@@ -246,25 +246,14 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
 
 
 def rungs_of(content: Mapping[str, Any], source: str) -> tuple[Rung, ...]:
-    """The rungs of a diagnosis' JSON; earlier versions kept the geometric and the last alone.
-
-    Raises CalibrationError, or one of `records.FAULTS`.
-    """
-    if listed := content.get("rungs"):
-        return tuple(
-            Rung(str(each["name"]), cell_from_dict(each, f"{source}: rungs[{i}]"))
-            for i, each in enumerate(listed)
-        )
-    cells = [
-        cell_from_dict(cell, f"{source}: cells[{i}]")
-        for i, cell in enumerate(content.get("cells", ()))
-    ]
-    if not cells:
+    """The rungs of a diagnosis' JSON.  Raises CalibrationError, or one of `records.FAULTS`."""
+    listed = content.get("rungs")
+    if not listed:
         raise CalibrationError(f"{source}: holds no arm; write it again with this version")
-    steps = [str(step["step"]) for step in content["gap"]["ladder"]]
-    names = (NOMINAL, GEOMETRIC, *(name for name in steps if name.startswith("+ ")))
-    told = {GEOMETRIC: cells[0], names[-1]: cells[-1]}
-    return tuple(Rung(name, told.get(name)) for name in names)
+    return tuple(
+        Rung(str(each["name"]), cell_from_dict(each, f"{source}: rungs[{i}]"))
+        for i, each in enumerate(listed)
+    )
 
 
 # ---- the effects of a diagnosis, for a fit -----------------------------------------------------

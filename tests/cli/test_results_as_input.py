@@ -12,7 +12,6 @@ import minimax_cal as mc
 from minimax_cal.diagnosing.result import load_diagnosis
 from minimax_cal.fitting.instruments import flange_poses, write_relative
 from minimax_cal.fitting.opened import open_result
-from minimax_cal.judging.saved import open_saved
 from minimax_cal.modelling.simulate import Truth, simulate
 
 MM = 1e-6  # of numbers that went through a file in mm
@@ -80,19 +79,6 @@ def test_rungs_are_those_of_the_ladder(
     assert again.nominal is not None
     assert run("evaluate", here / "diagnosis.json", here / "gap.csv", "--rung", 9) == 2
     assert "has no step 9; it has 0 (nominal), 1 (geometric)" in capsys.readouterr().err
-
-
-def test_a_diagnosis_that_kept_two_arms_is_read(here: Path) -> None:
-    content = json.loads((here / "diagnosis.json").read_text())
-    del content["rungs"]
-    old = here / "old.json"
-    old.write_text(json.dumps(content))
-    for number in (1, len(content["gap"]["ladder"]) - 1):
-        one, other = (open_result(path, number) for path in (old, here / "diagnosis.json"))
-        assert_allclose(one.cell.robot.mdh, other.cell.robot.mdh, atol=1e-12)
-    with pytest.raises(mc.CalibrationError, match=r"does not hold the arm of step 0 \(nominal\)"):
-        mc.evaluate(old, here / "gap.csv", rung=0)
-    assert "after" in open_saved(old, nominal="ur10").cells
 
 
 def test_a_relative_calibration_is_placed_by_the_data(here: Path) -> None:

@@ -286,12 +286,12 @@ def test_no_chapter_is_empty(results: Path, given: str, lacking: str) -> None:
     assert {"accuracy", "workspace"} < set(told)
 
 
-def test_old_files_without_poses_give_their_tables(
+def test_files_without_poses_give_their_tables(
     tmp_path: Path, fit: dict[str, Any], gap: dict[str, Any]
 ) -> None:
-    for key in ("poses", "nominal_cell", "trace_mm2", "minimax", "advice"):
+    for key in ("poses", "trace_mm2", "minimax", "advice"):
         del fit[key]
-    for key in ("poses", "cells", "curves"):
+    for key in ("poses", "curves"):
         del gap[key]
     seen = rendered(tmp_path, fit, gap)
     assert "holds no poses" in seen.text["accuracy"]
