@@ -319,6 +319,8 @@ def check_parts(found: MotionDiagnosis, joints: int) -> None:
             raise ValueError("curves: numbers of one curve differ in their count")
     if len(found.curves) > joints or not found.models:
         raise ValueError("its curves or models are not of the arm")
+    if not all(one.parameters and one.worth for one in found.effects):
+        raise ValueError("effects: one has no parameters, or no worth")
     others = [other.effect for one in found.effects for other in one.alternatives]
     named = [*(one.effect for one in found.effects), *others]
     named += [untested.effect for untested in found.not_testable]

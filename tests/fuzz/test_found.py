@@ -497,6 +497,7 @@ def lengthen_a_step(content: Any) -> None:
         lambda content: content["held_run"]["measured"][0].pop(),
         lambda content: content["not_testable"].append({"effect": "x", "place": "J1", "needs": ""}),
         lengthen_a_step,
+        lambda content: content["effects"][0].update(parameters=[]),
     ],
 )
 def test_a_motion_diagnosis_of_other_parts_is_refused(
