@@ -246,15 +246,7 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     if not options.quick:
         beyond = beyond_of(study, causes, judges, options.holdout_by, step_of(PARTS))
     wrong = against(robot, floor, steps[-1])
-    alarming = (*doubts(robot, study.fit, study.nominal.error(study.data)), *filter(None, [wrong]))
-    unread = filter(None, [study.scene.unused_torques])
-    told = (*asked.data.notices, *notices, *clean.remarks, *unread)
-    if late:
-        told = (*told, f"outliers that no effect found explains: {name_first(late)}")
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
-    every = ladder.last.cell.placed(clean.given)
-    told = (*told, *contradictions(every, ladder.last.cell.error(every)))
-    told = (*told, *session_notices(study, effects))
     settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
@@ -272,7 +264,16 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         structure_in=unexplained,
         where=located(study).to_dict(),
         not_testable=causes.untestable,
-        notices=(*told, *study.fit.notices, *foot_notices(ladder.last, clean.data), *alarming),
+        notices=(
+            *asked.data.notices,
+            *notices,
+            *notices_of(study, clean, ladder, late),
+            *session_notices(study, effects),
+            *study.fit.notices,
+            *foot_notices(ladder.last, clean.data),
+            *doubts(robot, study.fit, study.nominal.error(study.data)),
+            *filter(None, [wrong]),
+        ),
         provenance=Provenance.of(robot, asked.data, settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
@@ -284,6 +285,16 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         with_them=counted,
         meets_floor=known.meets_floor,
     )
+
+
+def notices_of(study: Study, clean: Clean, ladder: Ladder, late: tuple[str, ...]) -> Iterator[str]:
+    """What the reader should know about the data.  late: outliers that the gap had hidden."""
+    yield from clean.remarks
+    yield from filter(None, [study.scene.unused_torques])
+    if late:
+        yield f"outliers that no effect found explains: {name_first(late)}"
+    every = ladder.last.cell.placed(clean.given)
+    yield from contradictions(every, ladder.last.cell.error(every))
 
 
 def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:

@@ -386,12 +386,6 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, and more; `from_dict` reads it back."""
-
-        def held(kind: str, of: str = "holdout") -> dict[str, float | None]:
-            chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
-                      "final": self.ladder[-1]}  # fmt: skip
-            return {k: finite(getattr(getattr(step, of), kind)) for k, step in chosen.items()}
-
         return {
             "schema": SCHEMA,
             "kind": "diagnosis",
@@ -409,31 +403,7 @@ class Diagnosis:
                 if self.with_them
                 else {}
             ),
-            "gap": {
-                "holdout_rms_mm": held("rms_mm"),
-                "holdout_max_mm": held("max_mm"),
-                "trusted_rms_mm": held("rms_mm", "trusted"),
-                "beyond": self.beyond.to_dict(),
-                "noise_floor_mm": finite(self.floor.value),
-                "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
-                "noise_floor_from": self.floor.source,
-                "minor_effects": {
-                    "count": len(self.minor),
-                    "explained_mm": self.minor_sizes[0],
-                    "gain_mm": self.minor_sizes[1],
-                },
-                "closed": finite(self.closed),
-                "closed_ci95": list(self.closed_ci) if self.has_interval else None,
-                "ladder": [
-                    {
-                        "step": step.name,
-                        "train": step.train.to_dict(),
-                        "holdout": step.holdout.to_dict(),
-                        "trusted": step.trusted.to_dict(),
-                    }
-                    for step in self.ladder
-                ],
-            },
+            "gap": self.gap_dict(),
             "frames": {name: frame.to_dict() for name, frame in self.frames.items()},
             "frames_convention": CONVENTION,
             "remainder": self.remainder.to_dict() if self.remainder else None,
@@ -453,6 +423,40 @@ class Diagnosis:
             "notices": list(self.notices),
             "seconds": self.seconds,
             "provenance": vars(self.provenance),
+        }
+
+    def gap_dict(self) -> dict[str, Any]:
+        """The error budget of `to_dict`."""
+
+        def held(kind: str, of: str = "holdout") -> dict[str, float | None]:
+            chosen = {"nominal": self.ladder[0], "geometric": self.ladder[1],
+                      "final": self.ladder[-1]}  # fmt: skip
+            return {k: finite(getattr(getattr(step, of), kind)) for k, step in chosen.items()}
+
+        return {
+            "holdout_rms_mm": held("rms_mm"),
+            "holdout_max_mm": held("max_mm"),
+            "trusted_rms_mm": held("rms_mm", "trusted"),
+            "beyond": self.beyond.to_dict(),
+            "noise_floor_mm": finite(self.floor.value),
+            "noise_floor_range_mm": [finite(self.floor.low), finite(self.floor.high)],
+            "noise_floor_from": self.floor.source,
+            "minor_effects": {
+                "count": len(self.minor),
+                "explained_mm": self.minor_sizes[0],
+                "gain_mm": self.minor_sizes[1],
+            },
+            "closed": finite(self.closed),
+            "closed_ci95": list(self.closed_ci) if self.has_interval else None,
+            "ladder": [
+                {
+                    "step": step.name,
+                    "train": step.train.to_dict(),
+                    "holdout": step.holdout.to_dict(),
+                    "trusted": step.trusted.to_dict(),
+                }
+                for step in self.ladder
+            ],
         }
 
     @property
