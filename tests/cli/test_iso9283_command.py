@@ -105,15 +105,12 @@ def test_the_file_of_the_fit_says_the_same(fit: Path, poses: Path, tmp_path: Pat
     assert any("is not the file of the fit; 48 of its 60 rows" in n for n in again["notices"])
 
 
-def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path, folder: Path) -> None:
-    """Without a nominal cell the table of parameters tells it; a robot that is named is placed."""
+def test_a_nominal_arm_is_placed_where_the_fit_placed_it(fit: Path) -> None:
+    """A robot that is named is placed as the fit placed its own."""
     told = values(fit)["parts"]["holdout"]["cells"]["before"]["AP_mm"]
-    older = without(fit, folder, "nominal_cell")
-    for arguments in ((older,), (fit, "--nominal", "irb2600")):
-        found = values(*arguments)
-        placed = any("is placed where it fits 48 poses best" in n for n in found["notices"])
-        assert placed == ("--nominal" in arguments)
-        assert found["parts"]["holdout"]["cells"]["before"]["AP_mm"] == pytest.approx(told)
+    found = values(fit, "--nominal", "irb2600")
+    assert any("is placed where it fits 48 poses best" in notice for notice in found["notices"])
+    assert found["parts"]["holdout"]["cells"]["before"]["AP_mm"] == pytest.approx(told)
 
 
 def test_new_poses_are_all_held_out(
