@@ -11,6 +11,7 @@ import click
 from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options
 from minimax_cal.cli.options import DETAILS, PATH, InGroups, Output, options_of, result_options
+from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import read_logs, runs_of, torque_gains
 from minimax_cal.dynamics.result import MotionDiagnosis
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 ARM = "The arm"
 JUDGED = "What judges"
-MODELS = (".xml", ".mjcf")  # of MuJoCo
 
 
 def model_of(name: str, runs: Sequence[Run]) -> Robot | str:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
@@ -99,7 +100,7 @@ def simulator_gap(
     began = time.perf_counter()
     check_chance(holdout, seed)
     if write is not None:
-        check_writable(write, (".xml", ".mjcf"))
+        check_writable(write, MODELS)
     mujoco()
     progress("reading the model")
     rows = data if isinstance(data, Measurements) else read_measurements(data)

@@ -5,7 +5,7 @@ The frame of a link is that of its body; a joint stands at its anchor, its axis 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -13,13 +13,15 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.correcting.exporters.job import Export, Job, number
+from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.correcting.exporters.urdf import assumptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import RobotError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.robots.transforms import to_rpy, transform
 from minimax_cal.simulators.arm import arm_of
 from minimax_cal.simulators.chain import mujoco
+from minimax_cal.simulators.elements import numbers
 from minimax_cal.simulators.given import read_model
 from minimax_cal.simulators.mjcf import new_tree, text_of
 
@@ -34,7 +36,8 @@ def write(job: Job) -> Export:
     """A new SDF of an arm: geometry, masses, limits and targets."""
     cell = job.cell or Cell(job.robot, np.eye(4), (), np.zeros((0, 3)))
     made = text_of(new_tree(arm_of(cell, job.q), cell.target_names))
-    return as_sdf(mujoco().MjModel.from_xml_string(made.decode()), job.robot.name, job.source)
+    found = as_sdf(mujoco().MjModel.from_xml_string(made.decode()), job.robot.name, job.source)
+    return replace(found, notices=(assumptions(job.robot), *found.notices))
 
 
 def convert(path: Path) -> Export:
@@ -107,13 +110,8 @@ def name_of(model: Any, body: int) -> str:
 def element(parent: ET.Element, tag: str, value: object) -> ET.Element:
     """A child with a number or text."""
     made = ET.SubElement(parent, tag)
-    made.text = number(float(value)) if isinstance(value, int | float) else str(value)
+    made.text = numbers([value]) if isinstance(value, int | float) else str(value)
     return made
-
-
-def numbers(values: Any) -> str:
-    """Numbers that read back as the same."""
-    return " ".join(number(value) for value in np.ravel(values))
 
 
 def frame_pose(parent: ET.Element, at: Array, relative_to: str = "") -> None:

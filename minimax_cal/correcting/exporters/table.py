@@ -16,7 +16,7 @@ from minimax_cal.correcting.exporters import (
     ur_yaml,
     urdf,
 )
-from minimax_cal.correcting.exporters.job import Export, Job
+from minimax_cal.correcting.exporters.job import MODELS, Export, Job
 from minimax_cal.fitting.options import OFFSETS
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
@@ -64,7 +64,7 @@ EXPORTERS: dict[str, Exporter] = {
 }
 
 
-CONVERTERS = {"sdf": (".xml", ".mjcf")}  # formats that a simulator's own model is converted to
+CONVERTERS = {"sdf": MODELS}  # formats that a simulator's own model is converted to
 convert = later(SDF, "convert")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import Payload, read_logs, runs_of
 from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
@@ -25,7 +26,7 @@ from minimax_cal.simulators.motion.correct import Bench, correct
 from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.module import ENDING
-from minimax_cal.simulators.motion.opened import MODELS, Opened, calibrated, open_model
+from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
 from minimax_cal.simulators.motion.result import MotionGap
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
@@ -23,8 +24,6 @@ from minimax_cal.simulators.given import (
 )
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.written import new_model, weigh_drawn
-
-MODELS = (".xml", ".mjcf")
 
 
 @dataclass(frozen=True, eq=False)
