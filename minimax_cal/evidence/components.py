@@ -8,10 +8,10 @@ import numpy as np
 
 from minimax_cal.ground.arrays import Array
 
-ROUNDS = 60
-SETTLED = 1e-3  # relative change of every variance
-LEAST, MOST = 1e-10, 1e6  # variance of a factor
-RIDGE = 1e-12  # of the sum that a factor pays for
+MAX_ROUNDS = 60
+VARIANCE_TOLERANCE = 1e-3  # relative change of every variance in the last round
+MIN_VARIANCE, MAX_VARIANCE = 1e-10, 1e6  # of a factor, the first of the noise too
+MIN_DOF = 1e-12  # of a factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,23 +28,23 @@ class Components:
     moment: Array
 
 
-def likeliest(gram: Array, pull: Array, square: float, dof: int, group: Array) -> Components:
+def likeliest(gram: Array, gradient: Array, square: float, dof: int, group: Array) -> Components:
     """Restricted maximum likelihood by its fixed point [Harville 1977].
 
-    gram: (c, c) products of the factors' columns, parameters taken out.  pull: (c,) their products
-    with the errors.  square: of the errors.  dof: numbers less parameters.  group: (c,) whose
-    factors share a variance.
+    gram: (c, c) products of the factors' columns, parameters taken out.  gradient: (c,) their
+    products with the errors.  square: of the errors.  dof: numbers less parameters.  group: (c,)
+    whose factors share a variance.
     """
-    variance, noise = np.ones(int(group.max(initial=-1)) + 1), max(square / dof, LEAST)
-    for _ in range(ROUNDS):
+    variance, noise = np.ones(int(group.max(initial=-1)) + 1), max(square / dof, MIN_VARIANCE)
+    for _ in range(MAX_ROUNDS):
         before = np.append(variance, noise)
         cover = np.linalg.inv(gram / noise + np.diag(1.0 / variance[group]))
-        mean = cover @ pull / noise
+        mean = cover @ gradient / noise
         told = np.maximum(1.0 - np.diag(cover) / variance[group], 0.0)
-        one = np.bincount(group, mean**2) / (np.bincount(group, told) + RIDGE)
-        left = square - 2.0 * mean @ pull + mean @ gram @ mean
-        noise = max(left / max(dof - told.sum(), 1.0), LEAST)
-        variance = np.clip(one, LEAST, MOST)
-        if np.all(np.abs(np.log(np.append(variance, noise) / before)) < SETTLED):
+        one = np.bincount(group, mean**2) / (np.bincount(group, told) + MIN_DOF)
+        left = square - 2.0 * mean @ gradient + mean @ gram @ mean
+        noise = max(left / max(dof - told.sum(), 1.0), MIN_VARIANCE)
+        variance = np.clip(one, MIN_VARIANCE, MAX_VARIANCE)
+        if np.all(np.abs(np.log(np.append(variance, noise) / before)) < VARIANCE_TOLERANCE):
             break
     return Components(float(noise), variance, mean, cover + np.outer(mean, mean))

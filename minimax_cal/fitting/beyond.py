@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.fitting.identify import redundant
+from minimax_cal.fitting.identify import RESOLUTION, redundant
 from minimax_cal.fitting.intervals import max_interval, rms_interval, told
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, PartSums, Poses
 from minimax_cal.ground.arrays import Array
@@ -31,13 +31,10 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.status import Status
 
-MAX_CONDITION_GROWTH = (
-    3.0  # a part is needed, and not left out, if the condition without it is so much worse
-)
-RANK_TOLERANCE = 1e-3  # singular value below which a parameter is lost, as `identify.RESOLUTION`
-MAX_SECOND_STEP = (
-    5e-3  # of a part's error: a fit that another step would move there by less has arrived
-)
+# a part is needed, and not left out, if the condition without it is so much worse
+MAX_CONDITION_GROWTH = 3.0
+# of a part's error: a fit that another step would move there by less has arrived
+MAX_SECOND_STEP = 5e-3
 MAX_SHOWN_PARTS = 4  # parts, the worst, for people
 NOTHING_LEFT = "every part of the poses is needed for the fit"
 
@@ -290,7 +287,7 @@ def are_needed(gram: Array, parts: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     alike = np.concatenate([gram[None], gram - parts]) / np.outer(scale, scale)
     size = np.sqrt(np.maximum(np.linalg.eigvalsh(alike), 0.0))
-    kept = (size > RANK_TOLERANCE * size[:, -1:]).sum(axis=1)
+    kept = (size > RESOLUTION * size[:, -1:]).sum(axis=1)
     whole, rest, had = size[0], size[1:], int(kept[0])
     wider = rest[:, -1] * whole[-had] > MAX_CONDITION_GROWTH * whole[-1] * rest[:, -had]
     return np.asarray((kept[1:] < had) | wider)
@@ -342,9 +339,8 @@ def unidentified(poses: Poses, part: Array, asked: Array) -> Array:
         gram = poses.normal_matrix - np.diag(poses.prior) - part
         own = np.maximum(np.diag(gram), 0.0)
         gram[np.diag_indices_from(gram)] = np.where(poses.prior > 0.0, 2.0 * own, own)
-        out[
-            redundant(gram, np.ones(len(asked), dtype=bool), np.flatnonzero(asked), RANK_TOLERANCE)
-        ] = True
+        every = np.ones(len(asked), dtype=bool)
+        out[redundant(gram, every, np.flatnonzero(asked), RESOLUTION)] = True
     return out
 
 

@@ -31,9 +31,8 @@ MAX_P_VALUE, MAX_DOUBTFUL_P_VALUE = (
     0.003,
     0.05,
 )  # that lengths which are off at random agree so well on a share
-MIN_CLEAR_SIGMAS = (
-    3.0  # sigmas of what the angles let expect, beside which doubtful agreement is enough
-)
+# sigmas of what the angles let expect, beside which doubtful agreement is enough
+MIN_CLEAR_SIGMAS = 3.0
 MEDIAN = 0.6745  # of a Gaussian's absolute value, in sigmas
 
 

@@ -23,9 +23,8 @@ from minimax_cal.modelling.parameters import State
 
 MIN_HELD_POSES = 20  # held-out poses; of fewer a share is left out in turn as well
 FOLDS = 10  # parts of the training poses: a fit without one has nearly all of them
-MIN_NUMBERS_PER_PARAMETER = (
-    3.0  # numbers measured per parameter; with fewer, errors on new poses are far larger
-)
+# numbers measured per parameter; with fewer, errors on new poses are far larger
+MIN_NUMBERS_PER_PARAMETER = 3.0
 FREE = 6  # numbers that a pose tells at most, however many targets it shows
 NOT_CROSSED = np.zeros((0, 0, 3))
 

@@ -23,7 +23,7 @@ from minimax_cal.fitting.crossed import NOT_CROSSED, Within, intervals_of
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval, max_interval, rms_interval, told
 from minimax_cal.fitting.minimax_problem import Distances, trusted_distances
-from minimax_cal.fitting.options import Options, options_from
+from minimax_cal.fitting.options import Options, read_options
 from minimax_cal.fitting.set_aside import WithThem, aside_sentence
 from minimax_cal.fitting.suspects import Suspect, aside, table_of
 from minimax_cal.fitting.uncertainty import Estimator, Uncertainty, quantile
@@ -489,7 +489,7 @@ class Fit:
     @property
     def options(self) -> Options:
         """How it was made, its effects with the variants that were chosen."""
-        return options_from(self.provenance.settings, effects=self.cell.effects.terms)
+        return read_options(self.provenance.settings, effects=self.cell.effects.terms)
 
     @property
     def is_after_check(self) -> bool:

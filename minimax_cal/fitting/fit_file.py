@@ -31,7 +31,7 @@ from minimax_cal.fitting.fit import (
 )
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.intervals import Interval
-from minimax_cal.fitting.options import options_from
+from minimax_cal.fitting.options import read_options
 from minimax_cal.fitting.set_aside import WithThem
 from minimax_cal.fitting.suspects import Suspect
 from minimax_cal.fitting.uncertainty import Uncertainty, uncertainty_from_dict
@@ -413,7 +413,7 @@ def assembled(
     after: Array,
 ) -> Fit:
     """The fit from what was read.  Raises one of FAULTS."""
-    options_from(part.provenance.settings)  # what later work rests on
+    read_options(part.provenance.settings)  # what later work rests on
     known = uncertainty_of(content, source, cell, arrays)
     parameters = Parameters(parameters_of(part, arrays), known.dof if known else math.nan)
     train = data.take(~held)

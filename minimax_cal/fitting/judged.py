@@ -11,9 +11,7 @@ import numpy as np
 
 from minimax_cal.fitting.between_sessions import between_sessions
 from minimax_cal.fitting.changed import Change
-from minimax_cal.fitting.checks import (
-    POOR_FIT,
-)
+from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.claims import (
     bad_rows,
     beyond_of,
@@ -35,10 +33,7 @@ from minimax_cal.fitting.fit import (
     link_by_link,
 )
 from minimax_cal.fitting.improvement import Improvement, no_better, rms_of, said_without
-from minimax_cal.fitting.options import (
-    Options,
-    qp_name,
-)
+from minimax_cal.fitting.options import Options, qp_name
 from minimax_cal.fitting.outcome import (
     compared,
     exchanged_rows,
@@ -350,10 +345,8 @@ def worst_case(
     best, weights = solved.optimum, solved.robust.weights
     if best is None:
         return None
-    labels, size = (
-        train.target_names,
-        np.array(accuracy(np.sqrt(weights)[..., None] * error).sse_mm2),
-    )
+    labels = train.target_names
+    size = np.array(accuracy(np.sqrt(weights)[..., None] * error).sse_mm2)
     chosen = np.arange(len(best.mu))
     if PER[objective] == "point":
         points = np.argwhere(weights > 0.0)

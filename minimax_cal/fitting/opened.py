@@ -15,7 +15,7 @@ import numpy as np
 
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.fit import Fit
-from minimax_cal.fitting.options import Options, options_from
+from minimax_cal.fitting.options import Options, read_options
 from minimax_cal.fitting.start import fit_base
 from minimax_cal.fitting.stations import MIN_FRAME_POINTS, moving
 from minimax_cal.fitting.uncertainty import Uncertainty
@@ -239,7 +239,7 @@ def of_diagnosis(content: Mapping[str, Any], source: str) -> Opened:
     firm = {term.text for term in confirmed(content, known)}
     return Opened(
         source, rungs, len(rungs) - 1, data, held, digest, status=status, spans=spans,
-        options=options_from(settings, objective="sum") if data.poses else None,
+        options=read_options(settings, objective="sum") if data.poses else None,
         outside=checked(BeyondPart, content["gap"].get("beyond", {}), source).beyond,
         possible=frozenset(term.text for term in known) - firm,
     )  # fmt: skip

@@ -225,7 +225,7 @@ class Options:
         return {**vars(self), "effects": effects, "qp": qp_name(self.qp)}
 
 
-def options_from(settings: Mapping[str, object], **given: object) -> Options:
+def read_options(settings: Mapping[str, object], **given: object) -> Options:
     """The options that a result's file holds, but for those given.  Raises ValueError."""
     kept: dict[str, object] = {}
     for name, reader in readers().items():

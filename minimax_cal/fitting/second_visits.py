@@ -21,9 +21,8 @@ from minimax_cal.measuring.measurements import Measurements
 MIN_GUILTY_RATIO = 3.0  # times the error of the other visit: the one that is wrong
 MAX_NAMED_PAIRS = 8  # pairs that are told
 USUAL_QUANTILE = 0.95  # share of the other visits that keep to what is told of them
-MIN_GROSS_RATIO = (
-    4.0  # times that: drift, growth and nests that shift part visits by less (blind_gap)
-)
+# times that: drift, growth and nests that shift part visits by less (blind_gap)
+MIN_GROSS_RATIO = 4.0
 
 
 def contradictions(data: Measurements, error: Array) -> Iterator[str]:

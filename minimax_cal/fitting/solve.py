@@ -56,17 +56,15 @@ MIN_TARGET_WEIGHT = 1e-3  # least weight of a target in a covariance, as in the 
 LEAST_NOISE = 5e-6  # of a coordinate, when a fit with priors leaves no residual to judge by [m]
 AT_BOUND = "at its bound"
 MAX_ROUNDING = 1e-9  # an error below is rounding: data that were computed, not measured [m]
-MIN_HOPELESS_MISS = (
-    10.0 * POOR_FIT
-)  # worst errors above this share of the reach: no calibration, so that
+# worst errors above this share of the reach: no calibration, so that
+MIN_HOPELESS_MISS = 10.0 * POOR_FIT
 LAST_STEPS = 20  # of the SQP are enough to say so; its QPs then go from backend to backend
 # Relative singular value from which a parameter joins at the answer.  Axes drawn parallel show it
 # by about their angle in rad: a few 1e-3 in whole arms, where it would be noise.  Of random arms
 # whose angles are off by up to 0.5 rad some need 2e-2 (`experiments random_arms`).
 MIN_GROWN_SINGULAR = 1e-2
-MAX_REMAINING_COST = (
-    0.5  # of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
-)
+# of the cost: one that shows less joins if so much is left (of those arms, 0.1 to 0.4)
+MAX_REMAINING_COST = 0.5
 MAX_GROWTHS = 3  # times that it is asked again
 LEAST_POSES = 3  # of a target in the fit; with fewer its own place explains all
 PER = {"minimax": "target", "point": "point"}  # objectives that ask for the worst of something

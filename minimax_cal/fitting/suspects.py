@@ -24,9 +24,8 @@ from minimax_cal.solvers.least_squares import solve_normal
 from minimax_cal.solvers.scalar import least_between
 
 FALSE_DISCOVERY_RATE = 0.01  # share of a list that is expected to be ordinary points
-MIN_VARIANCE_SHARE = (
-    0.01  # a fit that leaves less of a direction's variance hides what is wrong there
-)
+# a fit that leaves less of a direction's variance hides what is wrong there
+MIN_VARIANCE_SHARE = 0.01
 RIDGE = 1e-10  # of each parameter's own weight: one that the kept points do not tell is open
 MIN_POINTS_LEFT = 2.0 / 3.0  # of the points: where fewer are no suspects, all count
 MIN_HELD_EXCESS = 1.5  # times what any point of the fit is off: a held-out point that is suspect

@@ -39,9 +39,8 @@ from minimax_cal.solvers.least_squares import solve_normal
 
 MAX_DRAWN_POSES = 1000  # poses that tell all; of more, so many are drawn
 LEAST_DOF = 3.0  # degrees of freedom that tell two noises apart
-MIN_SHARE_WITHOUT_ONE = (
-    1e-3  # of what all poses tell of a direction, all but one must tell this share
-)
+# of what all poses tell of a direction, all but one must tell this share
+MIN_SHARE_WITHOUT_ONE = 1e-3
 # A fit of the worst point rests on a few points: other noise would choose others.  With this share
 # of the mean multiplier as the least of any point, `by_noise` covers as it should; no theory says
 # so, but runs with 30 to 160 poses, one target and three (experiments.coverage shows some).

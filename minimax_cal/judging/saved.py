@@ -25,9 +25,8 @@ from minimax_cal.robots.robot import load_robot
 
 BEFORE, AFTER = "before", "after"
 MAX_OWN_ERROR = 1e-6  # a file's own errors come back to this, or its effects need more columns [m]
-MAX_MISS_OF_REACH = (
-    5e-3  # errors above this share of the arm's reach are not what calibration leaves
-)
+# errors above this share of the arm's reach are not what calibration leaves
+MAX_EXPECTED_MISS = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def open_saved(
     before, more = nominal_cell(cell, drawn, train, nominal, known.source)
     notices += [*said, *more]
     miss = np.nanmedian(np.linalg.norm(cell.error(measured), axis=-1))
-    if miss > MAX_MISS_OF_REACH * cell.robot.reach():
+    if miss > MAX_EXPECTED_MISS * cell.robot.reach():
         notices.append(
             f"{measured.source}: the fit misses by {1e3 * miss:.3g} mm: check that data and fit "
             "belong to the same robot, measurement frame, units and order of targets"

@@ -17,12 +17,10 @@ PASSED, NOT_PASSED, NOT_STATED = "passed", "not passed", "not stated"
 CLAIMS = ("inside", "outside")  # the measured poses
 OTHER_SPELLINGS = {"within": "inside", "beyond": "outside"}  # accepted, and not offered
 KINDS = {"rms": "RMS", "max": "largest"}  # as people write it, and as they read it
-MAX_EXCEED_CHANCE = (
-    0.05  # that the next pose exceeds the largest so far: more says nothing of a maximum
-)
-MIN_POSES = math.ceil(
-    1.0 / MAX_EXCEED_CHANCE - 1.0
-)  # poses: `chance_of_larger` is then small enough
+# that the next pose exceeds the largest so far: more says nothing of a maximum
+MAX_EXCEED_CHANCE = 0.05
+# poses: `chance_of_larger` is then small enough
+MIN_POSES = math.ceil(1.0 / MAX_EXCEED_CHANCE - 1.0)
 MAX_NAMED = 3  # parts that could not be judged
 LIMIT = re.compile(r"\s*(rms|max)\s*[:=<]?\s*([0-9.eE+-]+)\s*(mm)?\s*", re.IGNORECASE)
 

@@ -16,7 +16,7 @@ from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.robot import Robot
 
 UNIT = 1e-4  # turn by a factor of 1, so that variances are numbers of ordinary size [rad]
-OF_ITSELF, OF_OTHERS, OF_GRAVITY = range(3)  # what drives a function
+OF_ITSELF, OF_OTHERS, OF_GRAVITY = DRIVERS = range(3)  # what drives a function
 OWN = 2  # waves in a turn of the joint itself: gears err once and twice a turn
 WAVES = 2  # of the place in the session: a drift and a bow
 GONE_ON = float(np.sqrt(12.0))  # from one session's mean to the next, over the RMS of a drift

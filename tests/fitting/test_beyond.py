@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import minimax_cal as mc
 from minimax_cal.fitting import beyond
 from minimax_cal.fitting.beyond import (
-    RANK_TOLERANCE,
+    RESOLUTION,
     needed,
     one_step,
     step_without,
@@ -168,7 +168,7 @@ class Rows:
         return cast(Array, self.rows[part].T @ self.rows[part])
 
 
-@pytest.mark.parametrize("weight", [0.0, 1e-2 * RANK_TOLERANCE**2])
+@pytest.mark.parametrize("weight", [0.0, 1e-2 * RESOLUTION**2])
 @pytest.mark.parametrize(
     ("apart", "lost"),
     [([1.0, 1.0, 1.0, 1.0], False), ([0.0, 0.0, 0.0, 0.0], False), ([1.0, 0.0, 0.0, 0.0], True)],

@@ -21,9 +21,8 @@ from minimax_cal.robots.robot import Robot
 
 SHARES = np.geomspace(1e-6, 1.0, 121)  # of the drawing's variance that are tried
 LEAST = 1e-12  # variance of a direction, in parts of the drawing's
-EVIDENCE = (
-    5.41  # twice a log-likelihood ratio: pixels contradict a drawing without error (1 of 100)
-)
+# twice a log-likelihood ratio: pixels contradict a drawing without error (1 of 100)
+EVIDENCE = 5.41
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,10 @@ from minimax_cal.evidence.components import likeliest
 from minimax_cal.fitting.pixels.fit import PixelFit
 from minimax_cal.fitting.pixels.identify import gram_of_pixels, lengths_of
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.lack import UNIT, by_pose, joint_units
+from minimax_cal.modelling.lack import DRIVERS, UNIT, by_pose, joint_units
 from minimax_cal.modelling.parameters import zero_positions
 from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers.least_squares import solve_normal
-
-DRIVERS = 3  # kinds of functions of a joint; its numbers at each pose are one more
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +113,7 @@ def lacking(arm: Robot, fit: PixelFit, joints: Array, group: Array) -> tuple[Arr
     alone = [joint * (group == each) for joint in unit * joints for each in range(group.max() + 1)]
     columns = np.concatenate([turned.transpose(2, 1, 0), np.stack(alone)])
     of_joint = np.repeat(np.arange(n), len(alone) // n)
-    which = np.concatenate([DRIVERS * kind[:, 0] + kind[:, 1], DRIVERS * n + of_joint])
+    which = np.concatenate([len(DRIVERS) * kind[:, 0] + kind[:, 1], len(DRIVERS) * n + of_joint])
     return columns.reshape(len(columns), -1), which, len(kind)
 
 

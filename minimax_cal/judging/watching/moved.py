@@ -26,12 +26,10 @@ from minimax_cal.judging.watching.watched import Watched
 from minimax_cal.modelling.parameters import links_of
 
 FALSE_ALARM = 0.005  # chance that anything at all is named on an arm that did not move
-ZEROS = (
-    0.8  # share of it for zero positions, which a knock or a service changes; links have the rest
-)
-MIN_OWN_MOTION = (
-    1e-6  # share of a motion that frame and reflectors do not imitate, of what can be told
-)
+# share of it for zero positions, which a knock or a service changes; links have the rest
+ZEROS = 0.8
+# share of a motion that frame and reflectors do not imitate, of what can be told
+MIN_OWN_MOTION = 1e-6
 CLEARER = 9.0  # by how much a link must explain more than a zero position, in squared sigmas
 LIKEWISE = 6.6  # rivals lose less than this, in squared sigmas: the 99 % point of one
 OF_POWER = 1.645  # sigmas that a normal variable falls short of in 5 of 100 cases

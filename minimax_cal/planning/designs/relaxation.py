@@ -37,9 +37,8 @@ SOLVERS: dict[str, dict[str, float]] = {  # by cvxpy's name, tried in turn
     "SCS": {"eps_abs": 1e-4, "eps_rel": 1e-4, "max_iters": 1000},
     "CLARABEL": {},
 }
-MAX_EXTRA_EXPERIMENTS = (
-    160  # experiments beyond the number to choose that the solver sees at a time
-)
+# experiments beyond the number to choose that the solver sees at a time
+MAX_EXTRA_EXPERIMENTS = 160
 WORST = 60  # predictions of `Largest` that it sees at a time
 GAP = 3e-3  # relative, between size and bound, at which no more rounds are needed
 STALE = 0.8  # of the gap that a round leaves: more, and further ones are in vain
