@@ -60,6 +60,8 @@ def test_type_checkers_see_the_same_names() -> None:
 def test_a_calibration_imports_no_statistics_and_no_pictures() -> None:
     heavy = ("scipy.stats", "pandas", "matplotlib", "cvxpy", "plotly", "jinja2")
     assert not any(after("from minimax_cal.fitting.calibrate import calibrate", *heavy).values())
+    heavy += ("scipy.signal", "scipy.ndimage", "numba", "minimax_cal.fitting.fit")
+    assert not any(after("from minimax_cal.cli.torques import torques_command", *heavy).values())
 
 
 def test_importing_is_quick_work() -> None:

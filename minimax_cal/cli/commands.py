@@ -137,7 +137,7 @@ COMMANDS: dict[str, dict[str, Entry]] = {
 # parameters that name outputs
 WRITTEN = ("output", "figure", "path", "pdf", "truth", "write", "out")
 SPARED = ("numpy.f2py", "numpy.testing")  # which SciPy would load and no command uses
-LONG = ("relative", "tradeoff", "diagnose", "torques", "plan", "gap")  # worth compiled kernels
+LONG = ("relative", "tradeoff", "diagnose", "plan", "gap")  # worth compiled kernels
 ENTRIES = {name: entry for part in COMMANDS.values() for name, entry in part.items()}
 
 

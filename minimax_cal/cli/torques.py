@@ -11,7 +11,6 @@ import click
 from minimax_cal.cli import options
 from minimax_cal.cli.motion_options import motion_options
 from minimax_cal.cli.options import DETAILS, PATH, InGroups, Output, options_of, result_options
-from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import read_logs, runs_of, torque_gains
 from minimax_cal.dynamics.result import MotionDiagnosis
@@ -21,6 +20,7 @@ from minimax_cal.ground.options import Option
 from minimax_cal.ground.stages import Progress
 from minimax_cal.reporting.plots.motion import save_motion
 from minimax_cal.robots.robot import Robot, load_robot
+from minimax_cal.robots.urdf import MODELS
 
 if TYPE_CHECKING:
     from minimax_cal.simulators.motion.result import MotionGap

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.special import stdtr
 
 from minimax_cal.dynamics.model import Normal
@@ -118,16 +117,15 @@ class Past:
         recent = np.empty((*q.shape, len(RECENT_S)))
         lagged = np.empty((*q.shape, len(PLAYS)))
         way = np.maximum(np.ptp(q, axis=0), 1e-12)[:, None] * np.array(PLAYS)
+        stays = np.exp(-1.0 / SAMPLE_HZ / np.array(RECENT_S))
         for a, b in zip(scene.logs.start[:-1], scene.logs.start[1:], strict=True):
-            for number, seconds in enumerate(RECENT_S):
-                stays = np.exp(-1.0 / SAMPLE_HZ / seconds)
-                recent[a:b, :, number] = lfilter([1.0 - stays], [1.0, -stays],
-                                                 np.abs(qd[a:b]), axis=0)  # fmt: skip
-            now = np.zeros_like(way)
+            now, average = np.zeros_like(way), np.zeros((q.shape[1], len(RECENT_S)))
             step = np.diff(q[a:b], axis=0, prepend=q[a : a + 1])[:, :, None]
+            new = np.abs(qd[a:b, :, None]) * (1.0 - stays)
             for i in range(b - a):
                 now = np.clip(now + step[i], -way, way)
-                lagged[a + i] = now
+                average = stays * average + new[i]
+                lagged[a + i], recent[a + i] = now, average
         return Past(recent, lagged / way)
 
 

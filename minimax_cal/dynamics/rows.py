@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.interpolate import CubicSpline
 from scipy.linalg import toeplitz
-from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.sparse import block_diag, coo_array, csr_array
 
 from minimax_cal.dynamics.regressor import Motion
@@ -26,6 +26,7 @@ SAMPLE_HZ = 100.0  # of what the columns are computed from
 ROW_HZ = 25.0  # of rows
 THIN = 2  # every second row is fitted: near the filter's cutoff, noise of fewer rows is whiter
 CUTOFF_HZ, FILTER_ORDER = 8.0, 4  # of the zero-phase filter [Butterworth]
+FORGETS_S = 2.0  # after which the filter has forgotten what went in, to 1e-16
 LEAST_TAP = 1e-7  # of the filter's largest: what it takes of samples further off is nothing
 REVERSAL_S = 0.1  # about rest and reversals, without a fit
 REST = 0.01  # of the joint's largest speed: below it the joint is at rest
@@ -38,10 +39,21 @@ LEAST_NOISE = 1e-9  # of the largest torque: the noise of computed rows
 
 
 @lru_cache(maxsize=32)
-def filter_sections(rate: float) -> tuple[Array, Array]:
-    """Second-order sections of the filter at a rate [Hz], and its state at rest under a unit."""
-    sections = butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos")
-    return np.asarray(sections), np.asarray(sosfilt_zi(sections))[:, None, :]
+def impulse_response(rate: float) -> Array:
+    """(k,) the filter forwards, until nothing of it is left.  rate: [Hz].
+
+    By partial fractions of the bilinear transform; scipy.signal would do, and takes longer to
+    import than to filter a minute.
+    """
+    around = np.exp(0.5j * np.pi * (1.0 + (2.0 * np.arange(FILTER_ORDER) + 1.0) / FILTER_ORDER))
+    analog = np.tan(np.pi * CUTOFF_HZ / rate) * around
+    poles = (1.0 + analog) / (1.0 - analog)
+    others = 1.0 - poles / poles[:, None]
+    np.fill_diagonal(others, 1.0)
+    out = ((poles ** np.arange(int(FORGETS_S * rate))[:, None]) @ (1.0 / others.prod(axis=1))).real
+    for _ in range(FILTER_ORDER):  # zeros at half the rate
+        out[1:] += out[:-1].copy()
+    return np.asarray(out / out.sum())
 
 
 def smooth(values: Array, rate: float) -> Array:
@@ -49,14 +61,18 @@ def smooth(values: Array, rate: float) -> Array:
 
     About the ends the values go on as they came, turned about the end [Gustafsson 1996].
     """
-    sections, state = filter_sections(rate)
+    response = impulse_response(rate)
     pad = min(len(values) - 1, int(rate))
     rows = values.reshape(len(values), -1).T
     before = 2.0 * rows[:, :1] - rows[:, pad:0:-1]
     after = 2.0 * rows[:, -1:] - rows[:, -2 : -pad - 2 : -1]
     out = np.concatenate([before, rows, after], axis=1)
+    size = next_fast_len(out.shape[1] + len(response), real=True)
+    gain = rfft(response, size)
     for _ in range(2):
-        out = sosfilt(sections, out, zi=state * out[:, :1])[0][:, ::-1]
+        first = out[:, :1]  # at rest there before
+        change = irfft(rfft(out - first, size) * gain, size)[:, : out.shape[1]]
+        out = (first + change)[:, ::-1]
     return np.asarray(out[:, pad : pad + len(values)].T.reshape(values.shape))
 
 

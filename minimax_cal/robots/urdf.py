@@ -27,6 +27,7 @@ from minimax_cal.robots.urdf_file import Joint, Urdf, read_urdf
 
 EXACT = 1e-9  # forward kinematics must agree to this [m, rad]
 TIPS = ("tool0", "flange")  # of several frames on the last moving body, the one that is meant
+MODELS = (".xml", ".mjcf")  # files of a simulator's own model
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit, Provenance
 from minimax_cal.fitting.options import Progress, silent
@@ -25,6 +24,7 @@ from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.effects.words import name_effect, name_step
 from minimax_cal.robots.transforms import inverse
+from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.arm import Arm, arm_of, assumed, unheld
 from minimax_cal.simulators.causes import Causes, causes_of
 from minimax_cal.simulators.chain import Chain, chain_of, mujoco

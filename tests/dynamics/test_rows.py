@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from dynamics.motions import fourier, run_of
 from numpy.testing import assert_allclose
+from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from minimax_cal.dynamics.rows import AR_ORDER, EDGE_S, ROW_HZ, prepare, slope, whitening
+from minimax_cal.dynamics.rows import (
+    AR_ORDER,
+    CUTOFF_HZ,
+    EDGE_S,
+    FILTER_ORDER,
+    ROW_HZ,
+    prepare,
+    slope,
+    smooth,
+    whitening,
+)
 from minimax_cal.ground.arrays import Array
 
 
@@ -29,6 +40,19 @@ def test_derivatives_and_torques_are_filtered_alike(rate: float, uneven: float) 
     assert_allclose(logs.y[inner], fitted[inner], rtol=0, atol=2e-3 * np.abs(logs.y).max())
     assert logs.seconds == pytest.approx(30.0, abs=0.1)
     assert len(logs.picked) == pytest.approx(30.0 * ROW_HZ, abs=2)
+
+
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+@pytest.mark.parametrize("samples", [3, 2000])
+def test_smooth_is_a_butterworth_filter_forwards_and_backwards(rate: float, samples: int) -> None:
+    values = np.cumsum(np.random.default_rng(0).normal(size=(samples, 2)), axis=0)
+    sections = butter(FILTER_ORDER, CUTOFF_HZ, fs=rate, output="sos")
+    pad = min(samples - 1, int(rate))
+    wide = np.pad(values, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd").T
+    for _ in range(2):
+        state = sosfilt_zi(sections)[:, None, :] * wide[:, :1]
+        wide = sosfilt(sections, wide, zi=state)[0][:, ::-1]
+    assert_allclose(smooth(values, rate), wide.T[pad : pad + samples], rtol=0, atol=1e-10)
 
 
 def test_slope_is_exact_for_cubics() -> None:

@@ -19,8 +19,6 @@ from minimax_cal.robots.transforms import SAME, head, tail
 from minimax_cal.robots.urdf import is_urdf, load_urdf
 from minimax_cal.robots.urdf_file import Urdf
 
-MODELS = (".xml", ".mjcf")  # files of a simulator's own model
-
 
 @dataclass(frozen=True, eq=False)
 class Job:

@@ -16,11 +16,12 @@ from minimax_cal.correcting.exporters import (
     ur_yaml,
     urdf,
 )
-from minimax_cal.correcting.exporters.job import MODELS, Export, Job
+from minimax_cal.correcting.exporters.job import Export, Job
 from minimax_cal.fitting.options import OFFSETS
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.modelling.cell import Cell
 from minimax_cal.modelling.effects.table import Term
+from minimax_cal.robots.urdf import MODELS
 
 Carries = Callable[[Cell], tuple[Term, ...]]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from math import comb
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from minimax_cal.dynamics.logs.draft import Draft
 from minimax_cal.ground.arrays import Array
@@ -179,7 +178,8 @@ def changes(draft: Draft, speed: Array) -> tuple[Array, Array]:
     took = draft.time[2 * half :] - draft.time[: -2 * half]
     near = took < 2.0 * np.median(took)
     change = (draft.q[2 * half :] - draft.q[: -2 * half]) / took[:, None]
-    mean = uniform_filter1d(speed, 2 * half + 1, axis=0)[half:-half]
+    wide, sums = 2 * half + 1, np.pad(speed, ((1, 0), (0, 0))).cumsum(axis=0)
+    mean = (sums[wide:] - sums[:-wide]) / wide
     return change[near], mean[near]
 
 

@@ -11,7 +11,6 @@ from warnings import catch_warnings, filterwarnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure, FigureBase
+
+    from minimax_cal.fitting.fit import Fit
 
 PICTURES = (".png", ".svg", ".pdf")
 BEFORE, AFTER = "#d55e00", "#0072b2"  # told apart by colour-blind eyes too [Okabe and Ito 2008]

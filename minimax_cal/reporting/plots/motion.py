@@ -10,11 +10,12 @@ import numpy as np
 
 from minimax_cal.dynamics.result import MotionDiagnosis
 from minimax_cal.reporting.plots.figures import AFTER, BEFORE, new_figure, plain_ticks, save
-from minimax_cal.simulators.motion.result import MotionGap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from minimax_cal.simulators.motion.result import MotionGap
 
 ROW_INCHES = 1.7  # of a joint
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.dynamics.diagnose import diagnose_motion
 from minimax_cal.dynamics.given import Payload, read_logs, runs_of
 from minimax_cal.dynamics.result import MotionDiagnosis, load_motion
@@ -20,6 +19,7 @@ from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import check_writable, write_whole
 from minimax_cal.ground.stages import Progress, silent
 from minimax_cal.robots.gravity import weighed
+from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.chain import mujoco
 from minimax_cal.simulators.given import largest_inertia
 from minimax_cal.simulators.motion.correct import Bench, correct

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from minimax_cal.correcting.exporters.job import MODELS
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.robots.gravity import LEAST_MASS, G, masses_of
 from minimax_cal.robots.robot import Robot, load_robot
-from minimax_cal.robots.urdf import is_urdf
+from minimax_cal.robots.urdf import MODELS, is_urdf
 from minimax_cal.simulators.arm import arm_of, assumed
 from minimax_cal.simulators.chain import Chain, chain_along, chain_of, mujoco
 from minimax_cal.simulators.document import Document
