@@ -5,6 +5,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import mujoco
 import pytest
 from conftest import ROOT, run
 
@@ -37,7 +38,7 @@ def test_the_three_commands_print_what_is_quoted(
         else:
             assert is_quoted(text.split(), out.split()), text
     assert (tmp_path / "diagnosis.png").stat().st_size > 50_000
-    assert mc.load_robot(tmp_path / "robot.urdf").joints == 6
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).njnt == 6
 
 
 def is_quoted(quoted: list[str], printed: list[str]) -> bool:

@@ -212,11 +212,15 @@ def advice(
     fit: Fit, robot: str, data: tuple[Path, ...], written: Path | None
 ) -> Iterator[tuple[str, str]]:
     """What to do next, and its command.  written: where the result went."""
-    left = f"{fit.within.after.rms_mm:.3f} mm"
-    diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
-    yield f"Next, to find the cause of the remaining {left}", diagnose
+    if not fit.cell.effects.terms:
+        left = f"{fit.within.after.rms_mm:.3f} mm"
+        diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
+        yield f"Next, to find the cause of the remaining {left}", diagnose
     if written and fit.status is Status.CONVERGED:
-        yield "To write a file for MuJoCo", f"minimax-cal export {written} --to mjcf -o arm.xml"
+        correct = f"minimax-cal compensate {written} targets.csv -o corrected.csv"
+        yield "To correct joint targets, or a program, for the controller", correct
+        write = f"minimax-cal export {written} --to mjcf -o arm.xml"
+        yield "To write a file for MuJoCo, or as --to urdf, dh-csv or another format", write
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

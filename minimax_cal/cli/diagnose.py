@@ -91,7 +91,7 @@ def advice(
     """What to do next, and its command.  written: where the diagnosis went."""
     if written and found.main and found.status is Status.CONVERGED:
         files = " ".join(map(str, data))
-        fit = f"minimax-cal calibrate {robot} {files} --effects {written}"
+        fit = f"minimax-cal calibrate {robot} {files} --effects {written} -o fit.json"
         yield "Next, to calibrate with the confirmed causes", fit
     keep = "" if written else "-o diagnosis.json "
     what = "To see" if written else "To keep the result, and to see"

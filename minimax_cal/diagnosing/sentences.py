@@ -15,7 +15,8 @@ from minimax_cal.solvers.status import Status
 Named = Finding | Alternative
 NOTHING_MM = 5e-4  # of a length that is reported to three digits
 MAX_NAMED_MINOR = 2  # more minor effects than this are counted, not listed
-REVISIT = "Next measurement: visit 10 poses twice, to know the measurement noise."
+REVISIT = "Recommended: visit 10 poses twice, to know the measurement noise."
+ALL_JOINTS = "all joints together"  # no single joint predicts it
 CONTRADICTED = (
     "Unexplained: the best fit contradicts the measurements. It is no calibration of this arm, and "
     "says nothing about causes."
@@ -38,11 +39,11 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     if found.status is Status.FAILED:
         return (CONTRADICTED,)
     tentative = [f for f in found.by_rung if not f.established]
-    main = listed(title_of(found), found.main)
+    main, often = listed(title_of(found), found.main), subsampled(found.main)
     return tuple(
         sentence
         for sentence in (
-            *((main, opening(found)) if found.main else (opening(found), main)),
+            *((main, often, opening(found)) if found.main else (opening(found), main)),
             minor(found),
             shrunk(found),
             remaining(found),
@@ -66,10 +67,8 @@ def opening(found: Diagnosis) -> str:
 
 
 def title_of(found: Diagnosis) -> str:
-    """Main cause, ambiguous cause, or causes found beside what is unexplained."""
+    """Main cause, or ambiguous cause."""
     many = "s" if len(found.main) > 1 else ""
-    if found.verdict == "unknown":
-        return f"Cause{many} found"
     ambiguous = found.verdict == "one_of" and bool(found.main and found.main[0].alternatives)
     return f"{OPENINGS['one_of' if ambiguous else 'named']}{many}"
 
@@ -84,13 +83,13 @@ def unexplained(found: Diagnosis) -> str:
             f"{found.floor.high:.3f} mm ({found.floor.source}{joints})."
         )
     sure = any(f.established for f in found.findings)
-    guess = "the causes listed are a best guess" if sure else "the cause is unknown"
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
-        return f"{left}: {guess}."
-    after = "after the causes above" if sure else "after geometry"
+        return f"{left}: {'these causes are uncertain' if sure else 'the cause is unknown'}."
+    after = "after all effects" if sure else "after geometry"
+    guess = "; the causes above may imitate one that the library lacks" if sure else ""
     return (
-        f"the error {after} is not random ({left}: p = {found.structure:.1g}, significant below "
-        f"{STRUCTURE:g}), and no known effect explains it; {guess}."
+        f"the error {after} is not random ({left}; p = {found.structure:.1g}, significant below "
+        f"{STRUCTURE:g}), and no known effect explains it{guess}."
     )
 
 
@@ -100,8 +99,18 @@ def listed(title: str, findings: Sequence[Finding]) -> str:
     for finding in findings:
         kinds.setdefault(finding.term.effect, []).append(finding)
     parts = [cause_of(same, first=i == 0) for i, same in enumerate(kinds.values())]
-    share = " of the remaining error" if any("%" in part for part in parts) else ""
+    share = " of the remaining squared error" if any("%" in part for part in parts) else ""
     return f"{title}: {'; '.join(parts)}{share}." if parts else ""
+
+
+def subsampled(findings: Sequence[Finding]) -> str:
+    """How often the causes are found again; empty where that was not asked."""
+    often = min((f.again for f in findings if not f.rows), default=math.nan)
+    if not math.isfinite(often):
+        return ""
+    each = "Each was" if len(findings) > 1 else "Confirmed:"
+    least = "at least " if len(findings) > 1 and often < 1.0 else ""
+    return f"{each} found again in {least}{100.0 * often:.0f} % of the subsamples of the poses."
 
 
 def cause_of(same: Sequence[Finding], *, first: bool) -> str:
@@ -137,17 +146,13 @@ def named_together(same: Sequence[Named]) -> str:
 
 
 def minor(found: Diagnosis) -> str:
-    """The minor effects in one line, and what they gain."""
+    """The minor effects in one line, and what they take off the error."""
     small = found.minor
     if not small:
         return ""
-    size, gain = found.minor_sizes
-    few = len(small) <= MAX_NAMED_MINOR
-    names = f" ({names_of(small)})" if few else ""
-    many = "" if len(small) == 1 else "s, together"
-    above = "cause" if len(found.main) == 1 else f"{len(found.main)} causes"
-    keep = "" if few else f"; keep the {above} above, the others gain {gain:.3f} mm"
-    return f"{len(small)} minor effect{many}{names} {size:.3f} mm{keep}."
+    names = f" ({names_of(small)})" if len(small) <= MAX_NAMED_MINOR else ""
+    many = f"{names} takes" if len(small) == 1 else f"s{names} together take"
+    return f"{len(small)} minor effect{many} {found.minor_sizes[1]:.3f} mm off the RMS error."
 
 
 def together(places: Sequence[str]) -> str:
@@ -171,8 +176,8 @@ def shrunk(found: Diagnosis) -> str:
     """How far the error falls on held-out poses."""
     nominal, geometric, last = (found.ladder[i].holdout for i in (0, 1, -1))
     text = (
-        f"RMS error on held-out poses: nominal arm {nominal.rms_mm:.3f} mm, calibrated geometry "
-        f"{geometric.rms_mm:.3f} mm (largest {geometric.max_mm:.3f} mm)"
+        f"RMS error on held-out poses: nominal arm {nominal.rms_mm:.3f} mm, geometry calibrated by "
+        f"least squares {geometric.rms_mm:.3f} mm (largest {geometric.max_mm:.3f} mm)"
     )
     if len(found.ladder) < 3:
         return f"{text}."
@@ -211,8 +216,9 @@ def remaining(found: Diagnosis) -> str:
     if left.predictable_mm < NOTHING_MM:
         return f"The remaining {found.ladder[-1].holdout.rms_mm:.3f} mm looks random; {noise}."
     where = ", ".join(
-        f"{name_place(place)} {100.0 * share:.0f} %" for place, share in left.where[:3]
-    )
+        f"{ALL_JOINTS if place == 'all' else name_place(place)} {100.0 * share:.0f} %"
+        for place, share in left.where[:3]
+    ).removesuffix(" 100 %")
     named = f" ({where})" if where else ""
     return (
         f"Remaining error: {left.predictable_mm:.3f} mm depends on the pose{named}, "
@@ -258,4 +264,4 @@ def next_measurement(causes: Sequence[Finding]) -> str:
     text, pairs = max(by_text.items(), key=lambda entry: settled(entry[1]))
     named = names_of(list({f.name: f for f, _ in pairs}.values()), " and ")
     others = names_of(list({a.name: a for _, a in pairs}.values()), " and ")
-    return f"Next measurement: {text}, to distinguish {named} from {others}."
+    return f"Recommended: {text}, to distinguish {named} from {others}."

@@ -57,7 +57,7 @@ class Remains:
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.place} with {self.driver}"
+        return f"{self.place} following {self.driver}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,16 +124,17 @@ class Beyond:
                 if self.narrow
                 else ""
             )
-        parts = "each part held out in turn"
+        parts = f"{len(self.folds)} parts"
         if self.missed:
-            parts = f"{self.judged} held out in turn (the fit needs the others)"
+            parts = f"{self.judged} (the fit needs the others)"
         less = ""
         if self.trusted:
             worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
             less = f"; without outliers at worst {worst}"
         return (
-            f"Outside the measured region, {parts}{self.kept}: RMS {self.typical_mm:.3f} mm, "
-            f"at worst {self.worst_mm:.3f} mm ({self.worst.where}){less}."
+            f"Outside the measured region, {parts} each predicted from the other poses{self.kept}: "
+            f"RMS {self.typical_mm:.3f} mm, at worst {self.worst_mm:.3f} mm "
+            f"({self.worst.where}){less}."
         )
 
     def table(self) -> Table:

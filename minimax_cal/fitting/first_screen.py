@@ -21,9 +21,8 @@ def accuracy_rows(fit: Fit) -> Iterator[tuple[Cell, ...]]:
         yield row_of("new poses, nominal", inside.before, drawn)
         yield row_of("new poses, calibrated", inside.after, inside.rms)
     if fit.beyond.worst:
-        count = sum(fold.poses for fold in fit.beyond.folds)
         most = max(fold.max_mm for fold in fit.beyond.folds)
-        yield "outside, calibrated", count, fit.beyond.typical_mm, math.nan, math.nan, most
+        yield "outside, calibrated", "", fit.beyond.typical_mm, math.nan, math.nan, most
     for key, name in (("nominal_train", "nominal"), ("train", "calibrated")):
         yield row_of(f"training poses, {name}", fit.accuracy[key])
 
@@ -35,10 +34,10 @@ def row_of(name: str, of: Accuracy, ends: Interval = UNKNOWN) -> tuple[Cell, ...
 
 def first_table(fit: Fit) -> Table:
     """Position accuracy before and after; rows without poses are left out."""
-    rows = tuple(row for row in accuracy_rows(fit) if row[1])
+    rows = tuple(row for row in accuracy_rows(fit) if row[1] != 0)
     return Table(
         "position error",
-        ("error at", "poses", "RMS mm", "95 % from", "to", "max mm"),
+        ("error at", "poses", "RMS mm", "95 % low", "95 % high", "max mm"),
         rows,
         ("", "d", *[".3f"] * 4),
     )

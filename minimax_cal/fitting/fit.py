@@ -713,7 +713,7 @@ class Fit:
 
     def answered_by(self) -> str:
         """Who answered the quadratic programs, as a clause; empty where there were none."""
-        return f"; QPs: {self.answerers()}" if self.answered else ""
+        return f"; quadratic programs of the minimax: {self.answerers()}" if self.answered else ""
 
     def answerers(self) -> str:
         """Backends with the number of QPs they answered, and how rough the answers were."""

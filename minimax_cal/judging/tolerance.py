@@ -163,7 +163,7 @@ def beyond(found: Beyond) -> Claim:
 
 
 def open_of(found: Beyond) -> str:
-    """What could not be judged outside the measured poses."""
+    """What could not be judged outside the measured region."""
     if found.missed is None:
         return "an earlier version wrote this file and does not tell which parts were not judged"
     if not found.missed:
@@ -222,7 +222,7 @@ def elsewhere(judged: Judgement, other: Claim) -> str:
     asked = next(name for name in CLAIMS if name != other.name)
     kind = {"rms": "RMS", "max": "Largest"}[judged.limit.kind]
     return (
-        f"{kind} error passed {asked} the measured poses alone: {other.name} them it is "
+        f"{kind} error passed {asked} the measured region alone: {other.name} them it is "
         f"{seen:.3f} mm, more than the {limit:g} mm required"
     )
 

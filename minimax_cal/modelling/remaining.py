@@ -169,7 +169,7 @@ def timed(scene: Scene) -> Drivers:
         if last > COURSE:
             swings = range(COURSE + 1, last + 1)
             out["time, to and fro"] = np.array([np.cos(np.pi * k * clock) for k in swings])
-        out["the visits before"] = following(clock)
+        out["the previous poses"] = following(clock)
     if scene.has("temperature"):
         warm = unit(scene.column("temperature") - ROOM)
         out["temperature"] = np.array([warm, warm**2])

@@ -67,7 +67,7 @@ def report(
     tolerance
         What is required in mm, as ``rms 0.2, max 0.5``.
     tolerance_for
-        inside or outside the measured poses.
+        inside or outside the measured region.
     facts
         A TOML file with serial_number, controller, tool ...
     rung

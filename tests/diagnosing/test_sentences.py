@@ -81,7 +81,7 @@ def test_every_verdict_opens_the_words(found: Diagnosis) -> None:
         changed = replace(found, verdict=verdict)
         if verdict == "one_of":
             changed = replace(changed, findings=(first, *found.findings[1:]))
-        first_words = "Causes found" if verdict == "unknown" else OPENINGS[verdict]
+        first_words = "Main causes" if verdict == "unknown" else OPENINGS[verdict]
         if verdict in ("none", "not_repeatable"):
             changed = replace(changed, findings=())
         assert changed.headline().startswith(first_words), verdict
@@ -99,7 +99,7 @@ def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
     assert causes.startswith("Main causes: joint compliance at joint 2 (")
     places = [causes.index(f", {share} %") for share in (60, 20, 12)]
     assert places == sorted(places)
-    assert causes.endswith("12 % of the remaining error.")
+    assert causes.endswith("12 % of the remaining squared error.")
     assert [row[0] for row in found.effects_table().rows] == IN_WORDS
     assert [row[0] for row in found.parameter_table().rows] == IN_WORDS
     assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]
@@ -116,17 +116,15 @@ def test_the_words_are_short_and_have_no_loose_pronoun(found: Diagnosis) -> None
 
 def test_minor_effects_take_one_line(found: Diagnosis) -> None:
     (line,) = [text for text in found.reasons if "minor" in text]
-    assert line.startswith("2 minor effects, together (gear error at joint 5; backlash at joint 4)")
-    size = math.sqrt(0.25**2 - 0.24**2 + 0.24**2 - 0.23**2)
-    assert line.endswith(f" {size:.3f} mm.")
+    assert line.startswith("2 minor effects (gear error at joint 5; backlash at joint 4) together")
+    assert line.endswith(" take 0.020 mm off the RMS error.")
     many = tuple(replace(found.findings[-1], terms=(Term("backlash", f"J{n}"),))
                  for n in range(1, 7))  # fmt: skip
     (line,) = [
         text for text in replace(found, findings=(*found.findings[:3], *many)).reasons
         if "minor" in text
     ]  # fmt: skip
-    assert line.startswith("6 minor effects, together ")
-    assert line.endswith("; keep the 3 causes above, the others gain 0.060 mm.")
+    assert line == "6 minor effects together take 0.060 mm off the RMS error."
 
 
 def test_a_single_cause_is_one(found: Diagnosis) -> None:
@@ -149,9 +147,9 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
     )
     assert "(for joint 2)" not in causes
     both = replace(both, findings=(replace(large, alternatives=(others[1],)), second))
-    text = next(text for text in both.reasons if text.startswith("Next measurement"))
+    text = next(text for text in both.reasons if text.startswith("Recommended: "))
     assert large.share > second.share > 0.0
-    assert text.startswith("Next measurement: measure 2, to distinguish")
+    assert text.startswith("Recommended: measure 2, to distinguish")
 
 
 def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
@@ -194,21 +192,22 @@ def test_what_does_not_help_is_not_proposed(found: Diagnosis) -> None:
                           "enough: the best raises the power to 2 of the 25 needed"))  # fmt: skip
     first = replace(found.findings[0], alternatives=others)
     changed = replace(found, verdict="one_of", findings=(first, *found.findings[1:]))
-    (text,) = [text for text in changed.reasons if text.startswith("Next measurement")]
+    (text,) = [text for text in changed.reasons if text.startswith("Recommended: ")]
     assert text == (
-        f"Next measurement: {WIDER}, to distinguish joint compliance at joint 2 from link bending "
+        f"Recommended: {WIDER}, to distinguish joint compliance at joint 2 from link bending "
         "at link 2."
     )
     assert "or base flex or link bending at link 2" in changed.reasons[0]
     nothing = replace(changed, findings=(replace(first, alternatives=others[1:]),))
-    said = [text for text in nothing.reasons if text.startswith("Next measurement")]
+    said = [text for text in nothing.reasons if text.startswith("Recommended: ")]
     assert said == [REVISIT]  # the noise is not known here
 
 
 def test_every_chance_and_power_says_what_is_enough(found: Diagnosis) -> None:
-    told = replace(found, verdict="unknown", structure=1e-7, structure_in="J3 with its own angle")
+    place = "J3 following its own angle"
+    told = replace(found, verdict="unknown", structure=1e-7, structure_in=place)
     assert "p = 1e-07, significant below 0.005" in told.headline()
-    assert "Unexplained: the error after the causes above is not random" in told.headline()
+    assert "Unexplained: the error after all effects is not random" in told.headline()
     assert replace(told, findings=()).headline().startswith("Unexplained: the error after geometry")
     assert "below 0.005 are significant" in told.effects_table().title
     assert "the power is below 25" in told.rival_table().title

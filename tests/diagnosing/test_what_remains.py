@@ -47,14 +47,18 @@ def test_laws_outside_the_library_remain_at_their_joint(law: str) -> None:
 @pytest.mark.parametrize(
     ("law", "place", "where"),
     [
-        ("outside_plate", "all", ("plate with the tool's attitude",)),
-        ("outside_clearance", "J2", ("J2 tilting with the loads", "J2 tilting with its own angle")),
+        ("outside_plate", "all", ("plate following the tool's attitude",)),
+        (
+            "outside_clearance",
+            "J2",
+            ("J2 tilting following the loads", "J2 tilting following its own angle"),
+        ),
         (
             "outside_settling_base",
             "frame",
-            ("base with the loads of the past", "base with the visits before"),
+            ("base following the loads of the past", "base following the previous poses"),
         ),
-        ("outside_hysteresis", "J2", ("J2 with its past", "J2 with the visits before")),
+        ("outside_hysteresis", "J2", ("J2 following its past", "J2 following the previous poses")),
     ],
 )
 def test_mechanisms_and_memories_remain_where_they_are(
@@ -73,10 +77,10 @@ def test_a_joint_that_wanders_with_time_remains() -> None:
     course = 5e-5 * np.cos(6.0 * np.pi * made.scene.column("clock"))
     found = loudest(left(made, made.rows.error + clear(made, of_joint(made, 2, course))))
     assert found is not None
-    assert found.name in ("J3 with time, to and fro", "J3 with the visits before")
+    assert found.name in ("J3 following time, to and fro", "J3 following the previous poses")
     frozen = replace(made.scene.data, columns={"temperature": np.full(made.scene.poses, 20.0)})
     still = replace(made, scene=replace(made.scene, data=frozen))
-    assert not [one for one in left(still) if "time" in one.driver or "visits" in one.driver]
+    assert not [one for one in left(still) if "time" in one.driver or "previous" in one.driver]
 
 
 def of_joint(made: Study, joint: int, turn: Array) -> Array:

@@ -51,7 +51,7 @@ def test_bad_rows_that_are_held_out_are_told(robot: mc.Robot, noisy: Simulation)
     clean = mc.calibrate(robot, noisy.data, "sum")
     # the same arm judged by the rows that are left
     assert_allclose(fit.trusted.rms_mm, clean.accuracy["holdout"].rms_mm, rtol=0.15)
-    assert fit.beyond.worst_mm > 20.0  # they judge beyond the measured poses as well
+    assert fit.beyond.worst_mm > 20.0  # they judge outside the measured region as well
     assert fit.beyond.trusted is not None
     assert_allclose(fit.beyond.trusted.worst_mm, clean.beyond.worst_mm, rtol=0.3)
     assert "without outliers at worst" in fit.headline()

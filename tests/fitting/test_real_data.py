@@ -124,7 +124,7 @@ def test_a_part_of_few_poses_is_judged_by_a_fit_that_has_arrived(
     assert end.rms_mm == pytest.approx(0.144, rel=0.05)
     assert fit.within.missed == 0
     assert fit.within.after.poses == 36
-    # the pose that stands out judges beyond the measured poses as well, and in no fit
+    # the pose that stands out judges outside the measured region as well, and in no fit
     worst = next(f for f in plain.beyond.folds if f.where == "joint 2 at its high end")
     assert worst.poses == 4
     assert plain.beyond.trusted is not None

@@ -81,14 +81,19 @@ def test_the_page_and_the_command_say_for_which_file(
     assert run(*asked) == 0
     first, *rest = capsys.readouterr().out.splitlines()
     assert first == PASSED
-    assert any("hold for targets corrected by minimax-cal compensate" in line for line in rest)
+    assert any(
+        "hold for joint targets corrected by minimax-cal compensate" in line for line in rest
+    )
     assert any(line.startswith("urdf: not passed: urdf holds geometry alone") for line in rest)
     page = (tmp_path / "page.html").read_text()
     assert "Files and corrected targets" in page
     assert run(*asked, "--deliver", "urdf", "--deliver", "ros-yaml") == 0
     first, *rest = capsys.readouterr().out.splitlines()
     assert first == NOT_PASSED
-    assert any("hold for an exported urdf file (geometry alone)" in line for line in rest)
+    assert any(
+        "hold for the file of minimax-cal export --to urdf (geometry alone)" in line
+        for line in rest
+    )
     assert sum(line.startswith(("urdf: ", "ros-yaml: ")) for line in rest) == 2
     assert run(*asked, "--deliver", "step") == 2
     assert "no such format; choose one of urdf" in capsys.readouterr().err

@@ -54,7 +54,7 @@ def test_requirement_result_and_verdict(
         assert stdout.splitlines()[0] == verdict
         assert f"written: {out}" in stderr
         seen = Seen(out.read_text())
-        poses, before, after, limit, asked, said = rows(seen)["RMS, inside measured poses"]
+        poses, before, after, limit, asked, said = rows(seen)["RMS, inside measured region"]
         assert poses == f"{fit.within.after.poses} cross-validated"
         assert (before, after) == (f"{fit.within.before.rms_mm:.3f}",
                                    f"{fit.within.after.rms_mm:.3f}")  # fmt: skip
@@ -125,8 +125,9 @@ def test_only_what_a_diagnosis_establishes_is_told_for_established(results: Path
     for verdict in ("unknown", "not_repeatable"):
         guess = limiting(verdict, 0.9)
         assert "establishes" not in guess
-        assert "leaves part of the error unexplained" in guess
-        assert f"best guess, which this model leaves out: {cause}" in guess
+        said = {"unknown": "Unexplained by the diagnosis: ", "not_repeatable": "Not repeatable: "}
+        assert said[verdict] in guess
+        assert guess.startswith(f"{cause} (")
     assert cause not in limiting("named", -0.001)  # a cause that closes nothing limits nothing
 
 
@@ -151,7 +152,7 @@ def test_rungs_of_a_diagnosis(results: Path, tmp_path: Path) -> None:
     gap = load_diagnosis(results / "gap.json")
     for number, step in ((0, gap.ladder[0]), (1, gap.ladder[1]), (None, gap.ladder[-1])):
         wording = Wording("2026-11-21", rung=number)
-        found = rows(rendered(wording, results / "gap.json"))["RMS, inside measured poses"]
+        found = rows(rendered(wording, results / "gap.json"))["RMS, inside measured region"]
         assert found[0] == f"{step.holdout.poses} held out"
         assert found[2] == f"{step.holdout.rms_mm:.3f}"
     with pytest.raises(mc.OptionError, match="no step 7"):

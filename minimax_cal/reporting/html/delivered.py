@@ -26,7 +26,7 @@ from minimax_cal.solvers.status import Status
 
 USUAL = (COMPENSATED, "urdf")  # where none is named: all that joints correct, and no effect
 NOWHERE = Bound(math.nan, math.nan)
-CORRECTED = "targets corrected by minimax-cal compensate"
+CORRECTED = "joint targets corrected by minimax-cal compensate"
 
 Claims = tuple[Claim, ...]
 
@@ -43,7 +43,7 @@ class Row:
     def name(self) -> str:
         """For people."""
         to = self.delivered.format
-        return CORRECTED if to == COMPENSATED else f"an exported {to} file"
+        return CORRECTED if to == COMPENSATED else f"the file of minimax-cal export --to {to}"
 
     @property
     def verdict(self) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.result import Diagnosis, Finding
-from minimax_cal.diagnosing.sentences import NOTHING_MM
+from minimax_cal.diagnosing.sentences import NOTHING_MM, OPENINGS
 from minimax_cal.fitting.beyond import Beyond
 from minimax_cal.fitting.crossed import intervals_of
 from minimax_cal.fitting.fit import Fit
@@ -37,7 +37,7 @@ from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
-from minimax_cal.modelling.effects.words import name_effect
+from minimax_cal.modelling.effects.words import name_codes, name_effect
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Note, caveat, text
 from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
@@ -62,7 +62,7 @@ class Signed:
     wild: links that no whole arm changes so much, empty where there are none.  rows: of what leaves
     the house; row: that of them which is judged, None where the result itself is.
     set_aside: points that take no part; with_them: the claim inside where they count, None without
-    any; judged_with: the requirements against their bounds.
+    any; judged_with: the requirements against their bounds.  which: the claim that is judged.
     """
 
     model: str
@@ -74,6 +74,7 @@ class Signed:
     set_aside: tuple[SetAside, ...] = ()
     with_them: Claim | None = None
     judged_with: tuple[Judgement, ...] = ()
+    which: str = "inside"
 
     @property
     def verdict(self) -> str:
@@ -150,12 +151,13 @@ def signed(
     rows = rows_of(sources, deliver, rung, limits, which, claims_of, claims)
     if row := governing(rows, bool(deliver)):
         model = with_effects(row.delivered.cell)
-        found = Signed(model, row.claims, row.judged, odd, rows, row)
+        found = Signed(model, row.claims, row.judged, odd, rows, row, which=which)
         return counting_all(found, sources, limits, which)
     chosen = next((claim for claim in claims if claim.name == which), None)
     if chosen is None:
         chosen = beyond(Beyond(reason="this result makes no such claim"))
-    found = Signed(model, claims, tuple(judge(limit, chosen) for limit in limits), odd)
+    judged = tuple(judge(limit, chosen) for limit in limits)
+    found = Signed(model, claims, judged, odd, which=which)
     return counting_all(found, sources, limits, which)
 
 
@@ -290,6 +292,7 @@ def page_blocks(sources: Sources, found: Signed) -> tuple[Block, ...]:
     kind = {PASSED: "passed", NOT_PASSED: "failed"}.get(found.verdict, "unstated")
     banner = found.sentence[:1].upper() + found.sentence[1:] if found.verdict else NO_LIMIT
     kind = kind if found.sentence == found.verdict else "unstated"
+    banner += f" {found.which} the measured region" if kind == "passed" else ""
     alarm = "caveat" if kind == "passed" else "warning"  # nothing is red under what is passed
     lines: list[Block] = [Note(banner, f"banner {kind}" if found.verdict else "text")]
     lines += [text(found.holds_for)] if found.row else []
@@ -317,7 +320,7 @@ def result_table(sources: Sources, found: Signed) -> Table:
     for claim in found.claims:
         if claim.name == "outside" and claim.reason:
             continue
-        title = "inside measured poses" if claim.name == "inside" else "outside, worst part"
+        title = "inside measured region" if claim.name == "inside" else "outside, worst part"
         for i, kind in enumerate(KINDS):
             bound = claim.bound(kind)
             one = named.get((bound, kind))
@@ -358,7 +361,7 @@ def iso_rows(fit: Fit) -> list[tuple[Cell, ...]]:
 def basis(found: Signed) -> str:
     """What the numbers rest on."""
     inside = found.claims[0]
-    out = f"Inside the measured poses: on {inside.where}. "
+    out = f"Inside the measured region: on {inside.where}. "
     away = found.claims[1] if len(found.claims) > 1 else None
     if away and not away.reason:
         out += f"Outside: {away.where.removeprefix('outside the measured region, in ')}. "
@@ -380,19 +383,17 @@ def limits_now(sources: Sources, found: Signed) -> str:
     if found.row and found.row.delivered.lacks:
         own = found.row.delivered
         whole = number(own.whole.rms)
-        return f"{own.lacks}, which {own.format} does not hold; the full model has {whole} RMS."
+        return (
+            f"{own.lacks}, which {own.format} does not hold; the full model has {whole} RMS."
+            f"{unexplained_of(sources.gap)}"
+        )
     if sources.gap:
         lacking = [f for f in causes(sources.gap) if not (holds(sources, f) or f.share < CLOSES)]
         if lacking and sources.gap.verdict in CERTAIN:
             return f"{said_of(lacking)}, which the diagnosis establishes and this model leaves out."
         if lacking:
-            return (
-                f"the diagnosis leaves part of the error unexplained. Its best guess, which this "
-                f"model leaves out: {said_of(lacking)}."
-            )
-        guess = sources.gap.verdict == "unknown" and causes(sources.gap)
-        names = " The diagnosis calls the names in this model a best guess." if guess else ""
-        return left_now(sources.gap, left) + names
+            return f"{said_of(lacking)}, which this model leaves out.{unexplained_of(sources.gap)}"
+        return left_now(sources.gap, left) + unexplained_of(sources.gap)
     if sources.fit:
         few = [notice for notice in sources.fit.notices if notice.startswith("too few poses")]
         if few:
@@ -402,6 +403,15 @@ def limits_now(sources: Sources, found: Signed) -> str:
             "measurements finds its cause."
         )
     return ""
+
+
+def unexplained_of(gap: Diagnosis | None) -> str:
+    """What the diagnosis does not explain, after a space; empty where it explains all."""
+    if gap is None or gap.verdict not in ("unknown", "not_repeatable"):
+        return ""
+    if gap.verdict == "not_repeatable":
+        return f" {OPENINGS[gap.verdict]}"
+    return f" Unexplained by the diagnosis: {name_codes(gap.structure_in)}."
 
 
 def left_now(gap: Diagnosis, left: float) -> str:
