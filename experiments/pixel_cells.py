@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,17 @@ from scipy.spatial.transform import Rotation
 import minimax_cal as mc
 from minimax_cal.fitting.pixels.camera import Camera
 from minimax_cal.fitting.pixels.data import PixelData
-from minimax_cal.fitting.pixels.judge import missed, tool_points
+from minimax_cal.fitting.pixels.identify import gram_of_pixels
+from minimax_cal.fitting.pixels.judge import POSES as JUDGED
+from minimax_cal.fitting.pixels.judge import everywhere, free_motion, missed, tool_points
+from minimax_cal.fitting.pixels.model import PixelModel, Scene, lens_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.gravity import masses_of, torques
 from minimax_cal.robots.sampling import random_joints
 from minimax_cal.robots.transforms import transform
+from minimax_cal.solvers.least_squares import solve_normal
 
 SIZE = (2448, 2048)  # five megapixels
 LENS = (2500.0, 2500.0, 1223.5, 1023.5)
@@ -267,3 +271,30 @@ def arm_error(cell: Cell, arm: mc.Robot) -> float:
     """RMS error of an arm over the joints' whole range, base and tool fitted [mm]."""
     q = random_joints(cell.true, (POSES,), np.random.default_rng(0))
     return 1e3 * missed(arm, q, tool_points(cell.true, cell.law(q)))
+
+
+def least_variances(
+    cell: Cell, data: PixelData, active: Array, lens_sigma: Array, noise: float = NOISE
+) -> Array:
+    """(f,) variances of independent parts of a squared arm error that no unbiased fit is below.
+
+    Their sum is the Cramer-Rao bound of the mean square [mm^2]: at the true cell, with the true
+    noise.  active: (p,) what is fitted.  lens_sigma: (c, 9) of the lenses' files.
+    """
+    cameras = [
+        replace(camera, intrinsic=np.array([*view.lens, *view.distortion, *np.zeros(7)]))
+        for camera, view in zip(data.cameras, cell.views, strict=True)
+    ]
+    model = PixelModel.of(cell.true, replace(data, cameras=tuple(cameras)), cell.on_flange)
+    poses = np.stack([view.pose for view in cell.views])
+    x = Scene(
+        cell.true.mdh[None], poses[None, :, :3, :3], poses[None, :, :3, 3],
+        cell.place[None, :3, :3], cell.place[None, :3, 3], np.zeros((1, 0, 3)), lens_of(cameras),
+    )  # fmt: skip
+    told = gram_of_pixels(model, x, active) / noise**2
+    told[-lens_sigma.size :, -lens_sigma.size :] += np.diag(lens_sigma.reshape(-1) ** -2.0)
+    cover = solve_normal(told[np.ix_(active, active)], np.eye(int(active.sum())))
+    links = active[: 5 * cell.true.joints]
+    moved = free_motion(cell.true, everywhere(cell.true))[0][:, links]
+    root = np.linalg.cholesky(cover[: links.sum(), : links.sum()])
+    return np.asarray(1e6 * np.linalg.svd(moved @ root, compute_uv=False) ** 2 / JUDGED)

@@ -186,14 +186,12 @@ def by_cameras(
     if not (files.pixels and files.joints and files.camera):
         raise OptionError("cameras need all three of pixels=, joints= and camera='NAME=FILE'")
     at = click.get_current_context()
-    given = ParameterSource.COMMANDLINE
-    known = {field.name for field in fields(PixelOptions)}
-    for name in chosen:
-        if name not in known and at.get_parameter_source(name) is given:
-            if name == "objective" and chosen[name] == "sum":
-                continue
-            raise OptionError(f"{name}= is not for pixels: leave it out")
-    own = {name: value for name, value in chosen.items() if name in known}
+    given = [
+        name for name in chosen if at.get_parameter_source(name) is ParameterSource.COMMANDLINE
+    ]
+    for name in set(given) - {field.name for field in fields(PixelOptions)}:
+        raise OptionError(f"{name}= is not for pixels: leave it out")
+    own = {name: chosen[name] for name in given}
     cameras = dict(camera_of(text) for text in files.camera)
     if len(cameras) < len(files.camera):
         raise OptionError("camera= gives one name twice; each camera has its own")

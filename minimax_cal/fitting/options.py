@@ -93,7 +93,8 @@ class Options:
     objective: str = option(
         "minimax",
         "What is minimised: sum, minimax (the worst target), point (the worst point), pose, or "
-        "one target alone, as smr:2.",
+        "one target alone, as smr:2. Of pixels: sum (the default there), minimax, or camera (the "
+        "worst camera).",
         group="What is fitted",
     )
     qp: QpSolver = option(  # noqa: RUF009

@@ -58,6 +58,22 @@ def test_tables_say_what_pixels_do_not(
     assert "the lenses are held as their files say" in err
 
 
+def test_the_worst_target_by_a_named_backend(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = tmp_path / "fit.json"
+    chosen = ("--objective", "minimax", "--qp", "quadprog")
+    assert run("calibrate", "ur5", *files, *chosen, "--json", "-o", result) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert (content["objective"], content["qp"]) == ("minimax", "quadprog")
+    assert content["answered"].keys() == {"quadprog"}
+    worst = content["minimax"]
+    assert max(worst["rms_px"]) < worst["sum_largest_rms_px"]
+    assert len(worst["functions"]) == len(CELL.names)
+    assert run("report", result, "-o", tmp_path / "report.html") == 0
+    assert "what decides the minimax" in (tmp_path / "report.html").read_text()
+
+
 def test_the_drawn_arm_is_kept_where_it_is_known_better(
     files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,6 +102,10 @@ def test_the_drawn_arm_is_kept_where_it_is_known_better(
         (("d.csv", "--pixels", "d.csv"), "DATA and pixels are two calibrations"),
         (("--pixels", "d", "--joints", "j", "--camera", "left"), "--camera left: give a name"),
         (("--pixels", "d", "--joints", "j", "--camera", "a=b", "--trim", "0.1"), "--trim is not "),
+        (
+            ("--pixels", "d", "--joints", "j", "--camera", "a=b", "--objective", "pose"),
+            "for pixels",
+        ),
         (("--pixels", "d", "--joints", "j", "--camera", "a=b", "--camera", "a=c"), "name twice"),
         (("--pixels", "d", "--joints", "j", "--camera", "a=b", "--camera-on", "x"), "--camera-on"),
         (("--pixels", "d", "--joints", "j", "--camera", "a=b", "--camera-prior", "x"), "write f"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.optimize import minimize
 
 import minimax_cal as mc
 from experiments.pixel_cells import (
@@ -19,14 +21,16 @@ from experiments.pixel_cells import (
     make_cell,
     projected,
 )
-from minimax_cal.fitting.pixels.calibrate import fitted
+from minimax_cal.fitting.pixels.calibrate import concluded, determined, fitted
 from minimax_cal.fitting.pixels.camera import INTRINSICS, distorted, slopes, undistorted
 from minimax_cal.fitting.pixels.data import PixelData
+from minimax_cal.fitting.pixels.identify import gram_of_pixels
 from minimax_cal.fitting.pixels.judge import Claim
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, Sight
-from minimax_cal.fitting.pixels.options import PixelOptions, doubts_of
+from minimax_cal.fitting.pixels.options import PixelOptions, check_options, doubts_of
 from minimax_cal.fitting.pixels.result import PixelCalibration
 from minimax_cal.fitting.pixels.start import by_rotations, directions, merged, start_scene
+from minimax_cal.ground.arrays import Array
 from minimax_cal.solvers.status import Status
 
 LENS = np.array([2500, 2510, 1220, 1030, -0.1, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.01, 3e-3,
@@ -169,12 +173,7 @@ def test_the_arm_comes_out_and_its_sigma_is_true(cell: Cell) -> None:
 
 
 def test_two_cameras_are_better_than_one() -> None:
-    second = np.eye(4)
-    second[:3, 3] = -0.06, 0.02, 0.08
-    first = np.eye(4)
-    first[:3, 3] = 0.04, -0.03, 0.08
-    views = (View(first), View(second, lens=(2300.0, 2300.0, 1200.0, 1000.0)))
-    cell = cell_of(4, views=views)
+    cell = cell_of(4, views=two_views())
     data = data_of(cell)
     both = fitted(cell.drawn, data, PixelOptions())
     one = replace(data.some(data.camera == 0), cameras=data.cameras[:1])
@@ -232,6 +231,73 @@ def test_an_image_with_other_joints_is_named_whole(cell: Cell) -> None:
     fit = fitted(cell.drawn, replace(data, at=replace(data.at, q=q)), PixelOptions())
     assert any("whole images are outliers" in n and "pose P7 of" in n for n in fit.notices)
     assert arm_error(cell, fit.robot) < GIVEN_MM
+
+
+# ---- the minimax -----------------------------------------------------------------------------
+
+
+def two_views() -> tuple[View, View]:
+    """Two cameras on the flange."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = (0.04, -0.03, 0.08), (-0.06, 0.02, 0.08)
+    return View(poses[0]), View(poses[1], lens=(2300.0, 2300.0, 1200.0, 1000.0))
+
+
+@pytest.mark.parametrize(("objective", "count"), [("minimax", 24), ("camera", 2)])
+def test_the_minimax_is_that_of_slsqp(objective: str, count: int) -> None:
+    cell = cell_of(4, views=two_views(), points=board_points((4, 3), 0.06), poses=20)
+    data, options = data_of(cell), PixelOptions(objective=objective, fix_camera=True)
+    plain = determined(cell.drawn, data, replace(options, objective="sum"))
+    found = determined(cell.drawn, data, options)
+    assert found.worst is not None
+    assert len(found.worst.functions) == count
+    label = plain.train.part if objective == "minimax" else plain.train.camera
+    model, kept = plain.fit.model, plain.fit.model.weight > 0.0
+    gram = gram_of_pixels(model, plain.fit.scene, model.active)
+    scale = np.sqrt(len(model.pose) / np.diag(gram)[model.active])
+
+    def sizes(x: Array) -> Array:
+        error = model.errors(model.step(plain.fit.scene, (scale * x[:-1])[None]))
+        square = np.bincount(label[kept], (error[:, kept] ** 2).sum(axis=0))
+        return x[-1] - square / np.bincount(label[kept])
+
+    begin = np.zeros(len(scale) + 1)
+    begin[-1] = -sizes(begin).min()
+    slope = np.append(np.zeros(len(scale)), 1.0)
+    theirs = minimize(
+        lambda x: x[-1], begin, jac=lambda x: slope, method="SLSQP",
+        constraints={"type": "ineq", "fun": sizes}, options={"maxiter": 200, "ftol": 1e-12},
+    )  # fmt: skip
+    assert theirs.success
+    assert_allclose(found.worst.size.max() ** 2, theirs.fun, rtol=1e-6)
+    assert found.worst.size.max() < found.worst.before
+    assert_allclose(found.worst.multiplier.sum(), 1.0)
+    assert found.worst.answered.keys() == {"daqp"}
+
+
+def test_sigmas_of_a_minimax_are_true() -> None:
+    """Pixels that do not count tell nothing: the arm is known less, by as much as is claimed."""
+    ratio, against = [], []
+    for seed in range(5):
+        cell = cell_of(seed)
+        sums, fit = (
+            fitted(cell.drawn, data_of(cell), PixelOptions(camera_on="flange", objective=name))
+            for name in ("sum", "minimax")
+        )
+        ratio.append(arm_error(cell, fit.calibrated) / (1e3 * fit.claim.sigma))
+        against.append(fit.claim.sigma / sums.claim.sigma)
+    assert 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.4
+    assert min(against) > 1.2
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"objective": "point"}, "is not for pixels: give sum, minimax or camera"),
+     ({"objective": "minimax", "drawn_prior": True}, "drawn_prior= is for objective='sum'")],
+)  # fmt: skip
+def test_objectives_that_pixels_do_not_have(given: dict[str, object], said: str) -> None:
+    with pytest.raises(mc.OptionError, match=re.escape(said)):
+        check_options(PixelOptions(**given))  # type: ignore[arg-type]
 
 
 # ---- slips -----------------------------------------------------------------------------------
@@ -320,8 +386,8 @@ def test_a_drawing_as_a_prior_helps_weak_pixels() -> None:
     errors, ratio = [], []
     for seed in range(6):
         cell = cell_of(seed, noise=5.0, off=(0.3e-3, 0.5e-3))
-        plain = fitted(cell.drawn, data_of(cell), PixelOptions())
-        fit = fitted(cell.drawn, data_of(cell), PixelOptions(drawn_prior=True))
+        known = determined(cell.drawn, data_of(cell), PixelOptions(camera_on="flange"))
+        plain, fit = (concluded(known, PixelOptions(drawn_prior=p), 0.0) for p in (False, True))
         arms = (fit.calibrated, plain.calibrated, cell.drawn)
         errors.append([arm_error(cell, arm) for arm in arms])
         ratio.append(errors[-1][0] / (1e3 * fit.claim.sigma))
@@ -360,13 +426,19 @@ def test_claims_compare_sigma_and_drawing() -> None:
 
 
 def test_a_result_comes_back_from_its_file(ground: Cell) -> None:
-    fit = fitted(replace(ground.drawn, drawn_within=(1e-6, 1e-6)), data_of(ground), PixelOptions())
+    drawn, options = (
+        replace(ground.drawn, drawn_within=(1e-6, 1e-6)),
+        PixelOptions(objective="minimax"),
+    )
+    fit = fitted(drawn, data_of(ground), options)
     again = PixelCalibration.from_dict(fit.to_dict())
     assert again.status is Status.NO_BETTER
     assert again.pixels == fit.pixels
     assert_allclose(again.claim.sigma, fit.claim.sigma, rtol=1e-12)
     assert_allclose(again.calibrated.mdh, fit.calibrated.mdh, rtol=0, atol=1e-15)
     assert again.headline() == fit.headline()
+    assert "QPs: " in fit.headline()
+    assert again.to_dict()["minimax"] == fit.to_dict()["minimax"]
 
 
 def test_doubts_of_lenses_are_read() -> None:

@@ -14,7 +14,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter, Provenance, link_by_link
 from minimax_cal.fitting.identify import RESOLUTION
 from minimax_cal.fitting.instruments.options import Progress, silent
-from minimax_cal.fitting.options import listed
+from minimax_cal.fitting.options import QpSolver, listed, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS, read_camera
 from minimax_cal.fitting.pixels.data import PixelData, read_pixels
 from minimax_cal.fitting.pixels.drawing import Drawing, Scale, scale_of
@@ -25,7 +25,7 @@ from minimax_cal.fitting.pixels.fit import (
 )
 from minimax_cal.fitting.pixels.judge import Claim, arms_apart, drawn_sigma, position_sigma
 from minimax_cal.fitting.pixels.model import PixelModel, Scene, units_of
-from minimax_cal.fitting.pixels.options import PixelOptions, check_options
+from minimax_cal.fitting.pixels.options import SUM, PixelOptions, check_options
 from minimax_cal.fitting.pixels.plausible import (
     check_start,
     contradiction,
@@ -35,6 +35,7 @@ from minimax_cal.fitting.pixels.plausible import (
 from minimax_cal.fitting.pixels.result import PIXELS, PixelCalibration
 from minimax_cal.fitting.pixels.start import from_far, start_scene
 from minimax_cal.fitting.pixels.uncertainty import Uncertainty, uncertainty_of
+from minimax_cal.fitting.pixels.worst import WorstPixels, fit_worst
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import accuracy
 from minimax_cal.measuring.aside import TOOL, SetAside
@@ -57,6 +58,8 @@ def calibrate_pixels(
     board: Path | str | None = None,
     progress: Progress = silent,
     *,
+    objective: str = SUM,
+    qp: QpSolver = PixelOptions.qp,
     camera_on: str = "",
     fix_camera: bool = False,
     camera_prior: str = "",
@@ -85,6 +88,10 @@ def calibrate_pixels(
         the drawing alone tells the scale.
     progress
         Called with a word on each stage.
+    objective
+        sum, minimax (the worst target) or camera (the worst camera).
+    qp
+        Backend of the minimax QPs.
     camera_on
         flange or ground; what fits better unless given.
     fix_camera
@@ -121,6 +128,8 @@ def calibrate_pixels(
     """
     began = time.perf_counter()
     options = PixelOptions(
+        objective=objective,
+        qp=qp,
         camera_on=camera_on,
         fix_camera=fix_camera,
         camera_prior=camera_prior,
@@ -149,21 +158,56 @@ def fitted(
 ) -> PixelCalibration:
     """As `calibrate_pixels`, of measurements that are read."""
     began = time.perf_counter() if began is None else began
+    return concluded(determined(robot, data, options, progress), options, began)
+
+
+@dataclass(frozen=True, eq=False)
+class Determined:
+    """What pixels determine.  held: (m,) poses left out.  drawing, scale: of the least squares."""
+
+    robot: Robot
+    data: PixelData
+    held: Array
+    fit: PixelFit
+    sure: Uncertainty
+    drawing: Drawing
+    scale: Scale | None
+    worst: WorstPixels | None
+    notices: tuple[str, ...]
+
+    @property
+    def train(self) -> PixelData:
+        """The pixels that were fitted."""
+        return self.data.some(~self.held[self.data.pose])
+
+
+def determined(
+    robot: Robot, data: PixelData, options: PixelOptions, progress: Progress = silent
+) -> Determined:
+    """The fit of pixels, and how sure it is."""
     held, said = held_out(data.at, options.holdout, options.seed)
     train = data.some(~held[data.pose])
     progress("start")
     fit = fitted_on(robot, train, options, progress)
+    fit, worst, more = fit_worst(train, fit, options)
     progress("sigmas")
     _, group = np.unique(groups(data.at)[train.pose], return_inverse=True)
     sure = uncertainty_of(robot, fit, group.reshape(-1))
     length = np.arange(5 * robot.joints) < 2 * robot.joints  # known already where by_drawing
     drawing = Drawing.of(robot, fit, sure, ~(length & fit.by_drawing))
     scale = scale_of(robot, fit, sure)
+    return Determined(robot, data, held, fit, sure, drawing, scale, worst, (*said, *more))
+
+
+def concluded(one: Determined, options: PixelOptions, began: float) -> PixelCalibration:
+    """The result: whether to use the arm, and how good it is.  began: by `time.perf_counter`."""
+    robot, data, train, held = one.robot, one.data, one.train, one.held
+    fit, sure, scale = one.fit, one.sure, one.scale
     if options.drawn_prior:
-        fit, sure = drawing.beside(fit, sure)
+        fit, sure = one.drawing.beside(fit, sure)
     seen = judged_pixels(robot, data, held, fit)
     arm = robot.with_mdh(fit.scene.mdh[0])
-    claim = claimed(robot, arm, sure, drawing.share)
+    claim = claimed(robot, arm, sure, one.drawing.share)
     reason, status = contradiction(robot, train, fit, scale, options), fit.found.status[0]
     told = () if reason else file_notices(train, fit, scale)
     if reason:
@@ -174,7 +218,7 @@ def fitted(
         kind=PIXELS,
         robot=robot if status is Status.NO_BETTER else arm,
         nominal=robot,
-        parts=seen.parts,
+        parts=data.parts,
         status=status,
         iterations=int(fit.found.iterations[0]),
         seconds=time.perf_counter() - began,
@@ -187,8 +231,8 @@ def fitted(
         position_sigma=claim.sigma,
         beyond=(),
         notices=(
-            *data.notices, *limit_notices(robot, data.at), *said, *notices_of(fit, held), *told,
-            *outlier_notices(data, seen.aside),
+            *data.notices, *limit_notices(robot, data.at), *one.notices, *notices_of(fit, held),
+            *told, *outlier_notices(data, seen.aside),
         ),
         provenance=Provenance.of(
             robot, replace(data.at, source=data.source, digest=data.digest), options.settings()
@@ -199,6 +243,9 @@ def fitted(
         set_aside=set_aside(data, seen.aside),
         with_them=accuracy(seen.whole) if len(seen.aside) else None,
         reason=reason,
+        objective=options.objective,
+        qp=qp_name(options.qp) if one.worst else "",
+        worst=one.worst,
     )  # fmt: skip
 
 
@@ -247,12 +294,11 @@ def fitted_on(robot: Robot, data: PixelData, options: PixelOptions, progress: Pr
 class JudgedPixels:
     """Errors at the targets, of all pixels.
 
-    parts: what each row of the errors is.  errors: (parts, m, 3) by key, NaN where not measured or
+    errors: (parts, m, 3) by key, NaN where not measured or
     set aside [m].  pixels: RMS and largest by key [px].  aside: (a,) rows set aside.  whole: of the
     held-out poses, with them.
     """
 
-    parts: tuple[str, ...]
     errors: dict[str, Array]
     pixels: dict[str, tuple[float, float]]
     aside: Array
@@ -273,17 +319,12 @@ def judged_pixels(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> 
     later = ~trained & counts
     limit = np.linalg.norm(fit.model.errors(fit.scene)[:, fit.model.weight > 0.0], axis=0)
     wrong[later] = right_beside(error[:, later], limit) == 0.0
-    parts = tuple(
-        f"{camera.name} {target}" if len(data.cameras) > 1 else target
-        for camera in data.cameras
-        for target in data.targets
-    )
     tables = {
         name: table_of(model, data, scene, counts) for name, scene in
         (("drawn", fit.nominal), ("calibrated", fit.scene))
     }  # fmt: skip
     errors, pixels, whole = {}, {}, np.zeros(0)
-    rows = data.camera * len(data.targets) + data.target
+    rows = data.part
     for key, is_held in HELD.items():
         metres, image = tables["drawn" if key.startswith("nominal") else "calibrated"]
         part = metres[:, held == is_held]
@@ -296,7 +337,7 @@ def judged_pixels(robot: Robot, data: PixelData, held: Array, fit: PixelFit) -> 
         pixels[key] = (
             (float(np.sqrt((size**2).mean())), float(size.max())) if size.size else (np.nan,) * 2
         )
-    return JudgedPixels(parts, errors, pixels, np.flatnonzero(wrong), whole)
+    return JudgedPixels(errors, pixels, np.flatnonzero(wrong), whole)
 
 
 def right_beside(error: Array, size: Array) -> Array:
@@ -311,8 +352,8 @@ def table_of(model: PixelModel, data: PixelData, x: Scene, counts: Array) -> tup
     """Errors at the targets (parts, m, 3) [m], NaN where not measured, and in the image (2, N)."""
     error, depth = model.errors(x), model.seen(x).point[2]
     focal = x.lens[0][data.camera, :2].T
-    out = np.full((len(data.cameras) * len(data.targets), data.at.poses, 3), np.nan)
-    rows = data.camera * len(data.targets) + data.target
+    out = np.full((len(data.parts), data.at.poses, 3), np.nan)
+    rows = data.part
     at = np.flatnonzero(counts)
     flat = (error * np.abs(depth) / focal)[:, at].T
     out[rows[at], data.pose[at]] = np.concatenate([flat, np.zeros((len(at), 1))], axis=1)

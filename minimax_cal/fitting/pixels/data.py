@@ -57,6 +57,21 @@ class PixelData:
         """Number of pixels, each u and v."""
         return len(self.pixel)
 
+    @property
+    def part(self) -> Array:
+        """(N,) which target in which camera each pixel is of, as `parts` names them."""
+        return np.asarray(self.camera * len(self.targets) + self.target)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Every target in every camera."""
+        several = len(self.cameras) > 1
+        return tuple(
+            f"{camera.name} {target}" if several else target
+            for camera in self.cameras
+            for target in self.targets
+        )
+
     def some(self, kept: Array) -> PixelData:
         """Some of the pixels, of the same poses.  kept: (N,) mask."""
         parts = ("pose", "camera", "target", "pixel", "line")

@@ -59,6 +59,7 @@ class PixelFit:
     lens_sigma: (c, 9) how well the files know the lenses.  held: whether lenses are held so.
     by_drawing: whether nothing but the drawing tells the scale.  lens: (c, 9) the lenses as the
     pixels say they are, also where they are held; doubt: (c, 9) as it was given.
+    share: (N,) how much each pixel counts in the scene.  squares: the scene of the least squares.
     """
 
     model: PixelModel
@@ -72,6 +73,8 @@ class PixelFit:
     by_drawing: bool
     lens: Array
     doubt: Array
+    share: Array
+    squares: Scene
 
     @property
     def active(self) -> Array:
@@ -182,7 +185,7 @@ def fit_pixels(
         sigma = np.where(off > FAR_LENS * sigma, off, sigma)
     return PixelFit(
         model, nominal, found.x, known, found, noise, sigma, held, told.by_drawing, own.lens[0],
-        options.lens_sigma(model.intrinsic),
+        options.lens_sigma(model.intrinsic), model.weight, found.x,
     )  # fmt: skip
 
 

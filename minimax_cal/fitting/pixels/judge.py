@@ -40,10 +40,29 @@ def tool_points(robot: Robot, q: Array) -> Array:
     return np.asarray(pose[:, :3, :3] @ TOOL + pose[:, :3, 3])
 
 
-def arms_apart(one: Robot, other: Robot, poses: int = POSES) -> float:
+def arms_apart(one: Robot, other: Robot) -> float:
     """`missed` by one arm of the points of another, over the joints' range [m]."""
-    q = random_joints(one, (poses,), np.random.default_rng(0))
+    q = everywhere(one)
     return missed(other, q, tool_points(one, q))
+
+
+def free_motion(robot: Robot, q: Array) -> tuple[Array, Array, Array]:
+    """Motion of a tool's point at poses (m, n), less what base and tool take away.
+
+    (3m, 5n) by the links, (3m, f) by the functions of `modelling.lack`, (3m, n) by the joints [m].
+    """
+    arm = arm_at(robot, q)
+    every = arm.jacobian(state_of(robot.mdh, TOOL, np.zeros(0)))[0]
+    joints = every[..., zero_positions(robot.prismatic)]
+    turned, _ = by_pose(robot, arm.q, joints)
+    every, turned, joints = (part.reshape(3 * len(q), -1) for part in (every, turned, joints))
+    u, size, _ = np.linalg.svd(every[:, 5 * robot.joints :], full_matrices=False)
+    taken = u[:, size > 1e-9 * size[0]]
+
+    def left(rows: Array) -> Array:
+        return np.asarray(rows - taken @ (taken.T @ rows))
+
+    return left(every[:, : 5 * robot.joints]), left(turned), left(joints)
 
 
 def position_error(robot: Robot, links: Array, moved: Array, lack: Lack) -> float:
@@ -52,25 +71,17 @@ def position_error(robot: Robot, links: Array, moved: Array, lack: Lack) -> floa
     links: (5n, 5n) covariance of the link parameters, besides what the lack does.  moved: (5n, c)
     how each factor of the lack moves them.
     """
-    q = random_joints(robot, (POSES,), np.random.default_rng(0))
-    arm = arm_at(robot, q)
-    every = arm.jacobian(state_of(robot.mdh, TOOL, np.zeros(0)))[0]
-    joints = every[..., zero_positions(robot.prismatic)]
-    turned, _ = by_pose(robot, arm.q, joints)
-    parts = (every, turned, joints)
-    every, turned, joints = (part.reshape(3 * len(q), -1) for part in parts)
-    u, size, _ = np.linalg.svd(every[:, 5 * robot.joints :], full_matrices=False)
-    taken = u[:, size > 1e-9 * size[0]]
-
-    def left(rows: Array) -> Array:
-        return np.asarray(rows - taken @ (taken.T @ rows))
-
-    every = left(every[:, : 5 * robot.joints])
+    every, turned, joints = free_motion(robot, everywhere(robot))
     by_lack = every @ moved
-    by_lack[:, : lack.functions] -= left(turned)
+    by_lack[:, : lack.functions] -= turned
     square = np.sum((every @ links) * every) + np.sum((by_lack @ lack.moment) * by_lack)
-    square += np.sum(left(joints) ** 2 @ lack.scatter)
+    square += np.sum(joints**2 @ lack.scatter)
     return float(np.sqrt(max(square, 0.0) / POSES))
+
+
+def everywhere(robot: Robot) -> Array:
+    """(`POSES`, n) joint values over the joints' whole range, which an arm is judged at."""
+    return random_joints(robot, (POSES,), np.random.default_rng(0))
 
 
 def position_sigma(robot: Robot, sure: Uncertainty) -> float:

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from minimax_cal.fitting.options import Options
+from minimax_cal.fitting.options import Options, QpSolver, qp_name
 from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, INTRINSICS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.options import option
 
 CAMERAS = "Cameras in place of DATA"
+SUM, WORST_TARGET, WORST_CAMERA = OBJECTIVES = ("sum", "minimax", "camera")
 # How well a camera's file knows its lens: a share of the focal length, pixels of the centre, and
 # the first radial and both tangential coefficients; higher radial ones are known worse.
 DOUBTS = {"f": 1e-3, "c": 2.0, "k": 5e-3, "p": 5e-4}
@@ -52,13 +53,17 @@ def camera_of(text: str) -> tuple[str, str]:
 class PixelOptions:
     """How to calibrate.
 
-    camera_on: flange or ground; "" for what fits better.  fix_camera: hold the lenses as their
-    files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.  drawn_prior: whether
-    the drawing is a prior.  holdout: share of the poses kept out of the fit; seed: of that choice.
-    fix, free: names or patterns as ``beta*``.  resolution: relative singular value that counts as
-    not measured.  allow_large_changes: accept an arm that is another than the one drawn.
+    objective: sum, minimax (the worst target) or camera (the worst camera).  qp: backend of the
+    minimax QPs.  camera_on: flange or ground; "" for what fits better.  fix_camera: hold the
+    lenses as their files say.  camera_prior: how well these know them, as ``f 0.1%, c 2px``.
+    drawn_prior: whether the drawing is a prior.  holdout: share of the poses kept out of the fit;
+    seed: of that choice.  fix, free: names or patterns as ``beta*``.  resolution: relative singular
+    value that counts as not measured.  allow_large_changes: accept an arm that is another than the
+    one drawn.
     """
 
+    objective: str = SUM
+    qp: QpSolver = Options.qp
     camera_on: str = option(
         "",
         "What the cameras are fixed to: flange or ground [default: what fits better].",
@@ -91,7 +96,7 @@ class PixelOptions:
 
     def settings(self) -> dict[str, object]:
         """For the record."""
-        return dict(vars(self))
+        return {**vars(self), "qp": qp_name(self.qp)}
 
     def lens_sigma(self, intrinsic: Array) -> Array:
         """(c, 9) standard deviations of the lenses.  intrinsic: (c, 16)."""
@@ -104,6 +109,13 @@ class PixelOptions:
 
 def check_options(options: PixelOptions) -> None:
     """Raise OptionError for a choice that does not exist."""
+    if options.objective not in OBJECTIVES:
+        raise OptionError(
+            f"objective={options.objective!r} is not for pixels: give {', '.join(OBJECTIVES[:2])} "
+            f"or {OBJECTIVES[2]}"
+        )
+    if options.objective != SUM and options.drawn_prior:
+        raise OptionError(f"drawn_prior= is for objective='{SUM}': leave one of them out")
     if options.camera_on not in ("", FLANGE, GROUND):
         raise OptionError(f"camera_on={options.camera_on!r}: give {FLANGE} or {GROUND}")
     if not 0.0 <= options.resolution < 1.0:

@@ -7,15 +7,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
+from pydantic import Field
+
 from minimax_cal.fitting.fit import ACCURACIES, parameter_table
 from minimax_cal.fitting.instruments.result import RelativeCalibration, RelativePart
 from minimax_cal.fitting.pixels.judge import Claim
+from minimax_cal.fitting.pixels.options import SUM
+from minimax_cal.fitting.pixels.worst import WorstPixels
 from minimax_cal.ground.files import plain
-from minimax_cal.ground.records import Number, Part, checked
+from minimax_cal.ground.records import Number, Part, Recorded, checked
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.measuring.accuracy import Accuracy
 from minimax_cal.measuring.aside import SetAside
 from minimax_cal.robots.robot import Robot, robot_from_dict
+from minimax_cal.solvers.minimax import Kkt
 from minimax_cal.solvers.status import Status
 
 PIXELS = "pixels"  # what was measured
@@ -41,11 +47,32 @@ class AsidePart(Part):
     by: str
 
 
+class WorstPart(Part):
+    """What a minimax rests on, in a file."""
+
+    functions: tuple[str, ...]
+    rms_px: tuple[Number, ...]
+    multipliers: tuple[Number, ...]
+    active: tuple[str, ...]
+    sum_largest_rms_px: Number
+    kkt: Recorded[Kkt]
+
+    def read(self, answered: Mapping[str, int]) -> WorstPixels:
+        """What it says."""
+        size, multiplier = np.array(self.rms_px), np.array(self.multipliers)
+        before = self.sum_largest_rms_px
+        return WorstPixels(self.functions, size, multiplier, before, self.kkt, answered)
+
+
 class PixelPart(RelativePart):
     """The file of a calibration by cameras."""
 
     calibrated_robot: dict[str, Any]
     arm_position: ArmPart
+    objective: str = SUM
+    qp: str = ""
+    answered: dict[str, int] = Field(default_factory=dict)
+    minimax: WorstPart | None = None
     set_aside: tuple[AsidePart, ...] = ()
     reason: str = ""
 
@@ -56,11 +83,14 @@ class PixelCalibration(RelativeCalibration):
 
     calibrated: the robot that fits the pixels.  pixels: RMS and largest error by key [px].
     claim: of positions of the arm.  with_them: held-out accuracy with the pixels set aside.
-    reason: why it failed or the drawn arm is kept; empty where neither.
+    reason: why it failed or the drawn arm is kept; empty where neither.  worst: what a minimax
+    rests on, None where there was none.
     """
 
     calibrated: Robot | None = None
-    objective: str = "sum"
+    objective: str = SUM
+    qp: str = ""
+    worst: WorstPixels | None = None
     pixels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     claim: Claim = NO_CLAIM
     set_aside: tuple[SetAside, ...] = ()
@@ -98,7 +128,9 @@ class PixelCalibration(RelativeCalibration):
 
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
-        return (self.accuracy_table(), self.claim_table(), parameter_table(self.parameters))
+        worst = (self.worst.table(),) if self.worst else ()
+        parameters = parameter_table(self.parameters)
+        return (self.accuracy_table(), self.claim_table(), *worst, parameters)
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
@@ -116,6 +148,8 @@ class PixelCalibration(RelativeCalibration):
             f"{self.identification.condition:.3g}); {self.status} after {self.iterations} "
             f"iterations, {self.seconds:.2f} s."
         )
+        if self.worst:
+            text += f" {self.worst.sentence()}"
         if self.set_aside:
             text += f" {len(self.set_aside)} pixels set aside as wrong."
         if self.reason:
@@ -133,7 +167,9 @@ class PixelCalibration(RelativeCalibration):
         more: dict[str, Any] = plain(
             {
                 "objective": self.objective,
-                "qp": "",
+                "qp": self.qp,
+                "answered": self.worst.answered if self.worst else {},
+                "minimax": self.worst.to_dict() if self.worst else None,
                 "calibrated_robot": calibrated.to_dict(),
                 "arm_position": {
                     "sigma_mm": 1e3 * self.claim.sigma,
@@ -162,4 +198,7 @@ class PixelCalibration(RelativeCalibration):
             claim=Claim(*(1e-3 * value for value in claimed)),
             set_aside=tuple(SetAside(**each.model_dump()) for each in part.set_aside),
             reason=part.reason,
+            objective=part.objective,
+            qp=part.qp,
+            worst=part.minimax.read(part.answered) if part.minimax else None,
         )

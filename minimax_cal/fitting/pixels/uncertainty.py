@@ -71,8 +71,11 @@ class Uncertainty:
 
 
 def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
-    """Of a fit.  robot: as drawn.  group: (N,) the pose of each training pixel, from 0."""
-    model, x, active = fit.model, fit.scene, fit.active
+    """Of a fit.  robot: as drawn.  group: (N,) the pose of each training pixel, from 0.
+
+    Noise and lack are what the least squares leave; they move the fit by the pixels' shares in it.
+    """
+    model, x, active = fit.model, fit.squares, fit.active
     root = np.sqrt(model.weight)
     zero = np.zeros(len(active), dtype=bool)
     zero[zero_positions(model.prismatic)] = True
@@ -91,7 +94,10 @@ def uncertainty_of(robot: Robot, fit: PixelFit, group: Array) -> Uncertainty:
     own = kind[functions:].reshape(robot.joints, -1)[:, 0]
     lack = Lack(found.moment, functions, found.variance[own] * size)
     noise = np.zeros((len(active),) * 2)
-    told = found.noise * gram + np.diag(fit.noise**2 * prior)
+    pulled = jacobian * np.tile(fit.share, 2)
+    cover = solve_normal(pulled @ jacobian.T + np.diag(prior), np.eye(len(gram)))
+    moved = cover @ (pulled @ columns.T)
+    told = found.noise * pulled @ pulled.T + np.diag(fit.noise**2 * prior)
     noise[np.ix_(active, active)] = cover @ told @ cover
     if fit.held:
         lens = np.arange(len(active)) >= len(active) - x.lens[0].size
@@ -122,8 +128,8 @@ def shift_by(fit: PixelFit, held: Array, sigma: Array) -> Array:
 
     held: (p,) mask of h that were not fitted.  sigma: (h,).
     """
-    model, active = fit.model, fit.active
-    gram = gram_of_pixels(model, fit.scene, active | held)
+    model, active = replace(fit.model, weight=fit.share), fit.active
+    gram = gram_of_pixels(model, fit.squares, active | held)
     normal = gram + np.diag(np.where(active, model.prior.weight, 0.0))
     out = np.zeros((len(active), len(sigma)))
     mixed = gram[np.ix_(active, held)]
