@@ -152,7 +152,7 @@ class WorstPixels:
         order = np.argsort(-self.multiplier, kind="stable")
         rows = tuple((self.functions[i], self.size[i], self.multiplier[i]) for i in order)
         return Table(
-            "what decides the minimax", ("of", "RMS px", "weight"), rows, ("", ".4f", ".3f")
+            "what decides the minimax", ("target", "RMS px", "multiplier"), rows, ("", ".4f", ".3f")
         )
 
     def to_dict(self) -> dict[str, object]:
