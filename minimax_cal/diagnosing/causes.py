@@ -81,7 +81,8 @@ def causes_of(
     And the study, its rows weighed by the noises that were found beside the effects.
     """
     lib, choice = chosen(study, exclude)
-    clear = loudest(left_by(study, choice)) is None  # or each joint would absorb it
+    left = left_by(study, choice)
+    clear = loudest(left) is None  # or each joint would absorb it
     plain, study = study, weighed_anew(study, choice.known, each=clear)
     if study is not plain:
         progress("testing causes again")
@@ -91,7 +92,9 @@ def causes_of(
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
         exclude = (*exclude, *play)
         lib, choice = chosen(study, exclude)
-    every, told, left = (*faults, *read_back), lib.untestable, left_by(study, choice)
+    every, told = (*faults, *read_back), lib.untestable
+    if read_back or study is not plain:
+        left = left_by(study, choice)
     causes = Causes(
         every, lib, tuple(exclude), choice, (), left, told, wary=False, jobs=jobs, cluster=cluster
     )

@@ -304,13 +304,12 @@ class Fixed:
     def projected(self, columns: Array) -> tuple[Array, Array]:
         """Coordinates (s, d, f) of columns (d, N) in the span; (s, d) products with the error."""
         s, d = len(self.weights), len(columns)
-        weighed = (columns[None] * self.weights[:, None]).reshape(s * d, self.weights.shape[1])
-        shared = (self.rows @ weighed.T).reshape(len(self.rows), s, d)
-        part = np.stack([
-            solve_triangular(factor, shared[:, i], lower=True, check_finite=False).T
-            for i, factor in enumerate(self.factors)
-        ])  # fmt: skip
-        pull = (weighed @ self.error).reshape(s, d)
+        part, pull = np.empty((s, d, len(self.rows))), np.empty((s, d))
+        for i, (factor, weight) in enumerate(zip(self.factors, self.weights, strict=True)):
+            weighed = columns * weight
+            shared = self.rows @ weighed.T
+            part[i] = solve_triangular(factor, shared, lower=True, check_finite=False).T
+            pull[i] = weighed @ self.error
         return part, pull - (part @ self.before[..., None])[..., 0]
 
 

@@ -16,7 +16,7 @@ def evened(rows: Array, basis: Array, spread: Array, group: Array) -> Array:
     V_g - H_gg V_g - V_g H_gg + sum_h H_gh V_h H_hg with H = QQ', Q = `basis` (m, 3k, p).  All
     visits to a pose are one block g: the fit ties them together; of very many so many at a time.
     """
-    middle = (np.swapaxes(basis, 1, 2) @ spread @ basis).sum(axis=0)
+    middle = np.tensordot(basis, spread @ basis, ((0, 1), (0, 1)))
     several = np.stack([group, times_before(group) // TOGETHER])
     _, place, count = np.unique(several, axis=1, return_inverse=True, return_counts=True)
     place, out = place.reshape(-1), np.empty_like(rows)

@@ -26,17 +26,36 @@ SHOWN = 6  # components that are told at most
 
 
 @dataclass(frozen=True, eq=False)
+class Fading:
+    """A covariance of the visits that fades from each to the next.
+
+    order: (m,) the visits as they came.  keep: correlation of one with the next.
+    """
+
+    order: Array
+    keep: float
+
+    def score(self, felt: Array) -> Array:
+        """(b,) squares of what is felt (d, m, b), each visit adding to what is kept of the past."""
+        kept, total = np.zeros((len(felt), felt.shape[2])), np.zeros(felt.shape[2])
+        for visit in self.order.tolist():
+            kept = self.keep * kept + felt[:, visit]
+            total += (kept**2).sum(axis=0)
+        return total
+
+
+@dataclass(frozen=True, eq=False)
 class Component:
     """What may remain: motions of a place that follow functions of a driver.
 
-    motion: (N, d) rows per unit.  feature: (w, f, m) of the visits, f functions or a square root of
-    their covariance in each of w ways, of which the loudest counts.
+    motion: (N, d) rows per unit.  feature: (w, f, m) of the visits, f functions in each of w ways,
+    of which the loudest counts; or their covariance.
     """
 
     place: str
     driver: str
     motion: Array
-    feature: Array
+    feature: Array | Fading
 
 
 @dataclass(frozen=True)
@@ -146,8 +165,10 @@ def scores_of(rest: Rest, components: Sequence[Component], drawn: Array) -> Arra
     return np.array(out)
 
 
-def score_of(feature: Array, felt: Array) -> Array:
+def score_of(feature: Array | Fading, felt: Array) -> Array:
     """(b,) the largest squared product of the ways (w, f, m) with what is felt (d, m, b)."""
+    if isinstance(feature, Fading):
+        return feature.score(felt)
     ways, count, visits = feature.shape
     told = feature.reshape(-1, visits) @ felt
     return np.asarray((told**2).reshape(len(felt), ways, count, -1).sum(axis=(0, 2)).max(axis=0))
@@ -190,7 +211,7 @@ def share_of(rest: Rest, one: Component, drawn: Array) -> float:
     """
     felt = rest.felt(one.motion, np.concatenate([rest.rows[:, None], drawn], axis=1))
     feature = one.feature
-    if len(feature) > 1:
+    if not isinstance(feature, Fading) and len(feature) > 1:
         feature = feature[[int(np.argmax([score_of(w[None], felt[..., :1])[0] for w in feature]))]]
     score, *chance = score_of(feature, felt).tolist()
     mean, spread = float(np.mean(chance)), float(np.var(chance))

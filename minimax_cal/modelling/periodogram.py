@@ -170,15 +170,24 @@ def sums(turns: Array, q: Array, score: Array, size: Array) -> tuple[Array, Arra
     """Sums over poses of score e^(i k q) and of size e^(2 i k q) for turns k (f,), and of size.
 
     turns: equally spaced, so that every wave is a product of one from a coarse grid and one of the
-    few between: the sums over poses are products of two small matrices.
+    few between, themselves powers: the sums over poses are products of two small matrices.
     """
     count = int(np.ceil(np.sqrt(len(turns))))
-    step = turns[1] - turns[0]
-    coarse = np.exp(1j * np.outer(turns[::count], q))
-    fine = np.exp(1j * np.outer(step * np.arange(count), q))
+    step = np.exp(1j * (turns[1] - turns[0]) * q)
+    fine = powers(np.ones_like(step), step, count)
+    coarse = powers(np.exp(1j * turns[0] * q), fine[-1] * step, -(-len(turns) // count))
     pull = (coarse * score) @ fine.T
     square = (coarse**2 * size) @ (fine**2).T
     return pull.reshape(-1)[: len(turns)], square.reshape(-1)[: len(turns)], float(size.sum())
+
+
+def powers(first: Array, step: Array, count: int) -> Array:
+    """(count, m) first, then each times step.  first, step: (m,)."""
+    out = np.empty((count, len(first)), dtype=complex)
+    out[0] = first
+    for i in range(1, count):
+        np.multiply(out[i - 1], step, out=out[i])
+    return out
 
 
 def power(pull: Array, square: Array, whole: float) -> Array:

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.signal import lfilter
 
-from minimax_cal.evidence.remains import Component
+from minimax_cal.evidence.remains import Component, Fading
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.scene import Scene, turning
 from minimax_cal.modelling.effects.time import ROOM
@@ -29,7 +29,7 @@ RANDOM = 64  # Fourier features of all joints [Rahimi and Recht 2007]
 ALL = 2.0  # length of their kernel, in standard deviations of each joint
 MIN_SPAN = 1e-9  # of a driver's size: it does not vary
 
-Drivers = dict[str, Array]
+Drivers = dict[str, Array | Fading]
 
 
 def components(scene: Scene, rows: Rows, named: Sequence[tuple[str, Array]]) -> Iterator[Component]:
@@ -62,7 +62,9 @@ def components(scene: Scene, rows: Rows, named: Sequence[tuple[str, Array]]) -> 
 def driven(place: str, motion: Array, drivers: Drivers) -> Iterator[Component]:
     """The motion with each driver that varies."""
     for name, feature in drivers.items():
-        if np.abs(feature).max(initial=0.0) > MIN_SPAN:
+        if isinstance(feature, Fading):
+            yield Component(place, name, motion, feature)
+        elif np.abs(feature).max(initial=0.0) > MIN_SPAN:
             ways = feature if feature.ndim == 3 else feature[None]
             yield Component(place, name, motion, ways)
 
@@ -162,14 +164,15 @@ def everywhere(scene: Scene) -> Drivers:
 def timed(scene: Scene) -> Drivers:
     """What any motion may follow of the time, and of the order of the visits."""
     clock = scene.column("clock")
-    out: dict[str, Array] = {}
+    out: Drivers = {}
     if np.ptp(clock) > 0.0:
         last = min(SWINGS, scene.poses // 3)
         out["time"] = np.array([np.cos(np.pi * k * clock) for k in range(1, COURSE + 1)])
         if last > COURSE:
             swings = range(COURSE + 1, last + 1)
             out["time, to and fro"] = np.array([np.cos(np.pi * k * clock) for k in swings])
-        out["the previous poses"] = following(clock)
+        order = np.argsort(clock, kind="stable")
+        out["the previous poses"] = Fading(order, VISIT_CORRELATION)
     if scene.has("temperature"):
         warm = unit(scene.column("temperature") - ROOM)
         out["temperature"] = np.array([warm, warm**2])
@@ -236,17 +239,6 @@ def wound(move: Array) -> Array:
             at = min(max(at + step, -most), most)
             row[i] = at
     return out / max(usual, MIN_SPAN)
-
-
-def following(clock: Array) -> Array:
-    """(m, m) root of a covariance that fades from visit to visit."""
-    order = np.argsort(clock, kind="stable")
-    root = np.zeros((len(clock), len(clock)))
-    lag = np.arange(len(clock))
-    root[order[:, None], order] = np.where(
-        lag[:, None] >= lag, VISIT_CORRELATION ** np.abs(lag[:, None] - lag), 0.0
-    )
-    return root
 
 
 def unit(x: Array) -> Array:

@@ -19,7 +19,7 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import split
 from minimax_cal.measuring.history import with_history
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.modelling.remaining import curve, faded, following, tilts, wound
+from minimax_cal.modelling.remaining import curve, faded, tilts, wound
 from minimax_cal.robots.kinematics import chain, points
 from minimax_cal.robots.robot import Robot
 
@@ -166,10 +166,6 @@ def test_drivers_of_the_past_are_those_of_the_past() -> None:
     assert np.all(np.diff(past[:, 11:], axis=1) < 0.0)
     swing = wound(np.tile([1.0, -1.0], 10))
     assert np.abs(swing).max() <= 2.0
-    clock = np.array([0.0, 1.0, 0.5])  # the third row was visited between the others
-    root = following(clock)
-    covariance = root @ root.T
-    assert covariance[0, 2] > covariance[0, 1]
     assert (
         curve(np.linspace(0.0, 3.0, 50), 0.15).shape[0] > curve(np.linspace(0, 3, 50), 1.0).shape[0]
     )

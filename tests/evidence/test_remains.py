@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from minimax_cal.evidence.noise import Noise, Problem, orthonormal
-from minimax_cal.evidence.remains import Component, Rest, remains, rest_of
+from minimax_cal.evidence.remains import Component, Fading, Rest, remains, rest_of
 from minimax_cal.ground.arrays import Array
 
 VISITS, WIDTH = 80, 6
@@ -44,6 +44,15 @@ def rest(rng: np.random.Generator, error: Array) -> Rest:
     """What is left of an error."""
     none = np.zeros((len(error), 0))
     return rest_of(problem(rng, error), PLAIN, none, WIDTH)
+
+
+def test_what_fades_is_the_root_of_its_covariance() -> None:
+    rng = np.random.default_rng(4)
+    order, felt = rng.permutation(30), rng.normal(size=(2, 30, 5))
+    lag = np.arange(30)[:, None] - np.arange(30)
+    root = np.where(lag >= 0, 0.6 ** np.maximum(lag, 0), 0.0)
+    expected = ((root @ felt[:, order]) ** 2).sum(axis=(0, 1))
+    assert np.allclose(Fading(order, 0.6).score(felt), expected, rtol=1e-12)
 
 
 def test_noise_is_called_remains_as_often_as_the_level_says() -> None:
