@@ -37,7 +37,7 @@ ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 class Causes:
     """What may be wrong.
 
-    faults: of the data.  library: what could be tested, exclude: effects that were not looked for.
+    faults: of the data.  exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
     left: what they leave.  untestable: effects, and what the data lack for them.  wary:
     whether anything is left that matters, or names that change with the poses.  maps: of joints,
@@ -46,7 +46,6 @@ class Causes:
     """
 
     faults: tuple[Fault, ...]
-    library: Library
     exclude: tuple[str, ...]
     choice: Choice
     effects: tuple[Finding, ...]
@@ -56,11 +55,6 @@ class Causes:
     maps: Mapped = NO_MAPS
     jobs: int = 1
     cluster: str = ""
-
-    def portable(self) -> Causes:
-        """What folds of the poses need, for another process."""
-        choice = self.choice.portable()
-        return replace(self, choice=choice, library=choice.library, effects=())
 
     @property
     def ripple(self) -> bool:
@@ -80,23 +74,25 @@ def causes_of(
 
     And the study, its rows weighed by the noises that were found beside the effects.
     """
-    lib, choice = chosen(study, exclude)
+    choice = chosen(study, exclude)
     left = left_by(study, choice)
     clear = loudest(left) is None  # or each joint would absorb it
     plain, study = study, weighed_anew(study, choice.known, each=clear)
     if study is not plain:
         progress("testing causes again")
-        lib, choice = chosen(study, exclude, choice.found)
+        first = choice.found
+        del choice  # whose products fill the memory
+        choice = chosen(study, exclude, first)
     read_back = read_back_fault(study, choice)
     if read_back:  # what is left of a move looks like play in the gears
         play = [name for name, effect in EFFECTS.items() if effect.follows == "approach"]
         exclude = (*exclude, *play)
-        lib, choice = chosen(study, exclude)
-    every, told = (*faults, *read_back), lib.untestable
+        choice = chosen(study, exclude)
+    every, told = (*faults, *read_back), choice.library.untestable
     if read_back or study is not plain:
         left = left_by(study, choice)
     causes = Causes(
-        every, lib, tuple(exclude), choice, (), left, told, wary=False, jobs=jobs, cluster=cluster
+        every, tuple(exclude), choice, (), left, told, wary=False, jobs=jobs, cluster=cluster
     )
     return study, found_again(study, causes)
 
@@ -112,7 +108,7 @@ def found_again(study: Study, causes: Causes) -> Causes:
     effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
     change = mostly_loose(effects, [found for found in effects if found.established])
     wary = (change and asked(effects)) or loudest(causes.left) is not None
-    return replace(causes, effects=effects, wary=wary)
+    return replace(causes, choice=choice.portable(), effects=effects, wary=wary)
 
 
 def believed(causes: Causes, scene: Scene) -> list[Finding]:
@@ -153,9 +149,9 @@ def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     usual = [one.displacement(study.scene) / np.sqrt(one.ridge)[:, None, None, None]
              for one in columns]  # fmt: skip
     study = replace(study, rows=study.rows.beside(study.rows.of(np.concatenate(usual))))
-    lib, choice = chosen(study, causes.exclude)
+    choice = chosen(study, causes.exclude)
     left = left_by(study, choice)
-    return found_again(study, replace(causes, library=lib, choice=choice, left=left))
+    return found_again(study, replace(causes, choice=choice, left=left))
 
 
 def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
@@ -168,14 +164,12 @@ def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
     return replace(causes, left=left, wary=loudest(left) is not None)
 
 
-def chosen(
-    study: Study, exclude: Sequence[str], first: Sequence[Added] = ()
-) -> tuple[Library, Choice]:
-    """The library and what it explains.  first: what was chosen with other weights."""
+def chosen(study: Study, exclude: Sequence[str], first: Sequence[Added] = ()) -> Choice:
+    """What the library explains.  first: what was chosen with other weights."""
     lib = arm_library(study.scene, study.rows, exclude)
     if SESSION_JUMP.name not in exclude:
         lib = with_jumps(lib, study)
-    return lib, selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
+    return selection.select(lib, ripple=GEAR_RIPPLE.name not in exclude, first=first)
 
 
 def with_jumps(lib: Library, study: Study) -> Library:

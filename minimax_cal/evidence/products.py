@@ -119,16 +119,11 @@ class Sums:
         self.columns, self.ratios = columns, ratios
         self.weights = 1.0 / (1.0 + np.outer(ratios, columns.rows.variance_ratio))
         self.alike = not columns.rows.variance_ratio.any()  # one noise: ratios change nothing
-        self.lines = Lines(len(ratios))
         self.sets: dict[tuple[bytes, int], Array] = {}
         self.whole = np.zeros((0, len(ratios)))
 
     def products(self, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) of columns with those from a first to before a last."""
-        return self.lines.across(self.weighed, index, start, stop)
-
-    def weighed(self, index: Array, start: int, stop: int) -> Array:
-        """(f, g, d) as `products`, formed; the fewer columns are weighed."""
+        """(f, g, d) of columns with those from a first to before a last; the fewer are weighed."""
         fields = self.columns.clear
         there = fields[start:stop]
         if len(there) < len(index):
