@@ -67,6 +67,10 @@ STUDIES = {  # name: (module with the command `main`, what it tells)
         "experiments.external",
         "Do claimed accuracies hold on poses set aside: halves, regions, ends of the session",
     ),
+    "ablation": (
+        "experiments.ablation",
+        "Which rules of the diagnosis pay: each taken out in turn, simulated and real arms",
+    ),
     "ten_splits": (
         "experiments.ten_splits",
         "Do names of causes hold, whichever poses are held out",

@@ -126,21 +126,29 @@ def some_cases(
 def run(asked: Asked) -> Row:
     """Make the files, let them be diagnosed, and score."""
     made = make(asked)
+    began = time.perf_counter()
+    said = diagnosed(made)
+    seconds = time.perf_counter() - began
+    return score(asked, made, said, likeness(made)) | {"seconds": seconds}
+
+
+def diagnosed(made: Made) -> Row:
+    """The JSON of a diagnosis that sees the files alone."""
     with TemporaryDirectory() as name:
         robot, data = Path(name) / "robot.json", Path(name) / "data.csv"
         made.robot.save(robot)
         write_measurements(data, made.data)
-        began = time.perf_counter()
         try:
-            said: Row = mc.diagnose(robot, data, quick=True).to_dict()
+            return mc.diagnose(robot, data, quick=True).to_dict()
         except Exception as error:  # a crash is an answer too, and a bad one
-            said = {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
-        seconds = time.perf_counter() - began
-    return score(asked, made, said) | {"seconds": seconds}
+            return {"verdict": "error", "trouble": f"{type(error).__name__}: {error}"}
 
 
-def score(asked: Asked, made: Made, said: Row) -> Row:
-    """What an answer is worth, as plain data.  said: the JSON of a diagnosis."""
+def score(asked: Asked, made: Made, said: Row, alike: tuple[Array, Array]) -> Row:
+    """What an answer is worth, as plain data.
+
+    said: the JSON of a diagnosis.  alike: as `likeness` tells.
+    """
     effects = said.get("effects", [])
     sure = [e for e in effects if e.get("established", True)]
     names = [(str(e["effect"]), str(e["place"])) for e in sure]
@@ -148,7 +156,7 @@ def score(asked: Asked, made: Made, said: Row) -> Row:
         [name, *((str(a["effect"]), str(a["place"])) for a in e.get("alternatives", []))]
         for name, e in zip(names, sure, strict=True)
     ]
-    own, other = likeness(made)
+    own, other = alike
     power = np.array(made.powers)
     gap = said.get("gap", {})
     count = len(made.truth)

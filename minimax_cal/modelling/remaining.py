@@ -37,7 +37,8 @@ def components(scene: Scene, rows: Rows, named: Sequence[tuple[str, Array]]) -> 
 
     named: label and rows (N, d) of the motion of each law that was fitted.
     """
-    shared, past, fast = everywhere(scene), together(scene), {"a wave of two angles": waves(scene)}
+    shared, past = everywhere(scene), together(scene)
+    fast: Drivers = {"a wave of two angles": waves(scene)}
     for j in range(scene.joints):
         turn = rows.of(scene.jacobian[j : j + 1])
         yield from driven(f"J{j + 1}", turn, own(scene, j) | shared | fast)
@@ -158,7 +159,8 @@ def together(scene: Scene) -> Drivers:
 
 def everywhere(scene: Scene) -> Drivers:
     """What any motion may follow."""
-    return {"all joints": randomly(scene.q)} | timed(scene)
+    out: Drivers = {"all joints": randomly(scene.q)}
+    return out | timed(scene)
 
 
 def timed(scene: Scene) -> Drivers:
