@@ -122,7 +122,7 @@ RULES: dict[str, dict[str, object]] = {
         "diagnosing.verdict:mostly_loose": never,
     },
     "ends of an angle or the time": {"diagnosing.gap:ends_of": nothing},
-    "steps by the error foretold": {"diagnosing.gap:tells": alike_alone},
+    "steps by the predicted error": {"diagnosing.gap:tells": alike_alone},
     "priors of effects by their size": {
         "diagnosing.joint:weights_of": no_prior,
         "diagnosing.trial:weights_of": no_prior,
