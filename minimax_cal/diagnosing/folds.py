@@ -71,8 +71,7 @@ def beyond_of(
     for part, state in zip(found, states, strict=True):
         if state is None:
             errors.miss(part.name)
-    sent = replace(causes, effects=())
-    calls = [(study, sent, ~masks[i], states[i], data.take(found[i].rows)) for i in waiting]
+    calls = [(study, causes, ~masks[i], states[i], data.take(found[i].rows)) for i in waiting]
     ended = {}
     for number, pair in share(fold_errors, calls, processes=causes.jobs, cluster=causes.cluster):
         ended[number] = pair

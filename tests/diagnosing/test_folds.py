@@ -29,7 +29,7 @@ from minimax_cal.measuring.grouping import parts
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.parameters import State
 
-ALONE = SimpleNamespace(jobs=1, cluster="", portable=lambda: None)  # causes that no fold looks at
+ALONE = SimpleNamespace(jobs=1, cluster="")  # causes that no fold looks at
 
 
 @pytest.fixture(scope="module")

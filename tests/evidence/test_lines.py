@@ -129,7 +129,7 @@ def test_a_line_is_expected_where_another_gear_has_the_like(
 
 def test_the_level_is_shared_once() -> None:
     """Chances of all that is looked at, each at its own gate, add up to the level."""
-    _, choice = chosen(opened("irb120"), ())
+    choice = chosen(opened("irb120"), ())
     table = bench(choice.library, ())
     laws = [c for c in choice.library.candidates if not c.is_line]
     lines = {c.tries: c for c in choice.library.lines.candidates}  # type: ignore[union-attr]
@@ -139,7 +139,7 @@ def test_the_level_is_shared_once() -> None:
 
 def test_an_expected_line_has_the_level_to_itself() -> None:
     loud = Cause("gear_ripple", "J2", 2000.0, 1)
-    _, choice = chosen(opened("irb120", loud, seed=5, told=False), ())
+    choice = chosen(opened("irb120", loud, seed=5, told=False), ())
     (line,) = choice.chosen
     turns = line.term.choice["turns"]
     lib = choice.library
@@ -157,7 +157,7 @@ def test_an_expected_line_has_the_level_to_itself() -> None:
 @pytest.mark.parametrize(("told", "named"), [(True, True), (False, False)])
 def test_a_faint_line_is_found_where_its_gear_is_known(told: bool, named: bool) -> None:
     made = opened("irb120", Cause("gear_ripple", "J1", 20.0, 1), seed=5, told=told)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     assert (("gear_ripple", "J1") in {c.key for c in choice.chosen}) == named
 
 
@@ -171,13 +171,14 @@ def test_a_faint_line_is_found_where_its_gear_is_known(told: bool, named: bool) 
 )
 def test_one_law_of_another_course_is_one_name(law: str, place: str, key: tuple[str, str]) -> None:
     """Motors and casting that warm up apart, a lag that ends, two orders of one gear."""
-    _, choice = chosen(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
+    choice = chosen(opened("rail", Cause(law, place, 3000.0), seed=4, poses=100), ())
     assert {c.key for c in choice.chosen} == {key}
 
 
 def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
     made = opened("irb120", Cause("backlash", "J2", 500.0))
-    lib, choice = chosen(made, ())
+    choice = chosen(made, ())
+    lib = choice.library
     (right,) = choice.found
     idle = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("gear_error", "J4")))
     again = select(lib, first=(idle, right))
@@ -186,14 +187,14 @@ def test_what_other_weights_chose_is_dropped_where_it_is_not_needed() -> None:
 
 def test_the_only_one_that_other_weights_chose_is_compared_anew() -> None:
     made = opened("irb120", Cause("backlash", "J2", 500.0))
-    lib, _ = chosen(made, ())
+    lib = chosen(made, ()).library
     alike = bench(lib, ()).added(next(c for c in lib.candidates if c.key == ("settling", "J2")))
     again = select(lib, first=(alike,))
     assert [c.key for c in again.chosen] == [("backlash", "J2")]
 
 
 def test_a_moment_that_is_sought_costs_as_a_parameter_does() -> None:
-    lib, _ = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ())
+    lib = chosen(opened("irb120", Cause("backlash", "J2", 500.0)), ()).library
     seats = [c for c in lib.candidates if c.term.effect == "target_reseat"]
     assert {c.shapes for c in seats} == {1}
 
@@ -237,7 +238,7 @@ def test_a_line_has_a_ratio_or_another_line_for_company(
 @pytest.mark.parametrize("strong", [20.0, 2000.0])
 def test_a_faint_line_is_found_where_another_joint_has_the_like(strong: float) -> None:
     faint, loud = Cause("gear_ripple", "J1", 24.0, 1), Cause("gear_ripple", "J2", strong, 1)
-    _, choice = chosen(opened("irb120", faint, loud, seed=5, told=False), ())
+    choice = chosen(opened("irb120", faint, loud, seed=5, told=False), ())
     found = {c.key for c in choice.chosen}
     assert (("gear_ripple", "J1") in found) == (strong > 100.0)
 
@@ -249,7 +250,7 @@ def test_lines_that_are_not_there_are_rarely_found_beside_one(seeds: range) -> N
     strange = 0
     for seed in seeds:
         arm = ("irb120", "ur5e", "scara_600")[seed % 3]
-        _, choice = chosen(opened(arm, loud, seed=200 + seed, told=False), ())
+        choice = chosen(opened(arm, loud, seed=200 + seed, told=False), ())
         keys = {c.key for c in choice.chosen}
         assert ("gear_ripple", "J2") in keys
         strange += len(keys) > 1

@@ -86,7 +86,7 @@ def test_what_is_there_is_found_with_its_place_driver_and_size(size: float) -> N
     field *= size / np.sqrt(np.mean(field**2))
     found = remains(rest(rng, rng.normal(size=VISITS * WIDTH) + field), what)[0]
     assert (found.place, found.driver) == (true.place, true.driver)
-    assert found.name == f"{true.place} with {true.driver}"
+    assert found.name == f"{true.place} following {true.driver}"
     assert found.p < 0.005
     assert found.share == pytest.approx(size**2 / (1.0 + size**2), rel=0.5)
 

@@ -58,7 +58,7 @@ def study_of(robot: mc.Robot, data: mc.Measurements) -> Study:
 )
 def test_a_plain_effect_is_named_and_sized(law: str, place: str) -> None:
     """lambda = 1000: effect and place exactly, and the noise is found beside it."""
-    _, choice = chosen(opened(Cause(law, place, 1000.0), seed=11), ())
+    choice = chosen(opened(Cause(law, place, 1000.0), seed=11), ())
     assert [c.key for c in choice.chosen] == [(law, place)]
     assert 12e-6 < np.sqrt(choice.noise.variance) < 25e-6
 
@@ -66,7 +66,7 @@ def test_a_plain_effect_is_named_and_sized(law: str, place: str) -> None:
 @pytest.mark.parametrize("seed", [11, 12])
 def test_a_joint_that_stiffens_is_told_as_its_compliance(seed: int) -> None:
     """By a machine whose law is not ours: tau / (1 + 2 |tau| / most)."""
-    _, choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=seed), ())
+    choice = chosen(opened(Cause("joint_compliance/hardening", "J3", 5000.0), seed=seed), ())
     (one,) = choice.chosen
     assert one.key == ("joint_compliance", "J3")
     assert one.term.choice["within"] > 0.0
@@ -83,7 +83,7 @@ def test_masses_in_doubt_excuse_what_little_they_explain(seed: int) -> None:
     off = replace(robot, mass=mass * [1.0, 1.15, 0.9, 1.2, 1.0, 0.85])
     told = study_of(off, with_history(made.data))
     for exclude, excused in (((), True), (("joint_compliance",), False)):
-        _, choice = chosen(told, exclude)
+        choice = chosen(told, exclude)
         main, loose, _ = columns_of(choice.chosen, choice.found)
         assert len(loose)
         assert credible(choice.library, choice.found, choice.noise) == excused
@@ -92,26 +92,26 @@ def test_masses_in_doubt_excuse_what_little_they_explain(seed: int) -> None:
 
 def test_no_name_without_an_effect() -> None:
     for seed in range(8):
-        _, choice = chosen(opened(seed=100 + seed), ())
+        choice = chosen(opened(seed=100 + seed), ())
         assert choice.chosen == ()
 
 
 def test_two_effects_are_both_named() -> None:
     made = opened(Cause("backlash", "J1", 300.0), Cause("gear_error", "J3", 300.0), seed=4)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     assert {c.key for c in choice.chosen} == {("backlash", "J1"), ("gear_error", "J3")}
 
 
 def test_a_deleted_effect_is_not_named() -> None:
     made = opened(Cause("gear_ripple", "J2", 1000.0), seed=2)
-    _, choice = chosen(made, ("gear_ripple",))
+    choice = chosen(made, ("gear_ripple",))
     assert "gear_ripple" not in {c.term.effect for c in choice.chosen}
 
 
 def test_rivals_hold_the_truth_where_it_cannot_be_told() -> None:
     """A tilting base looks like a yielding second joint: whatever is named, both are in the set."""
     for seed in (1, 2, 3):
-        _, choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
+        choice = chosen(opened(Cause("base_flex", "frame", 60.0), seed=seed), ())
         named = choice.fits[0]
         found = alternatives(choice.benches[0], named)
         names = {named.candidate.key, *(other.candidate.key for other, _, _ in found)}
@@ -152,7 +152,7 @@ def test_a_cause_and_what_resembles_it_stay_rivals() -> None:
 def test_lambda_is_the_one_that_was_asked_for() -> None:
     """The generator's detectability and the diagnosis' agree to 35 %, masses being 15 % off."""
     made = opened(Cause("joint_compliance", "J3", 400.0), seed=6)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     one, table = choice.fits[0], choice.benches[0]
     size, rho2 = table.likeness(one, one.candidate)
     assert abs(size / 400.0 - 1.0) < 0.35
@@ -196,7 +196,7 @@ SOFT = np.array([0.0, 1e-6, 1.5e-6, 1e-5, 1.5e-5, 4e-5])
 
 def test_the_weight_of_an_untold_tool_is_found_beside_the_axis() -> None:
     made = yielding(opened(seed=3, poses=200), np.array([0.06, -0.08, 0.1]), SOFT)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     (one,) = choice.chosen
     assert one.key == ("joint_compliance", "all")
     assert "tool" in one.term.choice
@@ -210,7 +210,7 @@ def test_the_weight_of_an_untold_tool_is_found_beside_the_axis() -> None:
 
 def test_a_tool_on_the_axis_needs_no_levers() -> None:
     made = yielding(opened(seed=3, poses=200), np.array([0.0, 0.0, 0.1]), SOFT)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     assert [c.key for c in choice.chosen] == [("joint_compliance", "all")]
     assert "tool" not in choice.chosen[0].term.choice
 
@@ -277,7 +277,7 @@ def test_resemblance_knows_the_law() -> None:
 
 def test_terms_of_one_place_are_not_chosen_twice() -> None:
     made = opened(Cause("backlash", "J3", 2000.0), seed=5)
-    _, choice = chosen(made, ())
+    choice = chosen(made, ())
     keys = [c.key for c in choice.chosen if c.term.effect != "gear_ripple"]
     assert len(keys) == len(set(keys))
     assert Term("backlash", "J3").label == "backlash:J3"
