@@ -24,6 +24,7 @@ TIMED = 2  # calls from which the time of the others is known
 CHUNK = 1.0  # seconds of work sent at once; sending takes some 5 ms
 START = 2.0  # seconds that a process takes to import all and to load the compiled kernels (1.6)
 AHEAD = 2  # chunks of a process, so that it never waits for the next
+PARTS = 4  # the larger, the sooner all end together: a chunk is this part of a share of what waits
 CLUSTER_SHARES = 16  # at least so many chunks of a cluster, whose workers come and go
 LARGE = "1 GiB"  # of what is sent to a cluster at once, beyond which it warns
 ONE_THREAD = dict.fromkeys(
@@ -167,7 +168,7 @@ def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
     try:
         while waiting or flying:
             while waiting and len(flying) < AHEAD * (count - 1):
-                flying.add(pool.submit(several, next(chunked(waiting, clock.seconds, 2 * count))))
+                flying.add(pool.submit(several, next(chunked(waiting, clock.seconds, PARTS * count))))
             if waiting:
                 yield clock.time(waiting.popleft())
             else:
