@@ -215,10 +215,11 @@ def advice(
         diagnose = f"minimax-cal diagnose {robot} {' '.join(map(str, data))}"
         yield f"Next, to find the cause of the remaining {left}", diagnose
     if written and fit.status is Status.CONVERGED:
+        alone = "" if fit.cell.effects.terms else " by geometry alone"
         correct = f"minimax-cal compensate {written} targets.csv -o corrected.csv"
-        yield "To correct joint targets, or a program, for the controller", correct
+        yield f"To correct joint targets, or a program, for the controller{alone}", correct
         write = f"minimax-cal export {written} --to mjcf -o arm.xml"
-        yield "To write a file for MuJoCo, or as --to urdf, dh-csv or another format", write
+        yield f"To write a file for MuJoCo, or --to urdf, dh-csv and others{alone}", write
         yield "To see every parameter and table", "add --details"
     else:
         yield "To keep the result, and to see every table", "add -o fit.json --details"

@@ -91,8 +91,10 @@ def advice(
     """What to do next, and its command.  written: where the diagnosis went."""
     if written and found.main and found.status is Status.CONVERGED:
         files = " ".join(map(str, data))
-        fit = f"minimax-cal calibrate {robot} {files} --effects {written} -o fit.json"
+        fit = f"minimax-cal calibrate {robot} {files} --effects {written} -o fit_effects.json"
         yield "Next, to calibrate with the confirmed causes", fit
+        correct = "minimax-cal compensate fit_effects.json targets.csv -o corrected.csv"
+        yield "Then, to correct joint targets, or a program, for the controller", correct
     keep = "" if written else "-o diagnosis.json "
     what = "To see" if written else "To keep the result, and to see"
     yield f"{what} every effect, parameter and table", f"add {keep}--details"

@@ -8,12 +8,13 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.modelling.effects.words import name_step
 
+NAMED = {"geometric": "calibrated geometry (least squares)"}  # `calibrate` may have another
 MAX_STEPS = 6  # rows of the budget: nominal, geometry, effects, noise
 
 
 def budget_table(found: Diagnosis) -> Table:
     """Held-out errors step by step, what follows the main causes as one step if it is long."""
-    every = [(name_step(step.name), step.holdout) for step in found.ladder]
+    every = [(NAMED.get(step.name) or name_step(step.name), step.holdout) for step in found.ladder]
     most = MAX_STEPS - 1  # the last row is the noise
     if len(every) > most:
         main = [f"+ {f.term.effect} {f.term.place}" for f in found.main]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from minimax_cal.diagnosing.last_question import ABOVE_NOISE, ONLY_MINOR
 from minimax_cal.diagnosing.result import Alternative, Diagnosis, Finding
-from minimax_cal.evidence.limits import STRUCTURE
+from minimax_cal.evidence.limits import HALF, STRUCTURE
 from minimax_cal.measuring.floor import REPEATS
-from minimax_cal.modelling.effects.words import name_codes, name_place
+from minimax_cal.modelling.effects.words import name_place, name_structure
 from minimax_cal.solvers.status import Status
 
 Named = Finding | Alternative
@@ -38,18 +38,18 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     """
     if found.status is Status.FAILED:
         return (CONTRADICTED,)
-    tentative = [f for f in found.by_rung if not f.established]
-    main, often = listed(title_of(found), found.main), subsampled(found.main)
+    causes = (listed(title_of(found), found.main), subsampled(found.main))
+    first = (opening(found), *causes) if is_partial(found) else (*causes, opening(found))
     return tuple(
         sentence
         for sentence in (
-            *((main, often, opening(found)) if found.main else (opening(found), main)),
+            *first,
             minor(found),
             shrunk(found),
             remaining(found),
             away(found),
             proposal(found),
-            f"Possible causes, not confirmed: {names_of(tentative)}." if tentative else "",
+            possible([f for f in found.by_rung if not f.established]),
         )
         if sentence
     )
@@ -67,15 +67,22 @@ def opening(found: Diagnosis) -> str:
 
 
 def title_of(found: Diagnosis) -> str:
-    """Main cause, or ambiguous cause."""
+    """Main cause, ambiguous cause, or a partial one where most is unexplained."""
     many = "s" if len(found.main) > 1 else ""
+    if found.verdict == "unknown" and is_partial(found):
+        return f"Partial cause{many}"
     ambiguous = found.verdict == "one_of" and bool(found.main and found.main[0].alternatives)
     return f"{OPENINGS['one_of' if ambiguous else 'named']}{many}"
 
 
+def is_partial(found: Diagnosis) -> bool:
+    """Whether the confirmed causes leave most of the error unexplained."""
+    return sum(f.share for f in found.main if f.share > 0.0) < HALF
+
+
 def unexplained(found: Diagnosis) -> str:
     """What is not explained, and how that is known."""
-    left = name_codes(found.structure_in)
+    left = name_structure(found.structure_in)
     if left in (ABOVE_NOISE, ONLY_MINOR):
         joints = "" if found.floor.source == REPEATS else ", with what sound joints add"
         return (
@@ -86,10 +93,10 @@ def unexplained(found: Diagnosis) -> str:
     if not found.structure < STRUCTURE:  # it is the causes that are not certain
         return f"{left}: {'these causes are uncertain' if sure else 'the cause is unknown'}."
     after = "after all effects" if sure else "after geometry"
-    guess = "; the causes above may imitate one that the library lacks" if sure else ""
+    guess = " An effect that the library lacks may contribute to the causes above." if sure else ""
     return (
         f"the error {after} is not random ({left}; p = {found.structure:.1g}, significant below "
-        f"{STRUCTURE:g}), and no known effect explains it{guess}."
+        f"{STRUCTURE:g}), and no known effect explains it.{guess}"
     )
 
 
@@ -99,7 +106,9 @@ def listed(title: str, findings: Sequence[Finding]) -> str:
     for finding in findings:
         kinds.setdefault(finding.term.effect, []).append(finding)
     parts = [cause_of(same, first=i == 0) for i, same in enumerate(kinds.values())]
-    share = " of the remaining squared error" if any("%" in part for part in parts) else ""
+    share = (
+        " of the squared error that geometry leaves" if any("%" in part for part in parts) else ""
+    )
     return f"{title}: {'; '.join(parts)}{share}." if parts else ""
 
 
@@ -108,9 +117,11 @@ def subsampled(findings: Sequence[Finding]) -> str:
     often = min((f.again for f in findings if not f.rows), default=math.nan)
     if not math.isfinite(often):
         return ""
-    each = "Each was" if len(findings) > 1 else "Confirmed:"
+    each = "Each was found" if len(findings) > 1 else "Found"
     least = "at least " if len(findings) > 1 and often < 1.0 else ""
-    return f"{each} found again in {least}{100.0 * often:.0f} % of the subsamples of the poses."
+    return (
+        f"{each} again in {least}{100.0 * often:.0f} % of the subsamples of the poses: confirmed."
+    )
 
 
 def cause_of(same: Sequence[Finding], *, first: bool) -> str:
@@ -155,6 +166,14 @@ def minor(found: Diagnosis) -> str:
     return f"{len(small)} minor effect{many} {found.minor_sizes[1]:.3f} mm off the RMS error."
 
 
+def possible(findings: Sequence[Finding]) -> str:
+    """The causes that are not confirmed, and what they take off the error."""
+    if not findings:
+        return ""
+    gain = sum(f.before - f.after for f in findings if math.isfinite(f.before - f.after))
+    return f"Possible causes, not confirmed: {names_of(findings)}; {gain:.3f} mm off the RMS error."
+
+
 def together(places: Sequence[str]) -> str:
     """Several places in a few words, as at joint 2, 1 and 3."""
     kinds = [place.rpartition(" ")[0] for place in places]
@@ -192,7 +211,7 @@ def closed_words(found: Diagnosis) -> str:
     share = f"{100.0 * found.closed:.0f} %"
     if not (found.floor.certain or share == "100 %"):  # reported as if noise were zero
         share = f"at least {share}"
-    return f"{share} of the error above noise is explained{ends}"
+    return f"{share} of the squared error above noise is explained{ends}"
 
 
 def without_far(found: Diagnosis) -> str:
@@ -222,7 +241,7 @@ def remaining(found: Diagnosis) -> str:
     named = f" ({where})" if where else ""
     return (
         f"Remaining error: {left.predictable_mm:.3f} mm depends on the pose{named}, "
-        f"{left.unpredictable_mm:.3f} mm looks random; {noise}."
+        f"{left.unpredictable_mm:.3f} mm looks random (noise and repeatability); {noise}."
     )
 
 

@@ -22,6 +22,7 @@ from minimax_cal.ground.arrays import Array
 DRAWS = 499  # of rows, and of signs: the least p-value that is reported is 0.002
 AUDIBLE, ASKED = 0.5, 40  # chance above which none is asked about scatter, and how many at most
 SCATTERS = 0.05  # chance by flipped signs above which a motion scatters, and follows nothing
+FOLLOWING = " following "  # between a place and what drives it
 SHOWN = 6  # components that are told at most
 
 
@@ -76,7 +77,7 @@ class Remains:
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.place} following {self.driver}"
+        return f"{self.place}{FOLLOWING}{self.driver}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,14 +127,15 @@ class Beyond:
         parts = f"{len(self.folds)} parts"
         if self.missed:
             parts = f"{self.judged} (the fit needs the others)"
+        largest = max(fold.max_mm for fold in self.folds)
         less = ""
         if self.trusted:
             worst = f"{self.trusted.worst_mm:.3f} mm ({self.trusted.where})"
-            less = f"; without outliers at worst {worst}"
+            less = f"; without outliers worst part {worst}"
         return (
-            f"Outside the measured region, {parts} each predicted from the other poses{self.kept}: "
-            f"RMS {self.typical_mm:.3f} mm, at worst {self.worst_mm:.3f} mm "
-            f"({self.worst.where}){less}."
+            f"Outside the measured region, {parts} left out in turn and predicted from the rest"
+            f"{self.kept}: RMS {self.typical_mm:.3f} mm, worst part {self.worst_mm:.3f} mm RMS "
+            f"({self.worst.where}), largest error {largest:.3f} mm{less}."
         )
 
     def table(self) -> Table:

@@ -36,7 +36,7 @@ def first_table(fit: Fit) -> Table:
     """Position accuracy before and after; rows without poses are left out."""
     rows = tuple(row for row in accuracy_rows(fit) if row[1] != 0)
     return Table(
-        "position error",
+        f"position error, objective {fit.objective}",
         ("error at", "poses", "RMS mm", "95 % low", "95 % high", "max mm"),
         rows,
         ("", "d", *[".3f"] * 4),

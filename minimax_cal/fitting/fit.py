@@ -677,7 +677,8 @@ class Fit:
     def sentences(self) -> tuple[str, ...]:
         """The result: what went wrong if anything, inside, set aside, outside, identified."""
         before, after, where = self.within.before, self.within.after, self.within.where
-        identified = sum(p.identifiable for p in self.parameters)
+        count, identified = len(self.parameters), sum(p.identifiable for p in self.parameters)
+        rest = ", the others stay nominal" if identified < count else ""
         advice = "" if self.reason else self.status.advice
         every = (
             f"{self.reason[:1].upper()}{self.reason[1:]}." if self.reason else "",
@@ -685,7 +686,7 @@ class Fit:
             f"{before.max_mm:.3f} mm -> {after.max_mm:.3f} mm, on {where}.",
             self.aside_sentence() if self.set_aside else "",
             self.beyond.sentence(),
-            f"{identified} of {len(self.parameters)} parameters identified; {self.status}"
+            f"{identified} of {count} parameters identified{rest}; {self.status}"
             f"{self.answered_by()}.",
             f"{advice}." if advice else "",
         )

@@ -168,7 +168,8 @@ def beside(waiting: Queue, clock: Clock, count: int) -> Numbered:
     try:
         while waiting or flying:
             while waiting and len(flying) < AHEAD * (count - 1):
-                flying.add(pool.submit(several, next(chunked(waiting, clock.seconds, PARTS * count))))
+                chunk = next(chunked(waiting, clock.seconds, PARTS * count))
+                flying.add(pool.submit(several, chunk))
             if waiting:
                 yield clock.time(waiting.popleft())
             else:

@@ -51,7 +51,7 @@ def test_the_first_screen_is_short_and_narrow(
     assert said.startswith(fit.headline())
     assert f"{fit.within.after.rms_mm:.3f} mm" in said
     assert (
-        "Outside the measured region, 18 parts each predicted from the other poses: RMS "
+        "Outside the measured region, 18 parts left out in turn and predicted from the rest: RMS "
         f"{fit.beyond.typical_mm:.3f} mm" in said
     )
     assert f"minimax-cal diagnose irb2600 {csv}" in " ".join(lines)

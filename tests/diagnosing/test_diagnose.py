@@ -130,7 +130,7 @@ def test_a_law_outside_the_library_is_unknown() -> None:
     found = diagnosed(Cause("outside_sum", "J2", 1000.0))
     assert found.verdict == "unknown"
     assert found.structure < STRUCTURE
-    assert "cause is unknown" in found.headline() or "may imitate" in found.headline()
+    assert "cause is unknown" in found.headline() or "may contribute" in found.headline()
 
 
 def test_without_the_true_effect_no_relative_is_named_with_confidence() -> None:

@@ -99,7 +99,7 @@ def test_causes_stand_by_their_share_and_tables_in_the_order_of_the_ladder(
     assert causes.startswith("Main causes: joint compliance at joint 2 (")
     places = [causes.index(f", {share} %") for share in (60, 20, 12)]
     assert places == sorted(places)
-    assert causes.endswith("12 % of the remaining squared error.")
+    assert causes.endswith("12 % of the squared error that geometry leaves.")
     assert [row[0] for row in found.effects_table().rows] == IN_WORDS
     assert [row[0] for row in found.parameter_table().rows] == IN_WORDS
     assert [step.name for step in found.ladder[2:]] == [f"+ {name}" for name in LADDER]
@@ -155,7 +155,9 @@ def test_alternatives_stand_at_their_own_place(found: Diagnosis) -> None:
 def test_possible_effects_stand_together_below(found: Diagnosis) -> None:
     unsure = marked(found, established={"gear_ripple": False})
     assert "gear ripple" not in unsure.reasons[0]
-    assert unsure.reasons[-1] == "Possible causes, not confirmed: gear ripple at joint 1."
+    assert unsure.reasons[-1] == (
+        "Possible causes, not confirmed: gear ripple at joint 1; 0.050 mm off the RMS error."
+    )
     table = unsure.effects_table()
     assert table.header[-1] == "evidence"
     assert [(row[0], row[-1]) for row in table.rows][-1] == (

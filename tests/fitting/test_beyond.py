@@ -147,7 +147,10 @@ def test_parts_that_none_can_judge_are_counted_and_named(robot: mc.Robot) -> Non
     found = mc.calibrate(robot, data, "sum", holdout=0.0).beyond
     assert found.missed
     made = len(found.folds) + len(found.missed)
-    assert f"{len(found.folds)} of {made} parts (the fit needs the others) each" in found.sentence()
+    assert (
+        f"{len(found.folds)} of {made} parts (the fit needs the others) left out"
+        in found.sentence()
+    )
     assert found.table().rows[-1][0] == f"{len(found.folds)} of {made} parts"
     assert found.to_dict()["not_judged"] == list(found.missed)
     assert found.to_dict()["effects_sought_anew"] is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
+from minimax_cal.evidence.remains import FOLLOWING
 from minimax_cal.modelling.effects.table import EFFECTS
 
 OF_TARGETS = ("outliers", "swapped_rows")  # faults of the data: all of their place are the targets
@@ -49,6 +50,12 @@ def name_codes(text: str) -> str:
         return name_effect(effect, place) + (f", {parameter}" if parameter else "")
 
     return PLACE.sub(lambda at: f"{KINDS[at[1]]} {at[2]}", CODE.sub(named, text))
+
+
+def name_structure(text: str) -> str:
+    """What remains, as J2 following time, in words; another text stays but for its code names."""
+    place, _, driver = name_codes(text).partition(FOLLOWING)
+    return f"a motion of {place} that depends on {driver}" if driver else place
 
 
 def name_step(step: str) -> str:

@@ -37,7 +37,7 @@ from minimax_cal.measuring.aside import SetAside, counted
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.history import with_history
 from minimax_cal.modelling.cell import Cell as Arm
-from minimax_cal.modelling.effects.words import name_codes, name_effect
+from minimax_cal.modelling.effects.words import name_effect, name_structure
 from minimax_cal.modelling.parameters import Names, links_of
 from minimax_cal.reporting.html.content import Block, Note, caveat, text
 from minimax_cal.reporting.html.delivered import Row, delivered_table, governing, rows_of
@@ -88,7 +88,7 @@ class Signed:
             return ""
         rest = ""
         if any(row.delivered.not_carried for row in self.rows if row is not self.row):
-            rest = "; what carries fewer effects is judged below"
+            rest = "; other deliverables are judged below"
         return f"Result and verdict hold for {self.row.name} ({self.model}){rest}."
 
     @property
@@ -368,8 +368,8 @@ def basis(found: Signed) -> str:
     elif away:
         out += f"Outside them nothing is claimed: {away.reason}. "
     out += (
-        "The 95 % limits are upper ends: of the RMS over such poses, and of the largest error of "
-        "as many new ones."
+        "With 95 % confidence the RMS of such poses, and the largest error of as many new ones, "
+        "stay below the 95 % limits, which are compared with the requirement."
     )
     told = [claim for claim in found.claims if not claim.reason]
     if any(math.isnan(claim.bound(kind).high) for claim in told for kind in KINDS):
@@ -384,7 +384,7 @@ def limits_now(sources: Sources, found: Signed) -> str:
         own = found.row.delivered
         whole = number(own.whole.rms)
         return (
-            f"{own.lacks}, which {own.format} does not hold; the full model has {whole} RMS."
+            f"{own.lacks}, which {own.format} leaves out; the full model has {whole} RMS."
             f"{unexplained_of(sources.gap)}"
         )
     if sources.gap:
@@ -411,7 +411,7 @@ def unexplained_of(gap: Diagnosis | None) -> str:
         return ""
     if gap.verdict == "not_repeatable":
         return f" {OPENINGS[gap.verdict]}"
-    return f" Unexplained by the diagnosis: {name_codes(gap.structure_in)}."
+    return f" Unexplained by the diagnosis: {name_structure(gap.structure_in)}."
 
 
 def left_now(gap: Diagnosis, left: float) -> str:

@@ -13,6 +13,7 @@ from minimax_cal.diagnosing.result import Diagnosis
 from minimax_cal.fitting.fit import Fit
 from minimax_cal.fitting.uncertainty import Uncertainty
 from minimax_cal.ground.arrays import Array
+from minimax_cal.modelling.effects.words import name_step
 from minimax_cal.reporting.html.charts import (
     LOOKS,
     axis,
@@ -107,11 +108,6 @@ def waterfall(gap: Diagnosis) -> Figure:
     worst = np.array([s.holdout.max_mm for s in steps])
     at = np.arange(len(steps))
     traces: list[dict[str, Any]] = []
-    for i in range(1, len(steps)):
-        fell = not held[i] > held[i - 1]
-        bar = {"color": "after-soft" if fell else "before-soft", "width": 16, "dash": "solid"}
-        traces.append(line("after", "change", held[i - 1 : i + 1], np.full(2, i), line=bar,
-                           showlegend=False, hoverinfo="skip"))  # fmt: skip
     for name, symbol, x in (
         ("held-out RMS", "circle", held),
         ("training RMS", "circle-open", train),
@@ -126,7 +122,7 @@ def waterfall(gap: Diagnosis) -> Figure:
             line("third", "noise floor", np.full(2, floor), np.array([-0.5, at[-1] + 0.5]))
         )
     every = np.concatenate([held, train, worst, [floor] if floor > 0.0 else []])
-    names = [label(s.name) for s in steps]
+    names = [name_step(s.name) for s in steps]
     layout = frame(
         xaxis=log_axis("error (mm)", every),
         yaxis=axis("", tickvals=at.tolist(), ticktext=names, range=[len(steps) - 0.5, -0.5],
@@ -134,12 +130,12 @@ def waterfall(gap: Diagnosis) -> Figure:
     )  # fmt: skip
     last = f", {steps[-1].holdout.rms_mm:.3f} mm with all effects" if len(steps) > 2 else ""
     says = (
-        f"Held-out RMS: {steps[0].name} {steps[0].holdout.rms_mm:.3f} mm, {steps[1].name} "
+        f"Held-out RMS: {names[0]} {steps[0].holdout.rms_mm:.3f} mm, {names[1]} "
         f"{steps[1].holdout.rms_mm:.3f} mm{last}"
     )
     tail = f"; noise alone would leave {floor:.3f} mm" if math.isfinite(floor) else ""
-    return figure("ladder", "The gap, from the nominal robot down to the noise", f"{says}{tail}.",
-                  traces, layout, 120 + 44 * len(steps))  # fmt: skip
+    title = f"Held-out error from {held[0]:.3f} mm to {held[-1]:.3f} mm"
+    return figure("ladder", title, f"{says}{tail}.", traces, layout, 120 + 44 * len(steps))
 
 
 def curve_chart(name: str, curve: Curve, held: Array) -> Figure:
