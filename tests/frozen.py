@@ -110,6 +110,8 @@ def cases(data: Path) -> Iterator[tuple[str, list[str]]]:
     yield "robots", ["robots", "--json"]
     for kind in ("wires", "poses", "closures"):
         yield f"relative {kind}", ["relative", arm, str(data / f"{kind}.csv"), "--json"]
+    both = [str(data / f"{kind}.csv") for kind in ("wires", "closures")]
+    yield "relative several", ["relative", arm, *both, "--json"]
     yield (
         "simulate",
         ["simulate", "ur10", "--poses", "9", "--compliance", "2", "-o", "simulated.csv"],

@@ -166,7 +166,10 @@ def chunks(text: str) -> Iterator[list[str]]:
 
 
 PLAIN = {"mm", "deg", "mrad", "um"}  # units
-RUN = ["index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md"]
+RUN = [
+    "index.md", "tutorial.md", "backends.md", "own_effect.md", "from_matlab.md",
+    "several_instruments.md",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RUN)

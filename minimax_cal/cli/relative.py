@@ -9,7 +9,7 @@ import click
 
 from minimax_cal.cli import options
 from minimax_cal.cli.options import (
-    DATA,
+    CAMPAIGNS,
     DETAILS,
     ROBOT,
     InGroups,
@@ -23,24 +23,28 @@ from minimax_cal.fitting.options import Options
 
 @click.command(name="relative", cls=InGroups)
 @ROBOT
-@DATA
+@CAMPAIGNS
 @options_from(Options, "holdout", "seed", "fix", "free", "priors")
 @options_from(RelativeOptions)
 @options_from(Options, "method")
 @DETAILS
 @result_options("the result (JSON)")
-def relative_command(robot: str, data: Path, details: bool, to: Output, **chosen: Any) -> int:
+def relative_command(
+    robot: str, data: tuple[Path, ...], details: bool, to: Output, **chosen: Any
+) -> int:
     """Calibrate ROBOT without coordinates, from the lengths, closures or poses in DATA.
 
     DATA has joint columns and one of: wire1_mm ... (lengths from unknown fixed points to a target
     on the flange); socket (rows with the same label held the flange's ball in the same socket);
     flange_x_mm, flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
+
+    Several files, of any kinds, are one fit: all share the arm, each counts by its own noise.  A
+    tracker's measurements (smr1_x_mm ...) may be among them.
     """
     with to.stages() as progress:
-        fit = relative(robot, data, progress, **chosen)
+        fit = relative(robot, list(data), progress, **chosen)
     to.notice(*fit.notices)
     if to.deliver(fit.json, fit.status):
-        first = fit.accuracy_table().brief("poses", "count", "RMS mm", "max mm")
         advice = options.keep(to.path, "relative.json")
-        options.present(details, [fit.headline()], [first], fit.tables, advice)
+        options.present(details, [fit.headline()], fit.first_tables(), fit.tables, advice)
     return options.exit_code(fit.status)

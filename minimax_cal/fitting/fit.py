@@ -90,7 +90,7 @@ class Parameter:
     @property
     def corrects(self) -> str:
         """What it is a correction of, empty where it is a value by itself."""
-        return CORRECTIONS.get(self.name, "")
+        return CORRECTIONS.get(self.name.rpartition(".")[2], "")  # of several files: file.base_x
 
     @property
     def title(self) -> str:

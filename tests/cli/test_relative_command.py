@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import minimax_cal as mc
 from experiments.relative import SIMULATORS, Arm
 from minimax_cal.cli import main
 from minimax_cal.fitting.instruments import write_relative
 from minimax_cal.robots.robot import robot_from_dict
+from minimax_cal.robots.sampling import random_poses
 
 
 def run(*arguments: object) -> int:
@@ -30,6 +32,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         write_relative(out[kind], seen.data)
         for first, second, length in seen.known:
             out["known"] = Path(f"{first},{second},{1e3 * length:.4f}")
+    q = random_poses(arm.robot, 80, np.random.default_rng(3))
+    for name, unit in (("tracker", 1.0), ("tracker_m", 1e-3)):
+        out[name] = folder / f"{name}.csv"
+        mc.write_measurements(out[name], mc.measurements(q, unit * arm.place(q)))
     return out
 
 
@@ -132,6 +138,9 @@ def test_options_reach_the_fit(files: dict[str, Path], capsys: pytest.CaptureFix
         (("irb2600", "wires_3", "--known-distance", "A,B,5"), "--known-distance is for closures"),
         (("irb2600", "closures_known", "--lever", "5"), "--lever is for poses"),
         (("irb2600", "poses", "--offset"), "--offset is for distances"),
+        (("irb2600", "tracker"), "it holds reflectors: use minimax-cal calibrate"),
+        (("irb2600", "wires_3", "wires_3"), "is given twice"),
+        (("irb2600", "wires_3", "tracker_m"), "points look like metres given as millimetres"),
         (("irb2600", "poses", "--lever", "lots"), "--lever"),
         (("irb2600", "wires_3", "-o", "no/such/folder/fit.json"), "there is no such folder"),
     ],

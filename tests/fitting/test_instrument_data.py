@@ -137,7 +137,6 @@ def changed(header: str, row: int, text: str) -> list[str]:
     ("header", "cells", "place", "words"),
     [
         ("weight_kg", ["1"] * 6, ":1:", "no measured columns; name them wire1_mm"),
-        ("smr1_x_mm,smr1_y_mm,smr1_z_mm", ["1,2,3"] * 6, ":1:", "use minimax-cal calibrate"),
         ("wire1_cm", ["1"] * 6, ":1:", "column wire1_cm is not understood; write wire1_mm"),
         ("wire1_mm,wire1_m", ["1,1"] * 6, ":1:", "wire1 has two columns"),
         ("wire1_mm,socket", ["1,A"] * 6, ":1:", "columns wire1_mm and socket are of different"),

@@ -76,6 +76,7 @@ TEMPLATES = (
     f"calibrate ur5 {PIXELS} --fix-camera -o out.json",
     "evaluate fit.json later.csv --new-frame --json",
     "relative irb120 wires.csv --prior a*=0.5mm --json",
+    "relative irb120 wires.csv data.csv --json",
     "identify sweeps.csv --joints revolute,revolute,revolute,revolute,revolute,revolute --json",
     "import run1.csv run2.csv -o out.csv",
     "import data.csv --preview",

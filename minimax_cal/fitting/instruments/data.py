@@ -12,7 +12,7 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 
-KINDS = ("distances", "closures", "poses")
+KINDS = ("distances", "closures", "poses", "points")
 NO_POSES: Array = np.zeros((0, 4, 4))
 NORM = 1e-3  # a quaternion farther from unit length is no rotation
 LEAST_LENGTHS = 5  # of one wire; its anchor alone has three unknowns
@@ -22,7 +22,7 @@ LEAST_LENGTHS = 5  # of one wire; its anchor alone has three unknowns
 class RelativeData:
     """Joint values, and what was measured instead of coordinates.
 
-    at: the m poses (q, line, columns), without any point.  kind: one of KINDS.
+    at: the m poses (q, line, columns), with points where the kind is points.  kind: one of KINDS.
     wires: s names, as wire1.  length: (m, s) from an anchor to the target, NaN where not measured
     [m].  socket: (m,) label of the socket that held the ball.  pose: (m, 4, 4) of the flange in
     the measurement frame [m].  What is not of the kind is empty: s = 0, labels '', no poses.
@@ -167,4 +167,20 @@ def check_poses(data: RelativeData) -> None:
         raise DataError(f"{data.says(row)}: column flange_x_mm ...: is more than 100 km away")
 
 
-CHECKS = {"distances": check_lengths, "closures": check_sockets, "poses": check_poses}
+def points(at: Measurements) -> RelativeData:
+    """Points of a tracker beside other instruments."""
+    return check(RelativeData(at, "points"))
+
+
+def check_points(data: RelativeData) -> None:
+    """Raise DataError where there are none."""
+    if not data.at.seen.any():
+        raise DataError(f"{data.at.source}: holds no measured point")
+
+
+CHECKS = {
+    "points": check_points,
+    "distances": check_lengths,
+    "closures": check_sockets,
+    "poses": check_poses,
+}

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.fitting.instruments.data import NORM, RelativeData, check, wire_names
+from minimax_cal.fitting.instruments.data import NORM, RelativeData, check, points, wire_names
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
@@ -28,7 +28,13 @@ from minimax_cal.measuring.columns import (
     useless,
     whole_rows,
 )
-from minimax_cal.measuring.measurements import Measurements, check_columns, check_u95, file_column
+from minimax_cal.measuring.measurements import (
+    Measurements,
+    check_columns,
+    check_u95,
+    file_column,
+    measurements_in,
+)
 
 WIRE = re.compile(r"wire(\d+)_(mm|m)")
 PLACE = re.compile(r"flange_([xyz])_(mm|m)")
@@ -53,12 +59,12 @@ def kind_of(path: Path | str, header: Sequence[str]) -> str:
                 "flange_rx_rad or flange_qw"
             )
     found = [kind for kind, names in families.items() if names]
+    if not found and any(TARGET.fullmatch(name) for name in header):
+        return "points"
     if not found:
-        points = any(TARGET.fullmatch(name) for name in header)
-        hint = "; it holds reflectors: use minimax-cal calibrate" if points else ""
         raise DataError(
             f"{path}:1: no measured columns; name them wire1_mm ..., or socket, or flange_x_mm, "
-            f"flange_y_mm, flange_z_mm, flange_rx_rad ...{hint}"
+            "flange_y_mm, flange_z_mm, flange_rx_rad ..., or smr1_x_mm ..."
         )
     if len(found) > 1:
         first, second = (families[kind][0] for kind in found[:2])
@@ -70,10 +76,12 @@ def kind_of(path: Path | str, header: Sequence[str]) -> str:
 
 
 def read_relative(path: Path | str) -> RelativeData:
-    """Read a CSV file of lengths, closures or poses.  Raises DataError."""
+    """Read a CSV file of lengths, closures, poses, or points of a tracker.  Raises DataError."""
     file = read_rows(path)
-    header_check(path, [n for n in file.header if not TARGET.fullmatch(n)] + list(ANY_TARGET))
     kind = kind_of(path, file.header)
+    if kind == "points":
+        return points(measurements_in(file))
+    header_check(path, [n for n in file.header if not TARGET.fullmatch(n)] + list(ANY_TARGET))
     file = whole_rows(file)
     q, sliding = file.joints()
     columns, notices = optional_columns(file, kind)

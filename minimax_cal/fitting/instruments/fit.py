@@ -1,33 +1,33 @@
-"""The fit of lengths and of closures: start, identifiable parameters, least squares, sigmas."""
+"""The fit of all instruments: start, identifiable parameters, least squares, noises, sigmas."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from minimax_cal.fitting.fit import Parameter, link_by_link
 from minimax_cal.fitting.identify import Identification
 from minimax_cal.fitting.instruments.data import LEAST_LENGTHS, RelativeData
-from minimax_cal.fitting.instruments.identify import generic_count, has_scale, identified
+from minimax_cal.fitting.instruments.identify import (
+    Alone,
+    determined_alone,
+    generic_count,
+    identified,
+)
 from minimax_cal.fitting.instruments.options import (
     Progress,
     RelativeOptions,
     sigmas_of,
     wishes,
 )
-from minimax_cal.fitting.instruments.rows import (
-    Closures,
-    Instrument,
-    Known,
-    Squares,
-    Wires,
-    arm_at,
-    places,
-)
-from minimax_cal.fitting.instruments.split import before_and_after, free_numbers, misclosures
-from minimax_cal.fitting.instruments.start import ball_start, wire_start
+from minimax_cal.fitting.instruments.points import Points, WholePoses
+from minimax_cal.fitting.instruments.poses import TOOL, lever_of, poses_as_targets
+from minimax_cal.fitting.instruments.rows import Block
+from minimax_cal.fitting.instruments.sockets import Closures
+from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
+from minimax_cal.fitting.instruments.wires import Wires
 from minimax_cal.fitting.solve import LEAST_NOISE, PRIOR_ROUNDS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
@@ -37,220 +37,305 @@ from minimax_cal.robots.robot import Robot
 from minimax_cal.solvers import least_squares
 from minimax_cal.solvers.least_squares import LeastSquares, method_of, solve_normal
 
-SETTLED = 0.01  # relative change of the noise that ends the weighing of priors
+SETTLED = 0.01  # relative change of the noises that ends their weighing
+
+
+@dataclass(frozen=True, eq=False)
+class Train:
+    """What is fitted: each instrument's training measurements and what the file is called."""
+
+    label: str
+    data: RelativeData
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentFit:
     """What the solver found.
 
-    nominal: the arm as drawn with the instrument fitted to it.  state: the calibrated one.
-    numbers: independent numbers fitted.  covariance: (p, p) [SI], NaN where not identified.
+    stack: the instruments, weighed by their noise.  nominal: the arm as drawn with the instruments
+    fitted to it.  state: the calibrated one.  covariance: (p, p) [SI], NaN where not identified.
+    noise: (b,) sigma of a row of each instrument [m].  trains: what was fitted.  alone: what each
+    determines by itself, empty where there is one.
     """
 
-    instrument: Instrument
+    stack: Stack
     nominal: State
     state: State
     identification: Identification
     found: LeastSquares[State]
-    numbers: int
     covariance: Array
+    noise: Array
+    trains: Sequence[Train]
+    alone: tuple[Alone, ...]
+
+    def state_of(self, i: int) -> tuple[State, State]:
+        """As drawn and calibrated, of an instrument."""
+        return self.stack.part(self.nominal, i), self.stack.part(self.state, i)
 
 
-def instrument_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Instrument:
-    """The training measurements as a least-squares problem."""
-    if train.kind == "distances":
-        return Wires.of(robot, train.at.q, train.wires, train.length)
+def wires_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Lengths as a block."""
+    wires = Wires.of(robot, train.at.q, train.wires, train.length)
+    return replace(wires, with_offsets=options.offset)
+
+
+def closures_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Visits to sockets as a block, with the distances that are known between them."""
     labels, number = np.unique(train.socket, return_inverse=True)
     place = {str(label): i for i, label in enumerate(labels)}
-    known = options.known_distances
+    known = tuple(one for one in options.known_distances if set(one[:2]) <= set(place))
     pairs = np.array([(place[a], place[b]) for a, b, _ in known], dtype=int).reshape(-1, 2)
     distance = np.array([length for _, _, length in known])
-    return Closures.of(robot, train.at.q, number, pairs, distance)
+    made = Closures.of(robot, train.at.q, number, pairs, distance)
+    return replace(made, labels=train.sockets, known=known)
 
 
-def allowed_of(
-    robot: Robot, instrument: Instrument, options: RelativeOptions
-) -> tuple[Array, Array]:
+def points_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Points as a block."""
+    return Points.of(robot, train.at)
+
+
+def poses_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Whole poses as a block."""
+    return WholePoses.seen(robot, train, lever_of(train, options.lever)[0])
+
+
+BLOCKS = {
+    "distances": wires_of, "closures": closures_of, "points": points_of, "poses": poses_of,
+}  # fmt: skip
+
+
+def stack_of(robot: Robot, trains: Sequence[Train], options: RelativeOptions) -> Stack:
+    """The training measurements as a least-squares problem."""
+    blocks = [BLOCKS[each.data.kind](robot, each.data, options) for each in trains]
+    if any(block.has_length for block in blocks if not isinstance(block, Closures)):
+        blocks = [
+            replace(block, sole_length=False) if isinstance(block, Closures) else block
+            for block in blocks
+        ]
+    return Stack.of(robot, blocks, [each.label for each in trains])
+
+
+def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     """What may be fitted (p,), and what is to be given up last (p,); the base is no unknown."""
-    names = instrument.names
+    names = stack.names
     allowed, wanted = wishes(names, options)
-    allowed[5 * robot.joints : 5 * robot.joints + 6] = False
-    offsets = np.array([name.startswith("offset") for name in names.all])
-    return allowed & (options.offset | ~offsets), wanted
+    allowed[5 * names.joints : names.geometric] = False
+    for i, block in enumerate(stack.blocks):
+        own = stack.columns(i)[names.geometric :]
+        allowed[own] &= [options.offset or not name.startswith("offset") for name in block.own]
+    return allowed, wanted
 
 
-def start_of(robot: Robot, instrument: Instrument, q: Array, allowed: Array) -> State:
+def start_of(robot: Robot, stack: Stack, allowed: Array) -> State:
     """The arm as drawn, and what fits it best."""
-    if isinstance(instrument, Closures):
-        return ball_start(robot, instrument)
-    return wire_start(robot, q, instrument, allowed)
+    first = stack.names.geometric
+    free = [allowed[stack.columns(i)[first:]] for i in range(len(stack.blocks))]
+    pairs = zip(stack.blocks, free, strict=True)
+    return stack.state(robot.mdh, [block.start(robot, own) for block, own in pairs])
 
 
-def fit_instrument(
-    robot: Robot, train: RelativeData, options: RelativeOptions, progress: Progress
+def fit_instruments(
+    robot: Robot, trains: Sequence[Train], options: RelativeOptions, progress: Progress
 ) -> InstrumentFit:
     """Fit the identifiable parameters to the training measurements.  Raises DataError."""
     progress("start")
-    instrument = instrument_of(robot, train, options)
-    allowed, wanted = allowed_of(robot, instrument, options)
-    known = known_of(robot, instrument, options)
+    stack = stack_of(robot, trains, options)
+    allowed, wanted = allowed_of(stack, options)
+    known = Known(links_of(robot.mdh), sigmas_of(stack.names, options))
     held = np.pad(np.isfinite(known.sigma), (0, len(allowed) - len(known.sigma)))
-    nominal = start_of(robot, instrument, train.at.q, allowed)
+    nominal = start_of(robot, stack, allowed)
     progress("identifiable parameters")
-    unknowns = generic_count(robot, instrument, nominal, allowed & ~held)
-    numbers = check_count(train, unknowns, len(options.known_distances))
-    found = identified(
-        robot, instrument, nominal, allowed, wanted, known=held, resolution=options.resolution
-    )
+    reference = stack.reference(robot, nominal)
+    check_count(trains, stack, generic_count(robot, reference, nominal, allowed & ~held))
+
+    def identify(stack: Stack) -> Identification:
+        return identified(
+            robot, stack, reference, nominal, allowed, wanted,
+            known=held, resolution=options.resolution,
+        )  # fmt: skip
+
+    told = identify(stack)
     progress("least squares")
-    problem = Squares(instrument, found.active, known)
-    problem, ended = believed(problem, nominal, numbers, options)
-    state = ended.x.take(np.array(0))
+    problem, ended = weighed(Squares(stack, told.active, known), nominal, options)
+    if len(trains) > 1:  # an instrument that is rough tells less than it seemed
+        told = identify(problem.stack)
+        again = replace(problem, active=told.active)
+        problem, ended = weighed(again, nominal, options)
+    state, stack = ended.x.take(np.array(0)), problem.stack
+    closed = stack.closed(robot, nominal) if len(trains) > 1 else stack
+    alone = determined_alone(closed, nominal, told.active, options.resolution)
+    noise = np.sqrt(variances(problem, state))
     return InstrumentFit(
-        instrument, nominal, state, found, ended, numbers, covariance_of(problem, state, numbers)
-    )
+        stack, nominal, state, told, ended, covariance_of(problem, state), noise,
+        trains, tuple(alone) if len(trains) > 1 else (),
+    )  # fmt: skip
 
 
-def known_of(robot: Robot, instrument: Instrument, options: RelativeOptions) -> Known:
-    """What the user knows of the links."""
-    return Known(links_of(robot.mdh), sigmas_of(instrument.names, options))
-
-
-def believed(
-    problem: Squares, begin: State, numbers: int, options: RelativeOptions
+def weighed(
+    problem: Squares, begin: State, options: RelativeOptions
 ) -> tuple[Squares, LeastSquares[State]]:
-    """Least squares; with priors, weighed against the noise that remains.
+    """Least squares, instruments and priors weighed by the noises that remain.
 
-    The problem with the weights that it ended with.  As `solve.Task.squares` does.
+    The problem with the weights that it ended with.  A lone instrument without priors has nothing
+    to be weighed against.  As `solve.Task.squares` does.
     """
+    points, method = float(problem.stack.points), method_of(options.method)
 
     def solved(problem: Squares) -> LeastSquares[State]:
-        points, method = float(problem.instrument.points), method_of(options.method)
         return least_squares.solve(problem, begin.batch(), 1, points, method, least_squares.NEAR)
 
-    if problem.known is None or not problem.known.any:
+    priors = problem.known is not None and problem.known.any
+    if len(problem.stack.blocks) == 1 and not priors:
         return problem, solved(problem)
-    count = problem.instrument.names.count
-    variance = float(problem.normal(begin.batch())[0][0]) / numbers
+    count = [block.numbers for block in problem.stack.blocks]
+    variance = np.maximum(costs(problem, begin) / count, LEAST_NOISE**2)
     for _ in range(PRIOR_ROUNDS):
-        problem = replace(problem, weight=problem.known.weights(variance, count))
+        problem = believed(problem, variance)
         found = solved(problem)
-        previous, variance = variance, noise_of(problem, found.x.take(np.array(0)), numbers)
-        if abs(variance - previous) <= SETTLED * previous:
+        state = found.x.take(np.array(0))
+        previous, variance = variance, variances(problem, state)
+        if np.all(np.abs(variance - previous) <= SETTLED * previous):
             break
     return problem, found
 
 
-def noise_of(problem: Squares, x: State, numbers: int) -> float:
-    """Variance of a number by what a fit leaves [m^2]; a prior pays for parameters of its own."""
-    error, jacobian = problem.instrument.rows(x, problem.active)
-    gram = jacobian @ jacobian.T
-    held = np.diag(problem.weight[problem.active]) if len(problem.weight) else 0.0 * gram
-    paid = float(np.trace(solve_normal(gram + held, gram)))
-    least = LEAST_NOISE**2 if len(problem.weight) else 0.0
-    return max(float(error @ error) / max(numbers - paid, 1.0), least)
+def believed(problem: Squares, variance: Array) -> Squares:
+    """Instruments and priors weighed by the variances (b,) of their numbers [m^2].
+
+    The best instrument weighs 1, so that a step of the rows is one of metres.
+    """
+    unit, names = float(variance.min()), problem.stack.names
+    weight = problem.known.weights(unit, names.count) if problem.known else np.zeros(0)
+    return replace(problem, stack=replace(problem.stack, precision=unit / variance), weight=weight)
 
 
-def covariance_of(problem: Squares, x: State, numbers: int) -> Array:
+def costs(problem: Squares, x: State) -> Array:
+    """(b,) sums of the squared rows of each block, as heavy as one another [m^2]."""
+    none = np.zeros(problem.stack.names.count, dtype=bool)
+    stack = problem.stack
+    rows = [
+        block.rows(stack.part(x, i), none[stack.columns(i)])[0]
+        for i, block in enumerate(stack.blocks)
+    ]
+    return np.array([float(error @ error) for error in rows])
+
+
+def variances(problem: Squares, x: State) -> Array:
+    """(b,) of a number of each block by what a fit leaves [m^2].
+
+    Each pays for its share of the parameters, tr(H^-1 G_b) of the whole Gram matrix H [Forstner's
+    variance components]; a prior pays for parameters of its own.
+    """
+    stack, single = problem.stack, np.eye(len(problem.stack.blocks), dtype=bool)
+    grams = []
+    for chosen in single:
+        _, jacobian = stack.only(chosen).rows(x, problem.active)
+        grams.append(jacobian @ jacobian.T)
+    inverse = solve_normal(sum(grams) + problem.prior, np.eye(len(grams[0])))
+    paid = np.array([float(np.trace(inverse @ gram)) for gram in grams])
+    spare = np.maximum([block.numbers for block in stack.blocks] - paid, 1.0)
+    weighing = len(stack.blocks) > 1 or len(problem.weight)
+    return np.maximum(costs(problem, x) / spare, LEAST_NOISE**2 if weighing else 0.0)
+
+
+def covariance_of(problem: Squares, x: State) -> Array:
     """Covariance (p, p) of all parameters at a solution [SI], NaN where not identified.
 
     s^2 H^-1 F H^-1 with H = sum w j j' + P and F = sum w^2 j j' + P over the rows j of weight w and
-    the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: cost over
-    spare numbers.
+    the priors P: a known distance weighs much and is no surer than a coordinate.  s^2: of a number
+    of the best instrument, to which the others are weighed.
     """
-    active = problem.active
-    _, jacobians = problem.instrument.rows(x, active)
-    known = np.diag(problem.weight[active]) if len(problem.weight) else np.zeros((1, 1))
-    bread = solve_normal(jacobians @ jacobians.T + known, np.eye(len(jacobians)))
-    meat = (jacobians * problem.instrument.weights) @ jacobians.T + known
+    active, stack = problem.active, problem.stack
+    _, jacobians = stack.rows(x, active)
+    inverse = solve_normal(jacobians @ jacobians.T + problem.prior, np.eye(len(jacobians)))
+    middle = (jacobians * stack.weights) @ jacobians.T + problem.prior
     covariance = np.full((len(active),) * 2, np.nan)
-    covariance[np.ix_(active, active)] = noise_of(problem, x, numbers) * bread @ meat @ bread
+    unit = float((variances(problem, x) * stack.precision).mean())
+    covariance[np.ix_(active, active)] = unit * inverse @ middle @ inverse
     return covariance
 
 
-def numbers_of(train: RelativeData) -> tuple[int, int]:
-    """How many independent numbers were measured, and how many at different poses."""
+def numbers_of(train: RelativeData) -> int:
+    """How many independent numbers were measured at different poses."""
     pose = groups(train.at)
-    if train.kind == "distances":
-        seen = np.isfinite(train.length)
-        return int(seen.sum()), sum(len(np.unique(pose[wire])) for wire in seen.T)
-    labels = np.unique(train.socket)
-    different = [len(np.unique(pose[train.socket == label])) for label in labels]
-    return 3 * (train.poses - len(labels)), 3 * (sum(different) - len(labels))
+    if train.kind == "closures":
+        labels = np.unique(train.socket)
+        different = [len(np.unique(pose[train.socket == label])) for label in labels]
+        return 3 * (sum(different) - len(labels))
+    if train.kind == "poses":
+        return 6 * len(np.unique(pose))
+    of_each = 3 if train.kind == "points" else 1
+    seen = train.at.seen if train.kind == "points" else np.isfinite(train.length)
+    return of_each * sum(len(np.unique(pose[column])) for column in seen.T)
 
 
-def check_count(train: RelativeData, unknowns: int, known: int) -> int:
-    """The numbers measured in training, known distances among them.
+CALLED = {"distances": "lengths", "closures": "coordinates of visits"}
 
-    Raises DataError if they cannot determine the unknowns.
-    """
-    where = train.at.source
-    for name, count in zip(train.wires, np.isfinite(train.length).sum(axis=0), strict=True):
-        if count < LEAST_LENGTHS:
-            raise DataError(
-                f"{where}: {name} has {count} lengths in training, and needs {LEAST_LENGTHS}; "
-                "measure more or hold out fewer"
-            )
-    numbers, different = numbers_of(train)
-    if different + known <= unknowns:
-        what = "lengths" if train.kind == "distances" else "coordinates of visits"
+
+def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:
+    """Raise DataError where the training measurements cannot determine the unknowns."""
+    for train in (each.data for each in trains):
+        for name, count in zip(train.wires, np.isfinite(train.length).sum(axis=0), strict=True):
+            if count < LEAST_LENGTHS:
+                raise DataError(
+                    f"{train.at.source}: {name} has {count} lengths in training, and needs "
+                    f"{LEAST_LENGTHS}; measure more or hold out fewer"
+                )
+    known = sum(len(block.pairs) for block in stack.blocks if isinstance(block, Closures))
+    different = sum(numbers_of(each.data) for each in trains) + known
+    shape = sum(6 for block in stack.blocks if isinstance(block, WholePoses))  # of reflectors
+    if different <= unknowns - shape:
+        where = " and ".join(each.data.at.source for each in trains)
+        what = CALLED.get(trains[0].data.kind, "numbers") if len(trains) == 1 else "numbers"
         raise DataError(
-            f"{where}: {different + known} independent {what} in training, but {unknowns} unknown "
+            f"{where}: {different} independent {what} in training, but {unknowns - shape} unknown "
             "parameters need more; measure at more poses, hold out fewer or fix parameters (fix)"
         )
-    return numbers + known
 
 
-def errors_of(
-    robot: Robot, fit: InstrumentFit, data: RelativeData, held: Array
-) -> dict[str, Array]:
-    """Errors by the keys of a result: (parts, m, 3) each [m], NaN where not measured.
-
-    The error of a length stands first of three; that of a visit is about its socket.
-    """
-    arm = arm_at(robot, data.at.q)
-
-    def errors(x: State) -> Array:
-        if not isinstance(fit.instrument, Wires):
-            return misclosures(places(arm, x).T, data.socket, held)[None]
-        error = replace(fit.instrument, model=arm, length=data.length).errors(x)
-        return np.stack([error, *(np.where(np.isnan(error), np.nan, 0.0),) * 2], axis=-1)
-
-    return before_and_after(errors(fit.nominal), errors(fit.state), held)
-
-
-def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
-    """Independent numbers behind the errors, by the keys of a result."""
-    if data.kind == "distances":
-        seen = np.isfinite(data.length)
-        trained, left = int(seen[~held].sum()), int(seen[held].sum())
-    else:
-        trained, left = free_numbers(data.socket, held)
-    return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
-
-
-def parameters_of(robot: Robot, fit: InstrumentFit, *, offset: bool) -> tuple[Parameter, ...]:
-    """Every parameter, link by link; then target, anchors and, where fitted, offsets."""
-    names = fit.instrument.names
+def parameters_of(robot: Robot, fit: InstrumentFit) -> tuple[Parameter, ...]:
+    """Every parameter, link by link; then each instrument's own."""
+    names, first = fit.stack.names, fit.stack.names.geometric
     before, after = (x.along(np.eye(3), robot) for x in (fit.nominal, fit.state))
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    hidden = ("base_",) if offset else ("base_", "offset")
     every = link_by_link(names, names.units, before, after, sigma, fit.identification)
-    return tuple(p for p in every if not p.name.startswith(hidden))
-
-
-def placed(fit: InstrumentFit, data: RelativeData, options: RelativeOptions) -> dict[str, Any]:
-    """For JSON: what was fitted besides the robot, in the robot's base and last frame."""
-    out: dict[str, Any] = {"target_mm": (1e3 * fit.state.target_positions[0]).tolist()}
-    if isinstance(fit.instrument, Wires):
-        anchors, offsets = fit.instrument.split(fit.state.effects)
-        out["anchors_mm"] = dict(zip(data.wires, (1e3 * anchors).tolist(), strict=True))
-        if options.offset:
-            out["offsets_mm"] = dict(zip(data.wires, (1e3 * offsets).tolist(), strict=True))
-    else:
-        centre = fit.instrument.barycentres(places(fit.instrument.model, fit.state)).T
-        out["sockets_mm"] = dict(zip(data.sockets, (1e3 * centre).tolist(), strict=True))
-        out["known_distances"] = [[a, b, 1e3 * length] for a, b, length in options.known_distances]
-        out["scale"] = "known distance" if has_scale(fit.instrument) else "as drawn"
+    out = every[: 5 * robot.joints]
+    for i, block in enumerate(fit.stack.blocks):
+        own = fit.stack.columns(i)[first:]
+        listed = tuple(every[j] for j in own)
+        out += block.listed(listed, *fit.state_of(i), fit.covariance[np.ix_(own, own)])
     return out
+
+
+def placed(fit: InstrumentFit, i: int) -> Mapping[str, object]:
+    """For JSON: what was fitted besides the robot, in the robot's base and last frame."""
+    block, (nominal, x) = fit.stack.blocks[i], fit.state_of(i)
+    out = block.placed(x, nominal)
+    if isinstance(block, Closures):
+        alone = len(fit.stack.blocks) == 1
+        out["scale"] = (
+            "known distance" if block.has_length else "as drawn" if alone else "other files"
+        )
+    return out
+
+
+def beyond_one(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> tuple[str, ...]:
+    """Parameters that whole poses tell, and one reflector at the pose's origin would not."""
+    block = fit.stack.blocks[0]
+    if len(fit.stack.blocks) > 1 or not isinstance(block, WholePoses):
+        return ()
+    train = poses_as_targets(fit.trains[0].data)
+    origin = replace(train, y=train.y.mean(axis=1, keepdims=True), target_names=("smr1",))
+    lone = Stack.of(robot, [Points.of(robot, origin)], [""])
+    _, tool = block.tool(block.arm_state(fit.state))
+    x = lone.state(fit.state.mdh, [np.append(fit.state.effects[:6], tool[:3, 3])])
+    allowed, wanted = allowed_of(lone, options)
+    alone = identified(
+        robot, lone, lone.reference(robot, x), x, allowed, wanted,
+        known=np.zeros(lone.names.count, dtype=bool), resolution=options.resolution,
+    )  # fmt: skip
+    rows = lone.names.geometric + 6
+    more = fit.identification.active[:rows] & ~alone.active[:rows]
+    place = [name for name, told in zip(TOOL[:3], alone.active[rows:], strict=True) if not told]
+    return (*(lone.names.all[i] for i in np.flatnonzero(more)), *place, *TOOL[3:])

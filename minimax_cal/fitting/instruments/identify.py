@@ -1,4 +1,4 @@
-"""What lengths and closures can tell, and why not the rest.
+"""What instruments can tell, alone and together, and why not the rest.
 
 Lengths and closures know no base frame; closures know no length either.  Both show in the rank of
 their rows at plenty of poses that no one had to measure.
@@ -6,7 +6,7 @@ their rows at plenty of poses that no one had to measure.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,57 +21,65 @@ from minimax_cal.fitting.identify import (
     plenty_of_poses,
     redundant,
 )
-from minimax_cal.fitting.instruments.closing import closing_poses, reach
-from minimax_cal.fitting.instruments.rows import Closures, Instrument, Wires, gram_of, places
+from minimax_cal.fitting.instruments.rows import TARGET, motion
+from minimax_cal.fitting.instruments.stack import Stack
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.model import Model
-from minimax_cal.modelling.parameters import Names, State
+from minimax_cal.modelling.parameters import State
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.kinematics import hat
 from minimax_cal.robots.robot import Robot
 
-PLENTY = 200  # poses that show what no poses could tell
-SOCKETS, VISITS = 20, 10
 STILL = 1e-7  # relative motion of a column that moves nothing
-FRAMELESS = {
-    Wires: "moves nothing that is measured",
-    Closures: "moves or turns all sockets alike: closures know no base frame",
-}
+SHARED = 0.05  # of a direction that others leave open: a parameter with less is known without it
+CLOSURES = "closures"
+FRAMELESS = "moves nothing that is measured"
+ALIKE = "moves or turns all sockets alike: closures know no base frame"
 SCALE = (
     "all lengths together: a closure has no length standard; one known length, as "
     "known_distances= A,B,MM, gives it"
 )
+ALL_OWN = "all frames, anchors and targets of the files moved together"
 
 
-def order_of(robot: Robot, names: Names) -> Array:
+def order_of(robot: Robot, stack: Stack) -> Array:
     """Parameters in the order in which redundant ones are given up.
 
-    First the offsets of wires, then as `identify.drop_order`, anchors last.
+    First what the instruments give up, as offsets of wires, then as `identify.drop_order`, the
+    instruments' own last.
     """
+    names = stack.names
     extra = np.arange(names.geometric, names.count)
-    offset = np.array([names.all[i].startswith("offset") for i in extra], dtype=bool)
-    order = [*extra[offset], *drop_order(robot, names), *extra[~offset]]
+    soft = np.array([name in b.given_up for b in stack.blocks for name in b.own], dtype=bool)
+    order = [*extra[soft], *drop_order(robot, names), *extra[~soft]]
     return np.array([int(i) for i in order], dtype=int)
 
 
-def has_scale(instrument: Instrument) -> bool:
-    """Whether something measured is a length."""
-    return not isinstance(instrument, Closures) or bool(len(instrument.pairs))
+def length_row(stack: Stack, x: State) -> Array:
+    """(p,) derivative of the distance between two places of the first block's target."""
+    block, columns = stack.blocks[0], stack.columns(0)
+    arm = block.model.names.count
+    point, moved = motion(block.model, stack.part(x, 0), np.ones(arm, dtype=bool))
+    far = int(np.argmax(((point - point[:, :1]) ** 2).sum(axis=0)))
+    gap = point[:, far] - point[:, 0]
+    row = np.zeros(stack.names.count)
+    along = gap / max(float(np.linalg.norm(gap)), 1e-12)
+    row[columns[:arm]] = along @ (moved[..., far] - moved[..., 0]).T
+    return row
 
 
-def open_scale(reference: Instrument, x: State, active: Array, order: Array) -> bool:
+def open_scale(reference: Stack, x: State, plain: Array, active: Array, order: Array) -> bool:
     """Whether one more length would tell one more of the active parameters.
 
     Not so where the user fixed a length of the arm.
     """
-    if has_scale(reference) or not isinstance(reference, Closures):
+    if any(block.has_length for block in reference.blocks):
         return False
-    if len(reference.first) < 2:  # one socket: nothing has a length
+    row = length_row(reference, x)
+    if not row.any():  # one socket: nothing has a length
         return True
-    told = replace(reference, pairs=np.array([[0, 1]]), distance=np.zeros(1))
-    missing = [
-        len(redundant(gram_of(r, x), active, order, RANK_TOLERANCE)) for r in (reference, told)
-    ]
+    more = plain + reference.points * np.outer(row, row)
+    missing = [len(redundant(gram, active, order, RANK_TOLERANCE)) for gram in (plain, more)]
     return missing[1] < missing[0]
 
 
@@ -87,37 +95,10 @@ def scale_keeper(robot: Robot, allowed: Array, wanted: Array) -> list[int]:
     return [int(max(preferred, key=lambda i: lengths[i]))] if preferred else []
 
 
-def reference_of(robot: Robot, instrument: Instrument, x: State) -> Instrument:
-    """The instrument at plenty of random poses; of closures, poses that close."""
-    if isinstance(instrument, Wires):
-        poses = max(PLENTY, instrument.names.count)
-        model = plenty_of_poses(robot, instrument.model, poses)
-        return Wires(model, instrument.names, np.zeros((poses, instrument.length.shape[1])))
-    rng = np.random.default_rng(0)
-    q, socket = closing_poses(robot, x.target_positions[0], SOCKETS, VISITS, rng)
-    if len(np.unique(socket)) < 2:  # an arm that hardly reaches a place in two ways
-        return closed(robot, instrument, x)
-    _, socket = np.unique(socket, return_inverse=True)
-    known = min(len(instrument.pairs), 1)
-    return Closures.of(robot, q, socket, np.array([[0, 1]])[:known], np.zeros(known))
-
-
-def closed(robot: Robot, closures: Closures, x: State) -> Closures:
-    """The instrument at nearby poses where the arm as drawn itself closes.
-
-    Where a closure misses by millimetres, its rows turn with a turn of the whole arm, as if that
-    could be told.
-    """
-    centre = closures.barycentres(places(closures.model, x))
-    goal = np.repeat(centre, closures.visits, axis=-1).T
-    q, _ = reach(robot, x.target_positions[0], goal, robot.commanded(closures.model.q))
-    socket = np.repeat(np.arange(len(closures.first)), closures.visits)
-    return Closures.of(robot, q, socket, closures.pairs, closures.distance)
-
-
 def identified(
     robot: Robot,
-    instrument: Instrument,
+    stack: Stack,
+    reference: Stack,
     x: State,
     allowed: Array,
     wanted: Array,
@@ -127,40 +108,75 @@ def identified(
 ) -> Identification:
     """The largest set of allowed parameters that the measurements determine; see `identify`.
 
-    x: the arm as drawn, with the instrument's own parameters fitted to it.  wanted: (p,) those to
-    give up last.  known: (p,) True where a prior stands in for measurements.
+    reference: the instruments at plenty of poses.  x: the arm as drawn, with the instruments' own
+    parameters fitted to it.  wanted: (p,) those to give up last.  known: (p,) True where a prior
+    stands in for measurements.
     """
-    names = instrument.names
-    reference = reference_of(robot, instrument, x)
-    plain = gram_of(reference, x)
-    here = closed(robot, instrument, x) if isinstance(instrument, Closures) else instrument
-    gram = gram_of(here, x)
-    size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(instrument.points, 1))
+    names = stack.names
+    plain, gram = reference.gram(x), stack.closed(robot, x).gram(x)
+    size, scale = np.sqrt(np.diag(plain)), np.sqrt(np.diag(gram) / max(stack.points, 1))
     kept = Kept(names, allowed, {}).without(~allowed & names.links, "fixed by the user")
-    for motion, reason in (
-        (size, FRAMELESS[type(instrument)]),
+    closing = all(block.kind == CLOSURES for block in stack.blocks)
+    for motion_of, reason in (
+        (size, ALIKE if closing else FRAMELESS),
         (scale, "moves nothing at these poses"),
     ):
-        kept = kept.without(kept.active & (motion <= STILL * motion.max()), reason)
-    order = order_of(robot, names)
+        kept = kept.without(kept.active & (motion_of <= STILL * motion_of.max()), reason)
+    order = order_of(robot, stack)
     order = np.concatenate([order[~wanted[order]], order[wanted[order]]])
-    no_length = open_scale(reference, x, kept.active, order)
+    no_length = open_scale(reference, x, plain, kept.active, order)
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active, order, RANK_TOLERANCE)
     kept = kept.without(gone, SAME_MOTION).without([i for i in gone if i in keeper], SCALE)
     told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
-    anchors = {name.partition("_")[0] for name in names.all if name.startswith("anchor")}
-    return kept.identification(gram, scale, anchors, "all anchors moved together")
+    whole = stack.blocks[0].whole if len(stack.blocks) == 1 else ALL_OWN
+    stems = {name.rpartition("_")[0] for name in names.effects if whole}
+    return kept.identification(gram, scale, stems - {TARGET, "base"}, whole)
 
 
-def generic_count(robot: Robot, instrument: Instrument, x: State, allowed: Array) -> int:
+def generic_count(robot: Robot, reference: Stack, x: State, allowed: Array) -> int:
     """How many of the allowed parameters plenty of poses would determine."""
-    plain = gram_of(reference_of(robot, instrument, x), x)
+    plain = reference.gram(x)
     moving = allowed & (np.sqrt(np.diag(plain)) > STILL * np.sqrt(np.diag(plain).max()))
-    gone = redundant(plain, moving, order_of(robot, instrument.names), RANK_TOLERANCE)
+    gone = redundant(plain, moving, order_of(robot, reference), RANK_TOLERANCE)
     return int(moving.sum()) - len(gone)
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What a single instrument determines.
+
+    directions: number of independent ones that the others leave open.  names: link parameters that
+    take part in them.
+    """
+
+    directions: int
+    names: tuple[str, ...]
+
+
+def determined_alone(stack: Stack, x: State, active: Array, resolution: float) -> list[Alone]:
+    """What the links would lack without each block.
+
+    stack: where the arm fits it.  active: (p,).
+    """
+    out = []
+    stack = replace(stack, precision=np.ones(len(stack.blocks)))
+    for i in range(len(stack.blocks)):
+        others = stack.only(np.arange(len(stack.blocks)) != i)
+        gram, chosen = others.gram(x), active.copy()
+        chosen[stack.columns(i)[stack.names.geometric :]] = False
+        whole = np.sqrt(np.diag(stack.gram(x))[chosen])
+        alike = gram[np.ix_(chosen, chosen)] / np.outer(whole, whole)
+        values, vectors = np.linalg.eigh(alike)
+        lost = vectors[:, values <= resolution**2 * values[-1]]
+        share = np.linalg.norm(lost, axis=1)
+        places = np.flatnonzero(chosen)
+        named = [stack.names.all[p] for p, s in zip(places, share, strict=True)
+                 if s > SHARED and stack.names.links[p]]  # fmt: skip
+        out.append(Alone(lost.shape[1], tuple(named)))
+    return out
 
 
 def position_sigma(robot: Robot, model: Model, x: State, covariance: Array) -> float:

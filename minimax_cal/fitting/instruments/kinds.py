@@ -1,4 +1,4 @@
-"""From a file of lengths, closures or poses to a calibrated robot."""
+"""From files of lengths, closures, poses and points to a calibrated robot."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from minimax_cal.fitting.fit import Provenance
 from minimax_cal.fitting.identify import RESOLUTION
-from minimax_cal.fitting.instruments import fit, plausible, poses, remarks
-from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments import fit, plausible, remarks
+from minimax_cal.fitting.instruments.data import RelativeData, points
 from minimax_cal.fitting.instruments.file import read_relative
+from minimax_cal.fitting.instruments.fit import InstrumentFit, Train
 from minimax_cal.fitting.instruments.identify import position_sigma
 from minimax_cal.fitting.instruments.options import (
     Known,
@@ -20,18 +23,32 @@ from minimax_cal.fitting.instruments.options import (
     check_options,
     silent,
 )
-from minimax_cal.fitting.instruments.result import RelativeCalibration
-from minimax_cal.fitting.instruments.split import held_out
+from minimax_cal.fitting.instruments.points import WholePoses
+from minimax_cal.fitting.instruments.result import (
+    SEVERAL,
+    InstrumentResult,
+    Measured,
+    RelativeCalibration,
+)
+from minimax_cal.fitting.instruments.split import before_and_after, count_numbers, held_back
+from minimax_cal.fitting.intervals import rms_interval, told
 from minimax_cal.fitting.options import listed, sigmas_of
+from minimax_cal.ground.arrays import Array, rms
+from minimax_cal.ground.errors import DataError
+from minimax_cal.measuring.campaigns import session_names
 from minimax_cal.measuring.checks import check_joints, limit_notices
+from minimax_cal.measuring.grouping import groups
+from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.robots.robot import Robot, load_robot
 from minimax_cal.solvers.least_squares import AUTO
 from minimax_cal.solvers.status import Status
 
+Given = RelativeData | Measurements | str | Path
+
 
 def relative(
     robot: Robot | str | Path,
-    data: RelativeData | str | Path,
+    data: Given | Sequence[Given],
     progress: Progress = silent,
     *,
     holdout: float = 0.2,
@@ -45,12 +62,15 @@ def relative(
     method: str = AUTO,
     resolution: float = RESOLUTION,
 ) -> RelativeCalibration:
-    """Calibrate a robot from lengths, closures or poses.
+    """Calibrate a robot from lengths, closures or poses, or from several files together.
+
+    Several files share the arm; each has unknowns and a noise of its own, by its own residuals.
+    One of them may be measurements of a tracker.
 
     Parameters
     ----------
     robot, data
-        Loaded, or a name or path.
+        Loaded, or a name or path; several data in a list.
     progress
         Called with a word on each stage.
     holdout
@@ -99,86 +119,186 @@ def relative(
         resolution=resolution,
     )
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    data = data if isinstance(data, RelativeData) else read_relative(data)
-    check_options(data, chosen)
-    data = replace(data, at=check_joints(robot, data.at))
-    begin = from_poses if data.kind == "poses" else from_instrument
-    return begin(robot, data, chosen, progress)
+    given = [data] if isinstance(data, Given) else list(data)
+    every = [loaded(each) for each in given]
+    check_kinds(every)
+    check_options(every, chosen)
+    every = [replace(each, at=check_joints(robot, each.at)) for each in every]
+    return calibrate_instruments(robot, every, chosen, progress)
 
 
-def from_instrument(
-    robot: Robot, data: RelativeData, options: RelativeOptions, progress: Progress
+def loaded(data: Given) -> RelativeData:
+    """Data as they are, or of a file."""
+    if isinstance(data, Measurements):
+        return points(data)
+    return data if isinstance(data, RelativeData) else read_relative(data)
+
+
+def check_kinds(every: Sequence[RelativeData]) -> None:
+    """Raise DataError where there is nothing but points of trackers, or nothing at all."""
+    if not every:
+        raise DataError("no file of measurements is given")
+    if all(data.kind == "points" for data in every):
+        raise DataError(
+            f"{every[0].at.source}:1: it holds reflectors: use minimax-cal calibrate, or give "
+            "files of other instruments too"
+        )
+
+
+def labels_of(every: Sequence[RelativeData]) -> list[str]:
+    """What files are called: by their stems; data from arrays by their kind."""
+    files = [Path(data.at.source) for data in every if data.at.digest]
+    names = iter(session_names(files) if files else ())
+    out: list[str] = []
+    for data in every:
+        name = next(names) if data.at.digest else data.kind
+        alike = [each for each in out if each.rstrip("0123456789") == name]
+        out.append(f"{name}{len(alike) + 1}" if name in out else name)
+    return out
+
+
+def calibrate_instruments(
+    robot: Robot, every: Sequence[RelativeData], options: RelativeOptions, progress: Progress
 ) -> RelativeCalibration:
-    """Calibrate from lengths or closures."""
+    """Calibrate from all data together.  Raises CalibrationError."""
     began = time.perf_counter()
-    plausible.check_plausible(robot, data, options)
-    held, notices = held_out(data, options)
-    train = data.take(~held)
-    fitted = fit.fit_instrument(robot, train, options, progress)
-    arm = fitted.instrument.model
-    covariance = fitted.covariance[: arm.names.count, : arm.names.count]
+    for data in every:
+        plausible.check_plausible(robot, data, options)
+    splits = [held_back(data, options) for data in every]
+    named = zip(labels_of(every), every, splits, strict=True)
+    trains = [Train(label, data.take(~held)) for label, data, (held, _) in named]
+    found = fit.fit_instruments(robot, trains, options, progress)
+    measured = [
+        measured_by(robot, found, i, data, held)
+        for i, (data, (held, _)) in enumerate(zip(every, splits, strict=True))
+    ]
+    single = len(every) == 1
+    whole = measured[0] if single else together(found.stack.labels, measured)
+    notices = [
+        said
+        for data, (_, notes) in zip(every, splits, strict=True)
+        for said in (*data.at.notices, *limit_notices(robot, data.at), *notes)
+    ]
+    sources = ", ".join(data.at.source for data in every)
+    source = replace(every[0].at, source=sources, digest=" ".join(d.at.digest for d in every))
+    levers = [b.lever for b in found.stack.blocks if isinstance(b, WholePoses)]
+    settings = options.settings() | ({"lever": levers[0]} if levers else {})
     result = RelativeCalibration(
-        kind=data.kind,
-        robot=robot.with_mdh(fitted.state.mdh),
+        **vars(whole),
+        robot=robot.with_mdh(found.state.mdh),
         nominal=robot,
-        parts=data.wires or ("visits",),
-        status=fitted.found.status[0],
-        iterations=int(fitted.found.iterations[0]),
+        status=found.found.status[0],
+        iterations=int(found.found.iterations[0]),
         seconds=time.perf_counter() - began,
-        parameters=fit.parameters_of(robot, fitted, offset=options.offset),
-        errors=fit.errors_of(robot, fitted, data, held),
-        numbers=fit.count_numbers(data, held),
-        turns={},
-        instrument=fit.placed(fitted, train, options),
-        identification=fitted.identification,
-        position_sigma=position_sigma(robot, arm, fitted.state, covariance),
-        beyond=(),
-        notices=(*data.at.notices, *limit_notices(robot, data.at), *notices),
-        provenance=Provenance.of(robot, data.at, options.settings()),
+        parameters=fit.parameters_of(robot, found),
+        identification=found.identification,
+        position_sigma=sigma_of_positions(robot, found),
+        beyond=fit.beyond_one(robot, found, options),
+        notices=tuple(dict.fromkeys(notices)),
+        provenance=Provenance.of(robot, source, settings),
+        instruments=() if single else instruments_of(found, every, splits, measured),
     )
-    said = (*remarks.of_scale(fitted), *remarks.of_offsets(fitted, result.parameters, options))
-    offset = plausible.offset_told(robot, train, options, fitted)
-    wrong = plausible.contradiction(robot, data, fitted, result, offset)
-    said += (*remarks.weak(result), *remarks.unlikely(result), *filter(None, (offset, wrong)))
+    return judged(robot, every, splits, found, measured, result, options)
+
+
+def judged(
+    robot: Robot,
+    every: Sequence[RelativeData],
+    splits: Sequence[tuple[Array, tuple[str, ...]]],
+    found: InstrumentFit,
+    measured: Sequence[Measured],
+    result: RelativeCalibration,
+    options: RelativeOptions,
+) -> RelativeCalibration:
+    """The result with what the reader should know, failed where it is no calibration."""
+    offset = plausible.offset_told(robot, found, options)
+    wrong = plausible.contradiction(robot, every, found, measured, offset)
+    said = [
+        *remarks.of_lever(every, options, result),
+        *remarks.of_scale(found),
+        *remarks.of_offsets(found, result.parameters, options),
+        *remarks.weak(found, result, measured),
+        *remarks.unlikely(result, measured),
+        *filter(None, (offset, wrong)),
+    ]
+    for data, (held, _), each in zip(every, splits, measured, strict=True):
+        said += remarks.general(each, data, held)
     return replace(
         result,
         status=Status.FAILED if wrong else result.status,
-        notices=(*result.notices, *said, *remarks.general(result, data, held)),
+        notices=tuple(dict.fromkeys((*result.notices, *said))),
     )
 
 
-def from_poses(
-    robot: Robot, data: RelativeData, options: RelativeOptions, progress: Progress
-) -> RelativeCalibration:
-    """Calibrate from whole poses: `calibrate` on virtual reflectors, told as poses."""
-    began = time.perf_counter()
-    lever, whence = poses.lever_of(data, options.lever)
-    fitted = poses.fit_poses(robot, data, lever, options, progress)
-    calibration = fitted.fit
-    errors, turns = poses.errors_of(fitted, data)
-    beyond = poses.beyond_one(fitted, robot, options)
-    result = RelativeCalibration(
+def measured_by(
+    robot: Robot, found: InstrumentFit, i: int, data: RelativeData, held: Array
+) -> Measured:
+    """The errors of an instrument, as drawn and calibrated.  held: (m,)."""
+    block, states = found.stack.blocks[i], found.state_of(i)
+    nominal, calibrated = (block.errors(robot, x, data, held) for x in states)
+    turned = [block.turns(robot, x, data)[None] for x in states]
+    turns = before_and_after(turned[0], turned[1], held) if turned[0].size else {}
+    return Measured(
         kind=data.kind,
-        robot=calibration.robot,
-        nominal=robot,
-        parts=("position",),
-        status=calibration.status,
-        iterations=calibration.iterations,
-        seconds=time.perf_counter() - began,
-        parameters=poses.pose_parameters(fitted),
+        parts=block.parts,
+        errors=before_and_after(nominal, calibrated, held),
+        numbers=count_numbers(data, held),
+        turns={key: (rms(t), float(t.max()) if t.size else np.nan)
+               for key, t in turns.items()},
+        instrument=fit.placed(found, i),
+    )  # fmt: skip
+
+
+def together(labels: Sequence[str], measured: Sequence[Measured]) -> Measured:
+    """The errors of all files, one beside the other."""
+    names = ("nominal", "train", "holdout", "nominal_train")
+    errors = {}
+    for key in names:
+        parts = [each.errors[key] for each in measured]
+        ends = np.cumsum([[0, 0], *(part.shape[:2] for part in parts)], axis=0)
+        errors[key] = np.full((*ends[-1], 3), np.nan)
+        for part, (row, pose) in zip(parts, ends, strict=False):
+            errors[key][row : row + part.shape[0], pose : pose + part.shape[1]] = part
+    stems = zip(labels, measured, strict=True)
+    return Measured(
+        kind=SEVERAL,
+        parts=tuple(f"{label} {part}" for label, each in stems for part in each.parts),
         errors=errors,
-        numbers={key: 6 * error.shape[1] for key, error in errors.items()},
-        turns=turns,
-        instrument=poses.pose_place(fitted, lever),
-        identification=calibration.identification,
-        position_sigma=position_sigma(robot, fitted.model, fitted.state, fitted.covariance),
-        beyond=beyond,
-        notices=poses.notices_of(fitted),
-        provenance=Provenance.of(robot, data.at, {**options.settings(), "lever": lever}),
+        numbers={key: sum(each.numbers[key] for each in measured) for key in names},
+        turns={},
+        instrument={},
     )
-    said = (
-        f"a radian counts as {1e3 * lever:.4g} mm ({whence})",
-        f"identified beyond what one reflector at the pose's origin tells: {', '.join(beyond)}",
-        *remarks.general(result, data, calibration.held),
-    )
-    return replace(result, notices=(*result.notices, *said))
+
+
+def instruments_of(
+    found: InstrumentFit,
+    every: Sequence[RelativeData],
+    splits: Sequence[tuple[Array, tuple[str, ...]]],
+    measured: Sequence[Measured],
+) -> tuple[InstrumentResult, ...]:
+    """Each file's own figures."""
+    out = []
+    for i, (data, (held, _), each) in enumerate(zip(every, splits, measured, strict=True)):
+        error = each.errors["holdout"]
+        interval = rms_interval(error, groups(data.at)[held], rng=np.random.default_rng(0))
+        alone = found.alone[i]
+        out.append(
+            InstrumentResult(
+                **vars(each),
+                name=found.stack.labels[i],
+                interval=told(interval, 1e-3 * each.accuracy["holdout"].rms_mm),
+                noise=float(found.noise[i]) / found.stack.blocks[i].row_noise,
+                alone=alone.names,
+                directions_alone=alone.directions,
+            )
+        )
+    return tuple(out)
+
+
+def sigma_of_positions(robot: Robot, found: InstrumentFit) -> float:
+    """`identify.position_sigma`, of the target of the first file."""
+    block, columns = found.stack.blocks[0], found.stack.columns(0)
+    first = found.stack.names.geometric
+    place = np.concatenate([columns[:first], columns[first:][block.spots]])
+    x = block.arm_state(found.stack.part(found.state, 0))
+    return position_sigma(robot, block.model, x, found.covariance[np.ix_(place, place)])

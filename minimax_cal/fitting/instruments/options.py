@@ -87,21 +87,23 @@ class RelativeOptions:
         return {**vars(self), "known_distances": told, "priors": dict(self.priors)}
 
 
-def check_options(data: RelativeData, options: RelativeOptions) -> None:
+def check_options(every: Sequence[RelativeData], options: RelativeOptions) -> None:
     """Raise OptionError for a choice that does not exist or does not suit the data."""
     if options.method not in (AUTO, *METHODS):
         raise OptionError(f"no method {options.method!r}; choose {', '.join((AUTO, *METHODS))}")
     if not 0.0 <= options.resolution < 1.0:
         raise OptionError(f"resolution {options.resolution:g}: give 0 <= resolution < 1")
+    kinds = [data.kind for data in every]
     for kind, name, chosen in (
         ("distances", "offset", options.offset),
         ("closures", "known_distances", bool(options.known_distances)),
         ("poses", "lever", options.lever is not None),
     ):
-        if chosen and data.kind != kind:
-            raise OptionError(
-                f"{name}= is for {kind}; {data.at.source} holds {data.kind}: leave it out"
-            )
+        if chosen and kind not in kinds:
+            holds = " and ".join(f"{data.at.source} holds {data.kind}" for data in every)
+            raise OptionError(f"{name}= is for {kind}; {holds}: leave it out")
+    sockets = [set(data.sockets) for data in every if data.kind == "closures"]
+    files = ", ".join(data.at.source for data in every if data.kind == "closures")
     asked: set[frozenset[str]] = set()
     for known in options.known_distances:
         first, second, distance = known
@@ -110,10 +112,12 @@ def check_options(data: RelativeData, options: RelativeOptions) -> None:
             raise OptionError(f"{said}: this distance is given twice; give it once")
         asked.add(frozenset((first, second)))
         for label in (first, second):
-            if label not in data.sockets:
-                raise OptionError(f"{said}: {data.at.source} has no socket {label!r}")
+            if not any(label in some for some in sockets):
+                raise OptionError(f"{said}: {files} has no socket {label!r}")
         if first == second or not 0.0 < distance < FARTHEST:
             raise OptionError(f"{said}: needs two different sockets and a positive length")
+        if sum({first, second} <= some for some in sockets) != 1:
+            raise OptionError(f"{said}: both sockets must be in one file, and in no other")
 
 
 def wishes(names: Names, options: RelativeOptions) -> tuple[Array, Array]:

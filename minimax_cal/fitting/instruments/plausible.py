@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from minimax_cal.fitting.checks import EXPLAINED, MAX_TRIAL_POSES, POOR_FIT
+from minimax_cal.fitting.checks import check_plausible as of_points
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.identify import plenty_of_poses
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import (
     InstrumentFit,
+    Train,
     allowed_of,
-    fit_instrument,
-    instrument_of,
+    fit_instruments,
+    stack_of,
     start_of,
 )
 from minimax_cal.fitting.instruments.options import (
@@ -24,12 +26,15 @@ from minimax_cal.fitting.instruments.options import (
     sigmas_of,
     silent,
 )
-from minimax_cal.fitting.instruments.result import RelativeCalibration
-from minimax_cal.fitting.instruments.rows import Closures, Instrument, places
+from minimax_cal.fitting.instruments.poses import lever_of, poses_as_targets
+from minimax_cal.fitting.instruments.result import Measured
+from minimax_cal.fitting.instruments.rows import Block, places
+from minimax_cal.fitting.instruments.sockets import Closures
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError, OptionError
 from minimax_cal.measuring.slips import of_couplings, of_signs, of_units
 from minimax_cal.modelling.parameters import State
+from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
@@ -43,18 +48,23 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
 
     All rows are looked at, those held out too: they judge the fit.
     """
-    data = data.take(some(data))
-    instrument, state = started(robot, data, options)
-    given, limit = mean_square(instrument, state), POOR_FIT * robot.reach()
-    if np.sqrt(given) <= limit:
-        check_known(robot, data, options, instrument, state)
+    if data.kind in ("points", "poses"):
+        check_in_space(robot, data, options)
         return
-    whole = size(instrument, state)
+    data = data.take(some(data))
+    block, x = started(robot, data, options)
+    given, limit = block.mean_square(x), POOR_FIT * robot.reach()
+    if np.sqrt(given) <= limit:
+        if isinstance(block, Closures):
+            check_known(robot, data, options, block, x)
+        return
+    whole = size(block, x)
     trials = []
     for text, mended in slips(robot, data):
-        at = started(robot, mended, options)
-        trials.append((mean_square(*at) / size(*at), mean_square(*at), text))
-        if mended.length is not data.length and np.sqrt(trials[-1][1]) <= limit:
+        one, at = started(robot, mended, options)
+        square = one.mean_square(at)
+        trials.append((square / size(one, at), square, text))
+        if mended.length is not data.length and np.sqrt(square) <= limit:
             break  # a unit that fits leaves nothing to ask of joints
     least = min(share for share, _, _ in trials)
     share, square, text = next(trial for trial in trials if trial[0] <= 2.0 * least)
@@ -63,6 +73,17 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
             f"{data.at.source}: {text} (the nominal robot then misses by "
             f"{1e3 * np.sqrt(square):.3g} mm, not {1e3 * np.sqrt(given):.3g} mm)"
         )
+
+
+def check_in_space(robot: Robot, data: RelativeData, options: RelativeOptions) -> None:
+    """Raise DataError for slips of points, or of whole poses by their reflectors."""
+    if data.kind == "points":
+        of_points(robot, data.at)
+        return
+    try:
+        of_points(robot, poses_as_targets(data, lever_of(data, options.lever)[0]))
+    except DataError as wrong:  # the user's columns have other names
+        raise DataError(str(wrong).replace("smr1_x_", "flange_x_")) from wrong
 
 
 def some(data: RelativeData) -> Array:
@@ -78,27 +99,18 @@ def some(data: RelativeData) -> Array:
     return chosen
 
 
-def started(robot: Robot, data: RelativeData, options: RelativeOptions) -> tuple[Instrument, State]:
+def started(robot: Robot, data: RelativeData, options: RelativeOptions) -> tuple[Block, State]:
     """The measurements, and what fits the arm as drawn best."""
-    instrument = instrument_of(robot, data, options)
-    allowed, _ = allowed_of(robot, instrument, options)
-    return instrument, start_of(robot, instrument, data.at.q, allowed)
+    stack = stack_of(robot, [Train("", data)], options)
+    allowed, _ = allowed_of(stack, options)
+    return stack.blocks[0], start_of(robot, stack, allowed)
 
 
-def mean_square(instrument: Instrument, state: State) -> float:
-    """Of the misses of lengths, or of visits about their socket [m^2]."""
-    if isinstance(instrument, Closures):
-        off = instrument.centred(places(instrument.model, state))
-        return float((off**2).sum(axis=0).mean())
-    return float(np.nanmean(instrument.errors(state) ** 2))
-
-
-def size(instrument: Instrument, state: State) -> float:
+def size(block: Block, x: State) -> float:
     """What a mean square of closures is to be seen by: an arm that hardly moves closes anything."""
-    if not isinstance(instrument, Closures):
+    if not isinstance(block, Closures):
         return 1.0
-    place = places(instrument.model, state)
-    return max(float(place.var(axis=-1).sum()), 1e-12)
+    return max(float(places(block.model, x).var(axis=-1).sum()), 1e-12)
 
 
 def slips(robot: Robot, data: RelativeData) -> Iterator[tuple[str, RelativeData]]:
@@ -119,19 +131,12 @@ def slips(robot: Robot, data: RelativeData) -> Iterator[tuple[str, RelativeData]
 
 
 def check_known(
-    robot: Robot,
-    data: RelativeData,
-    options: RelativeOptions,
-    instrument: Instrument,
-    state: State,
+    robot: Robot, data: RelativeData, options: RelativeOptions, closures: Closures, x: State
 ) -> None:
     """Raise OptionError for a known distance that no arm like the drawn one can have."""
-    if not isinstance(instrument, Closures):
-        return
-    centre = instrument.barycentres(places(instrument.model, state)).T
-    limits = farthest(robot, options, instrument, state)
-    pairs = zip(options.known_distances, instrument.pairs, limits, strict=True)
-    for known, (a, b), limit in pairs:
+    centre = closures.barycentres(places(closures.model, x)).T
+    limits = farthest(robot, options, closures, x)
+    for known, (a, b), limit in zip(closures.known, closures.pairs, limits, strict=True):
         drawn, told = float(np.linalg.norm(centre[a] - centre[b])), known[2]
         if abs(drawn - told) <= limit:
             continue
@@ -142,76 +147,86 @@ def check_known(
         )
 
 
-def farthest(
-    robot: Robot, options: RelativeOptions, closures: Closures, state: State
-) -> list[float]:
+def farthest(robot: Robot, options: RelativeOptions, closures: Closures, x: State) -> list[float]:
     """By how much the drawn arm may miss each known distance: more where priors let it [m]."""
-    sigma = sigmas_of(closures.names, options)
-    free = np.pad(np.isfinite(sigma), (0, closures.names.count - len(sigma)))
+    sigma = sigmas_of(closures.model.names, options)
+    free = np.pad(np.isfinite(sigma), (0, closures.model.names.count - len(sigma)))
     limit = 4.0 * POOR_FIT * robot.reach()
     if not (free.any() and len(closures.pairs)):
         return [limit] * len(closures.pairs)
-    _, jacobian = closures.rows(state, free)
+    _, jacobian = closures.rows(x, free)
     slope = jacobian[:, -len(closures.pairs) :] / np.sqrt(closures.weights[-1])
     spread = np.linalg.norm(slope * sigma[np.isfinite(sigma)][:, None], axis=0)
     return [limit + FAR * float(one) for one in spread]
 
 
+WHICH = {
+    "distances": "which length is which wire's",
+    "closures": "the labels of the sockets",
+}
+
+
 def contradiction(
-    robot: Robot, data: RelativeData, fit: InstrumentFit, result: RelativeCalibration, offset: str
+    robot: Robot,
+    every: Sequence[RelativeData],
+    fit: InstrumentFit,
+    measured: Sequence[Measured],
+    offset: str,
 ) -> str:
     """Why the fit is no calibration of this arm; '' where it is one.
 
     offset: what the lengths say of offsets that were not fitted, see `offset_told`.
     """
-    closing, limit_mm = data.kind == "closures", 1e3 * MAX_MISS_OF_REACH * robot.reach()
-    which = "the labels of the sockets" if closing else "which length is which wire's"
-    for key, what in (("train", "training"), ("holdout", "held-out")):
-        miss_mm = result.accuracy[key].rms_mm
-        if miss_mm > limit_mm:
-            return (
-                f"the fit misses the {what} rows by {miss_mm:.3g} mm, more than "
-                f"{100 * MAX_MISS_OF_REACH:g} % "
-                "of the arm's reach: it is no calibration of this arm; check the robot file, joint "
-                f"signs, units and {which}"
-            )
-    before, after = (swept(robot, fit.instrument, x) for x in (fit.nominal, fit.state))
+    limit_mm = 1e3 * MAX_MISS_OF_REACH * robot.reach()
+    which = " and ".join(dict.fromkeys(WHICH.get(d.kind, "the order of the rows") for d in every))
+    for data, one in zip(every, measured, strict=True):
+        of_file = f" of {data.at.source}" if len(every) > 1 else ""
+        for key, what in (("train", "training"), ("holdout", "held-out")):
+            miss_mm = one.accuracy[key].rms_mm
+            if miss_mm > limit_mm:
+                return (
+                    f"the fit misses the {what} rows{of_file} by {miss_mm:.3g} mm, more than "
+                    f"{100 * MAX_MISS_OF_REACH:g} % "
+                    "of the arm's reach: it is no calibration of this arm; check the robot file, "
+                    f"joint signs, units and {which}"
+                )
+    before, after = (swept(robot, fit, x) for x in (fit.nominal, fit.state))
     if abs(after - before) > RESIZED * before:
         return (
             f"the fit makes an arm that sweeps {before:.3g} m one that sweeps {after:.3g} m: it is "
             f"no calibration of this arm; check the robot file, joint signs, units and {which}"
         )
-    nominal, calibrated, _ = result.before_and_after()
+    nominal, calibrated, _ = measured[0].before_and_after()
     if offset and calibrated.rms_mm > nominal.rms_mm:
         return "the fit is worse than the arm as drawn: fit the wires' zeros with offset="
     return ""
 
 
-def swept(robot: Robot, instrument: Instrument, state: State) -> float:
-    """Spread of the target over the joints' range [m]."""
-    place = places(plenty_of_poses(robot, instrument.model), state)
+def swept(robot: Robot, fit: InstrumentFit, state: State) -> float:
+    """Spread of the first file's targets over the joints' range [m]."""
+    block = fit.stack.blocks[0]
+    plenty = plenty_of_poses(robot, block.model)
+    links = kinematics.chain(state.mdh, plenty.q, plenty.prismatic)
+    spots = block.arm_state(fit.stack.part(state, 0)).target_positions
+    place = kinematics.points(links, spots).mean(axis=0)
     return float(np.sqrt(place.var(axis=-1).sum()))
 
 
-def offset_told(
-    robot: Robot, train: RelativeData, options: RelativeOptions, fit: InstrumentFit
-) -> str:
+def offset_told(robot: Robot, fit: InstrumentFit, options: RelativeOptions) -> str:
     """A notice where an offset of each wire explains what the fit leaves; '' where not."""
-    if train.kind != "distances" or options.offset or spread_mm(fit) < LEAST:
+    kinds = [block.kind for block in fit.stack.blocks]
+    if "distances" not in kinds or options.offset:
+        return ""
+    at = kinds.index("distances")
+    if 1e3 * fit.noise[at] < LEAST:
         return ""
     try:
-        more = fit_instrument(robot, train, replace(options, offset=True), silent)
+        more = fit_instruments(robot, fit.trains, replace(options, offset=True), silent)
     except DataError:  # too few lengths for so many unknowns
         return ""
-    if spread_mm(more) ** 2 > BETTER * spread_mm(fit) ** 2:
+    if more.noise[at] ** 2 > BETTER * fit.noise[at] ** 2:
         return ""
     return (
-        f"with an offset of each wire the lengths fit to {spread_mm(more):.3g} mm, without to "
-        f"{spread_mm(fit):.3g} mm: the wires' zeros look off; fit them with offset="
+        f"with an offset of each wire the lengths fit to {1e3 * more.noise[at]:.3g} mm, without to "
+        f"{1e3 * fit.noise[at]:.3g} mm: the wires' zeros look off; fit them with offset="
     )
-
-
-def spread_mm(fit: InstrumentFit) -> float:
-    """What a fit leaves of a length, by its spare numbers."""
-    dof = max(fit.numbers - int(fit.identification.active.sum()), 1)
-    return 1e3 * float(np.sqrt(fit.found.cost[0] / dof))

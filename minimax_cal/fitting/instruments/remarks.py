@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,9 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
-from minimax_cal.fitting.instruments.identify import has_scale
 from minimax_cal.fitting.instruments.options import RelativeOptions
-from minimax_cal.fitting.instruments.plausible import spread_mm
-from minimax_cal.fitting.instruments.result import RelativeCalibration
+from minimax_cal.fitting.instruments.poses import lever_of
+from minimax_cal.fitting.instruments.result import Measured, RelativeCalibration
 from minimax_cal.fitting.instruments.rows import TARGET
 from minimax_cal.fitting.same_arm import WILD_ANGLE
 from minimax_cal.ground.arrays import Array
@@ -24,6 +24,21 @@ WEAK = 3.0  # times what was measured: positions that are told worse are weakly 
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
 
+def of_lever(
+    every: Sequence[RelativeData], options: RelativeOptions, result: RelativeCalibration
+) -> tuple[str, ...]:
+    """What a radian of whole poses counts as, and what they tell that one reflector does not."""
+    said = []
+    for data in every:
+        if data.kind == "poses":
+            lever, whence = lever_of(data, options.lever)
+            said.append(f"a radian counts as {1e3 * lever:.4g} mm ({whence})")
+    if result.beyond:
+        names = ", ".join(result.beyond)
+        said.append(f"identified beyond what one reflector at the pose's origin tells: {names}")
+    return tuple(said)
+
+
 def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     """What stands for the length standard that closures lack."""
     kept = [
@@ -31,7 +46,7 @@ def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
         for name, reason in fit.identification.reasons.items()
         if reason.startswith("all lengths together")
     ]
-    if has_scale(fit.instrument) or not kept:
+    if not kept:
         return ()
     return (
         f"the scale is not identifiable from closures: {kept[0]} is kept as drawn, and if that is "
@@ -46,8 +61,9 @@ def of_offsets(
     """How weakly the offsets of wires are determined."""
     if not options.offset:
         return ()
-    noise_mm = spread_mm(fit)
-    told = [p for p in parameters if p.name.startswith("offset")]
+    at = [block.kind for block in fit.stack.blocks].index("distances")
+    noise_mm = 1e3 * fit.noise[at]
+    told = [p for p in parameters if p.name.rpartition(".")[2].startswith("offset")]
     each = ", ".join(
         f"{p.name} {1e3 * p.value:+.3f} +- {1e3 * p.sigma:.3f} mm"
         if p.identifiable
@@ -60,7 +76,7 @@ def of_offsets(
     )
 
 
-def general(result: RelativeCalibration, data: RelativeData, held: Array) -> tuple[str, ...]:
+def general(result: Measured, data: RelativeData, held: Array) -> tuple[str, ...]:
     """What the reader should know: nothing held out, measurements that stand out."""
     notices = []
     if not held.any():
@@ -73,18 +89,22 @@ def general(result: RelativeCalibration, data: RelativeData, held: Array) -> tup
     return (*notices, *checks.outliers(replace(data.at, target_names=result.parts), distance))
 
 
-def weak(result: RelativeCalibration) -> tuple[str, ...]:
+def weak(
+    fit: InstrumentFit, result: RelativeCalibration, measured: Sequence[Measured]
+) -> tuple[str, ...]:
     """A notice where positions are told far worse than what was measured."""
-    rms_mm, expected_mm = result.accuracy["train"].rms_mm, 1e3 * result.position_sigma
+    rms_mm = min(each.accuracy["train"].rms_mm for each in measured)
+    expected_mm = 1e3 * result.position_sigma
+    kinds = {block.kind for block in fit.stack.blocks}
     untold = [
         p.name
         for p in result.parameters
-        if not p.identifiable and p.name.startswith(TARGET) and "these poses" in p.reason
+        if not p.identifiable and TARGET in p.name and "these poses" in p.reason
     ]
-    if expected_mm <= WEAK * rms_mm and not untold:
+    if kinds & {"points", "poses"} or (expected_mm <= WEAK * rms_mm and not untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
-    more = "more sockets, farther apart" if result.kind == "closures" else "more anchors, around it"
+    more = "more sockets, farther apart" if "closures" in kinds else "more anchors, around it"
     return (
         f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "
@@ -92,11 +112,11 @@ def weak(result: RelativeCalibration) -> tuple[str, ...]:
     )
 
 
-def unlikely(result: RelativeCalibration) -> tuple[str, ...]:
+def unlikely(result: RelativeCalibration, measured: Sequence[Measured]) -> tuple[str, ...]:
     """Notices where the result is no calibration of this robot but of another one."""
     notices, reach = [], result.nominal.reach()
     for key, what in (("nominal_train", "the nominal robot"), ("train", "the best fit")):
-        miss_mm = result.accuracy[key].rms_mm
+        miss_mm = max(each.accuracy[key].rms_mm for each in measured)
         if miss_mm > 1e3 * POOR_FIT * reach:
             notices.append(
                 f"{what} misses by {miss_mm:.3g} mm: check that it is the robot of these "

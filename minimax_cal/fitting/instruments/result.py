@@ -15,6 +15,7 @@ from pydantic import Field
 from minimax_cal.fitting.fit import ACCURACIES, Parameter, Provenance, parameter_table
 from minimax_cal.fitting.fit_file import SCHEMA, ScoresPart, TableParameter, in_si
 from minimax_cal.fitting.identify import Identification
+from minimax_cal.fitting.intervals import Interval
 from minimax_cal.fitting.opened import RELATIVE
 from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.ground.files import json_text, plain, write_whole
@@ -27,13 +28,18 @@ from minimax_cal.robots.frames import CONVENTION, Frame
 from minimax_cal.robots.robot import Robot, robot_from_dict
 from minimax_cal.solvers.status import Status
 
+SEVERAL = "several"  # kind of a calibration from several files
 QUANTITY = {
+    "points": "point of the tracker",
+    SEVERAL: "what every file measured",
     "distances": "length of a wire",
     "closures": "ball about its socket",
     "poses": "position of the flange",
     "pixels": "pixel at the target",
 }
 CAUTION = {
+    "points": "",
+    SEVERAL: "Lengths, misclosures and positions are one number here; each file has its own. ",
     "distances": "An error of lengths is no error of position: what lies across the wires does "
     "not show in it. ",
     "closures": "A misclosure is no error of position: what moves all visits of a socket alike "
@@ -53,19 +59,51 @@ class ErrorsPart(ScoresPart):
     max_px: Number = math.nan
 
 
-class RelativePart(Part):
-    """The file of `minimax-cal relative -o`."""
+class MeasuredPart(Part):
+    """What an instrument measured, and how well it is fitted, in a file."""
 
-    measured: Literal["distances", "closures", "poses", "pixels"]
-    robot: dict[str, Any]
-    nominal_robot: dict[str, Any]
+    measured: Literal["distances", "closures", "poses", "points", "pixels", "several"]
     parts: tuple[str, ...]
     instrument: dict[str, Any] = Field(default_factory=dict)
+    accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
+
+    def fields(self) -> dict[str, Any]:
+        """As `Measured` has them, without the errors of single rows."""
+        turns = {
+            key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
+            for key, each in self.accuracy.items()
+            if not math.isnan(each.rms_mrad)
+        }
+        return {
+            "kind": self.measured,
+            "parts": self.parts,
+            "errors": {},
+            "numbers": {key: each.numbers for key, each in self.accuracy.items()},
+            "turns": turns,
+            "instrument": self.instrument,
+            "stated": {key: each.accuracy() for key, each in self.accuracy.items()},
+        }
+
+
+class InstrumentPart(MeasuredPart):
+    """One of several instruments, in a file."""
+
+    name: str
+    noise_mm: Number = math.nan
+    alone: tuple[str, ...] = ()
+    directions_alone: int = 0
+
+
+class RelativePart(MeasuredPart):
+    """The file of `minimax-cal relative -o`."""
+
+    robot: dict[str, Any]
+    nominal_robot: dict[str, Any]
+    instruments: tuple[InstrumentPart, ...] = ()
     status: Status
     iterations: int = 0
     seconds: Number = math.nan
     parameters: tuple[TableParameter, ...]
-    accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
     beyond_one_reflector: tuple[str, ...] = ()
     condition: Number = math.nan
     position_sigma_mm: Number = math.nan
@@ -85,37 +123,23 @@ class Stated(Identification):
         return self.told
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeCalibration:
-    """A robot calibrated from lengths, closures or poses.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured:
+    """What was measured, and how well it is fitted.
 
-    kind: one of `data.KINDS`.  robot: calibrated; nominal: as drawn.
-    parts: what each row of the errors is, as wire1.  errors: by key nominal, holdout,
-    nominal_train, train, (parts, m, 3) of the measured quantity, NaN where not measured
-    [m]; a length's error stands first of three.  numbers: independent numbers behind each
-    accuracy.  turns: RMS and largest error of orientation by key [rad], empty but for poses.
-    instrument: what was fitted besides the robot, for JSON.  position_sigma: expected error of a
-    position over the joints' range, by the parameters' sigmas alone, the base fitted [m].
-    beyond: parameters that whole poses tell and one reflector does not.
+    kind: one of `data.KINDS`, or `SEVERAL`.  parts: what each row of the errors is, as wire1.
+    errors: by key nominal, holdout, nominal_train, train, (parts, m, 3) of the measured quantity,
+    NaN where not measured [m]; a length's error stands first of three.  numbers: independent
+    numbers behind each accuracy.  turns: RMS and largest error of orientation by key [rad], empty
+    but for poses.  instrument: what was fitted besides the robot, for JSON.
     """
 
     kind: str
-    robot: Robot
-    nominal: Robot
     parts: tuple[str, ...]
-    status: Status
-    iterations: int
-    seconds: float
-    parameters: tuple[Parameter, ...]
     errors: Mapping[str, Array]
     numbers: Mapping[str, int]
     turns: Mapping[str, tuple[float, float]]
     instrument: Mapping[str, Any]
-    identification: Identification
-    position_sigma: float
-    beyond: tuple[str, ...]
-    notices: tuple[str, ...]
-    provenance: Provenance
     stated: Mapping[str, Accuracy] | None = None
 
     @cached_property
@@ -129,27 +153,24 @@ class RelativeCalibration:
         """On held-out poses where there are any, and which poses those are."""
         return before_and_after(self.accuracy)
 
-    @property
-    def identified(self) -> int:
-        """Number of identified parameters."""
-        return sum(p.identifiable for p in self.parameters)
-
-    def accuracy_table(self) -> Table:
-        """Accuracy of what was measured, before and after, training and held out."""
+    def scores(self, title: str) -> Table:
+        """Accuracy before and after, training and held out."""
         rows: list[tuple[Cell, ...]] = []
-        for title, key in ACCURACIES:
+        for heading, key in ACCURACIES:
             a, turned = self.accuracy[key], [1e3 * value for value in self.turns.get(key, ())]
-            rows.append((title, a.poses, self.numbers[key], a.rms_mm, a.mean_mm, a.max_mm, *turned))
+            rows.append(
+                (heading, a.poses, self.numbers[key], a.rms_mm, a.mean_mm, a.max_mm, *turned)
+            )
         turns = ("RMS mrad", "max mrad") if self.turns else ()
         return Table(
-            f"{self.robot.name}: {QUANTITY[self.kind]}",
+            title,
             ("poses", "count", "numbers", "RMS mm", "mean mm", "max mm", *turns),
             tuple(rows),
             ("", "d", "d", *[".4f"] * (3 + len(turns))),
         )
 
-    def parts_table(self) -> Table:
-        """RMS errors wire by wire."""
+    def parts_table(self, title: str) -> Table:
+        """RMS errors part by part, as wire by wire."""
         rows: tuple[tuple[Cell, ...], ...] = tuple(
             (
                 part,
@@ -157,24 +178,151 @@ class RelativeCalibration:
             )
             for i, part in enumerate(self.parts)
         )
-        header = ("RMS mm", *(title for title, _ in ACCURACIES))
-        return Table("by wire", header, rows, ("", *[".4f"] * len(ACCURACIES)))
-
-    def tables(self) -> tuple[Table, ...]:
-        """Every table of the result."""
-        parts = (self.parts_table(),) if len(self.parts) > 1 and self.errors else ()
-        frames = tables_of(self.frames)
-        return (self.accuracy_table(), *parts, *frames, parameter_table(self.parameters))
+        header = ("RMS mm", *(heading for heading, _ in ACCURACIES))
+        return Table(title, header, rows, ("", *[".4f"] * len(ACCURACIES)))
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """Base and tool of whole poses, those of the drawn arm, and the corrections."""
+        """Base and tool as a tracker's points or whole poses have them, the drawn arm's, and the
+        corrections.
+        """
         places = {
             name: pose_from_dict(self.instrument[name]) if name in self.instrument else None
             for name in ("base", "nominal_base", "tool", "nominal_tool")
         }
         base = paired("base", places["base"], places["nominal_base"])
         return base | paired("tool", places["tool"], places["nominal_tool"])
+
+    def measured_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        accuracies = {}
+        for key, value in self.accuracy.items():
+            turns = [1e3 * turn for turn in self.turns.get(key, ())]
+            angles = dict(zip(("rms_mrad", "max_mrad"), turns, strict=False))
+            accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
+        frames = {name: frame.to_dict() for name, frame in self.frames.items()}
+        return {
+            "measured": self.kind,
+            "parts": list(self.parts),
+            **({"frames": frames, "frames_convention": CONVENTION} if frames else {}),
+            "instrument": dict(self.instrument),
+            "accuracy": accuracies,
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InstrumentResult(Measured):
+    """One of several files.
+
+    interval: 95 % of the held-out RMS [m].  noise: sigma of a number by what the fit leaves [m].
+    alone: link parameters that only this file
+    determines; directions_alone: the number of independent directions in which it does.
+    """
+
+    name: str
+    interval: Interval
+    noise: float
+    alone: tuple[str, ...]
+    directions_alone: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        measured = self.measured_dict()
+        measured["accuracy"]["holdout"]["rms_ci95_mm"] = [
+            1e3 * self.interval.low,
+            1e3 * self.interval.high,
+        ]
+        return {
+            "name": self.name,
+            **measured,
+            "noise_mm": 1e3 * self.noise,
+            "alone": list(self.alone),
+            "directions_alone": self.directions_alone,
+        }
+
+    @staticmethod
+    def of(part: InstrumentPart) -> InstrumentResult:
+        """From a file's part."""
+        return InstrumentResult(
+            **part.fields(),
+            name=part.name,
+            interval=Interval(*(1e-3 * end for end in part.accuracy["holdout"].rms_ci95_mm)),
+            noise=1e-3 * part.noise_mm,
+            alone=part.alone,
+            directions_alone=part.directions_alone,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RelativeCalibration(Measured):
+    """A robot calibrated from lengths, closures or poses, or from several files together.
+
+    robot: calibrated; nominal: as drawn.  position_sigma: expected error of a position over the
+    joints' range, by the parameters' sigmas alone, the base fitted [m].  beyond: parameters that
+    whole poses tell and one reflector does not.  instruments: each of several files.
+    """
+
+    robot: Robot
+    nominal: Robot
+    status: Status
+    iterations: int
+    seconds: float
+    parameters: tuple[Parameter, ...]
+    identification: Identification
+    position_sigma: float
+    beyond: tuple[str, ...]
+    notices: tuple[str, ...]
+    provenance: Provenance
+    instruments: tuple[InstrumentResult, ...] = ()
+
+    @property
+    def identified(self) -> int:
+        """Number of identified parameters."""
+        return sum(p.identifiable for p in self.parameters)
+
+    def accuracy_table(self) -> Table:
+        """Accuracy of what was measured, before and after, training and held out."""
+        return self.scores(f"{self.robot.name}: {QUANTITY[self.kind]}")
+
+    def files_table(self) -> Table:
+        """Each of several files: held-out RMS before and after, and what it alone determines."""
+        rows: list[tuple[Cell, ...]] = []
+        for one in self.instruments:
+            before, after, _ = one.before_and_after()
+            ends = (1e3 * one.interval.low, 1e3 * one.interval.high)
+            rows.append((one.name, before.rms_mm, after.rms_mm, *ends, 1e3 * one.noise))
+        header = ("file", "nominal mm", "RMS mm", "95 % from", "to", "noise mm")
+        return Table("each file, RMS", header, tuple(rows), ("", *[".4f"] * 5))
+
+    def alone_table(self) -> Table:
+        """What only one of the files determines."""
+        rows = tuple(
+            (one.name, one.directions_alone, ", ".join(one.alone) or "none")
+            for one in self.instruments
+        )
+        header = ("only by", "directions", "parameters of the arm")
+        return Table("identified by one file alone", header, rows, ("", "d", ""))
+
+    def first_tables(self) -> list[Table]:
+        """What stands on the first screen."""
+        if self.instruments:
+            return [self.files_table(), self.alone_table()]
+        return [self.accuracy_table().brief("poses", "count", "RMS mm", "max mm")]
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every table of the result."""
+        parts = len(self.parts) > 1 and self.errors and not self.instruments
+        own: list[Table] = [self.parts_table("by wire")] if parts else []
+        own += tables_of(self.frames)
+        for one in self.instruments:
+            own.append(one.scores(f"{one.name}: {QUANTITY[one.kind]}"))
+            own += tables_of(one.frames)
+            if len(one.parts) > 1 and one.errors:
+                own.append(one.parts_table(f"{one.name}, part by part"))
+        first = [self.files_table(), self.alone_table()] if self.instruments else [
+            self.accuracy_table()
+        ]  # fmt: skip
+        return (*first, *own, parameter_table(self.parameters))
 
     def headline(self) -> str:
         """The result in some sentences, with what it does not say."""
@@ -196,27 +344,12 @@ class RelativeCalibration:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: `robot` is the calibrated robot, whole, as `load_robot` reads it."""
-        accuracies = {}
-        for key, value in self.accuracy.items():
-            turns = [1e3 * turn for turn in self.turns.get(key, ())]
-            angles = dict(zip(("rms_mrad", "max_mrad"), turns, strict=False))
-            accuracies[key] = {**value.to_dict(), "numbers": self.numbers[key], **angles}
         content = {
             "schema": SCHEMA,
             "kind": RELATIVE,
-            "measured": self.kind,
             "robot": self.robot.to_dict(),
             "nominal_robot": self.nominal.to_dict(),
-            "parts": list(self.parts),
-            **(
-                {
-                    "frames": {name: frame.to_dict() for name, frame in self.frames.items()},
-                    "frames_convention": CONVENTION,
-                }
-                if self.frames
-                else {}
-            ),
-            "instrument": dict(self.instrument),
+            **self.measured_dict(),
             "status": str(self.status),
             "advice": self.status.advice,
             "iterations": self.iterations,
@@ -226,10 +359,11 @@ class RelativeCalibration:
             "beyond_one_reflector": list(self.beyond),
             "condition": self.identification.condition,
             "position_sigma_mm": 1e3 * self.position_sigma,
-            "accuracy": accuracies,
             "notices": list(self.notices),
             "provenance": vars(self.provenance),
         }
+        if self.instruments:
+            content["instruments"] = [one.to_dict() for one in self.instruments]
         return dict(plain(content))
 
     @staticmethod
@@ -238,31 +372,22 @@ class RelativeCalibration:
         part = checked(RelativePart, content, source)
         known = np.array([p.identifiable for p in part.parameters])
         found = RelativeCalibration(
-            kind=part.measured,
+            **part.fields(),
             robot=robot_from_dict(content["robot"], f"{source}: robot"),
             nominal=robot_from_dict(content["nominal_robot"], f"{source}: nominal_robot"),
-            parts=part.parts,
             status=part.status,
             iterations=part.iterations,
             seconds=part.seconds,
             parameters=tuple(in_si(p) for p in part.parameters),
-            errors={},
-            numbers={key: each.numbers for key, each in part.accuracy.items()},
-            turns={
-                key: (1e-3 * each.rms_mrad, 1e-3 * each.max_mrad)
-                for key, each in part.accuracy.items()
-                if not math.isnan(each.rms_mrad)
-            },
-            instrument=part.instrument,
             identification=Stated(known, {}, np.zeros(0), np.zeros(0), part.condition),
             position_sigma=1e-3 * part.position_sigma_mm,
             beyond=part.beyond_one_reflector,
             notices=part.notices,
             provenance=part.provenance,
-            stated={key: each.accuracy() for key, each in part.accuracy.items()},
+            instruments=tuple(InstrumentResult.of(each) for each in part.instruments),
         )
-        with reading(source, "instrument"):
-            _ = found.frames  # poses that are none are refused here, not when they are shown
+        with reading(source, "instrument"):  # poses that are none are refused here, not when shown
+            _ = [each.frames for each in (found, *found.instruments)]
         return found
 
     def json(self) -> str:

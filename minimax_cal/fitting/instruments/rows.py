@@ -1,23 +1,120 @@
-"""Residuals of lengths and of closures, and their derivatives: a least-squares problem each.
+"""What every instrument brings to the fit: rows of residuals, their derivatives, parameters.
 
-The robot's base is the frame: no instrument has one.  What an instrument adds to the unknowns (the
-anchors of wires and their offsets) stands at the end of the state, where effects stand elsewhere;
-the places of sockets are eliminated.
+The robot's base is the frame.  What an instrument adds to the unknowns (its frame, anchors,
+targets, surfaces) stands in the state where effects stand elsewhere.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from typing import Any, Protocol, Self
 
 import numpy as np
 
+from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.ground.arrays import Array
-from minimax_cal.modelling.model import Block, Model, Prior
+from minimax_cal.modelling.model import Block as Poses
+from minimax_cal.modelling.model import Model, Prior
 from minimax_cal.modelling.parameters import Names, State, links_of
 from minimax_cal.robots import kinematics
 from minimax_cal.robots.robot import Robot
 
 TARGET = "target"  # the point on the flange: of the wires, or the ball
+SPOT = tuple(f"{TARGET}_{axis}" for axis in "xyz")
+LINEAR_RANK = 1e-6  # relative singular value below which a linear start says nothing
+NO_TURNS: Mapping[str, tuple[float, float]] = {}
+
+
+class Block(Protocol):
+    """An instrument's measurements as a part of the least-squares problem.
+
+    A state of a block has the links and the e parameters of the block's own, as effects; its p
+    parameters are in the order of `Names`: links, the base (which is the frame), its own.
+    """
+
+    @property
+    def kind(self) -> str:
+        """One of `data.KINDS`."""
+
+    @property
+    def model(self) -> Model:
+        """The arm at the poses, with the block's own points on the flange."""
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """(e,) names of its own parameters."""
+
+    @property
+    def given_up(self) -> tuple[str, ...]:
+        """Those of them that redundancy takes first."""
+
+    @property
+    def spots(self) -> slice:
+        """Where the model's targets stand among its own."""
+
+    @property
+    def numbers(self) -> int:
+        """Independent numbers, and as many more as parameters that cost none."""
+
+    @property
+    def points(self) -> int:
+        """Number of compared points, which turns a sum of squares into a mean motion."""
+
+    @property
+    def row_noise(self) -> float:
+        """Sigma of a row over that of a number."""
+
+    @property
+    def weights(self) -> Array:
+        """(rows,) one each; more where a row weighs more than its noise says."""
+
+    @property
+    def has_length(self) -> bool:
+        """Whether something that it measures is a length."""
+
+    @property
+    def whole(self) -> str:
+        """What several of its places are together, for reasons."""
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What each row of `errors` is."""
+
+    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
+        """Measured minus predicted (..., rows) [m], derivative of the latter (..., active, rows).
+
+        active: (p,).
+        """
+
+    def start(self, robot: Robot, free: Array) -> Array:
+        """(e,) that fit the arm as drawn best.  free: (e,) True where one may be fitted."""
+
+    def reference(self, robot: Robot, x: State) -> Self:
+        """The instrument at plenty of poses that it could measure, of the arm at a state."""
+
+    def closed(self, robot: Robot, x: State) -> Self:
+        """The instrument at poses near its own where the arm at a state itself fits it."""
+
+    def arm_state(self, x: State) -> State:
+        """The state of its model."""
+
+    def mean_square(self, x: State) -> float:
+        """Of the misses, as `errors` has them [m^2]."""
+
+    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+        """Of all rows of the data: (parts, m, 3), NaN where not measured [m]; numbers first."""
+
+    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+        """(m,) errors of orientation [rad], empty where none is measured."""
+
+    def listed(
+        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
+    ) -> tuple[Parameter, ...]:
+        """Its own parameters as people read them.  covariance: (e, e) of its own."""
+
+    def placed(self, x: State, nominal: State) -> dict[str, Any]:
+        """For JSON: what was fitted besides the robot."""
 
 
 def arm_at(robot: Robot, q: Array) -> Model:
@@ -37,242 +134,38 @@ def arm_at(robot: Robot, q: Array) -> Model:
 
 
 def state_of(mdh: Array, target: Array, own: Array) -> State:
-    """A state with the base as the frame.  target: (3,) [m].  own: (e,) of the instrument."""
+    """A state with the base as the frame.  target: (3,) [m].  own: (e,) of effects."""
     return State(mdh, np.eye(3), np.zeros(3), target[None], own)
+
+
+def own_state(mdh: Array, own: Array) -> State:
+    """A state of a block, or of several.  mdh: (..., n, 5).  own: (..., e)."""
+    *batch, _, _ = mdh.shape
+    rotation = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+    return State(mdh, rotation, np.zeros((*batch, 3)), np.zeros((*batch, 0, 3)), own)
+
+
+def with_spot(x: State) -> State:
+    """The state of the arm with the target that is first among a block's own."""
+    return State(x.mdh, x.rotation, x.origin, x.effects[..., None, :3])
 
 
 def places(model: Model, x: State) -> Array:
     """The point on the flange in the base: (..., 3, m) [m]."""
     links = kinematics.chain(x.mdh, model.q, model.prismatic)
-    return np.asarray(kinematics.points(links, x.target_positions)[..., 0, :, :])
+    return np.asarray(kinematics.points(links, with_spot(x).target_positions)[..., 0, :, :])
 
 
 def motion(model: Model, x: State, active: Array) -> tuple[Array, Array]:
     """`places`, and their derivative by the active parameters of the arm: (..., active, 3, m)."""
     links = kinematics.chain(x.mdh, model.q, model.prismatic)
-    error, turned = model.weighted_rows(x, Block(slice(0, len(model.q)), links), active)
+    poses = Poses(slice(0, len(model.q)), links)
+    error, turned = model.weighted_rows(with_spot(x), poses, active)
     return -error[..., 0, :, :], turned[..., 0, :, :, :]
 
 
-@dataclass(frozen=True, eq=False)
-class Wires:
-    """Lengths from fixed anchors to the target.
-
-    model: the arm at the m poses.  names: all p parameters, anchors and offsets at the end.
-    length: (m, s), NaN where not measured [m].
-    """
-
-    model: Model
-    names: Names
-    length: Array
-
-    @staticmethod
-    def of(robot: Robot, q: Array, wires: tuple[str, ...], length: Array) -> Wires:
-        """Wires of a robot; the parameters of wire3 are anchor3_x ... and offset3."""
-        numbers = [wire.removeprefix("wire") for wire in wires]
-        own = [f"anchor{number}_{axis}" for number in numbers for axis in "xyz"]
-        own += [f"offset{number}" for number in numbers]
-        return Wires(arm_at(robot, q), Names.of(robot, (TARGET,), tuple(own)), length)
-
-    @property
-    def points(self) -> int:
-        """Number of measured lengths."""
-        return int(np.isfinite(self.length).sum())
-
-    @property
-    def weights(self) -> Array:
-        """(rows,) one each."""
-        return np.ones(self.points)
-
-    def split(self, own: Array) -> tuple[Array, Array]:
-        """Anchors (..., s, 3) and offsets (..., s) [m]."""
-        s = self.length.shape[1]
-        return own[..., : 3 * s].reshape(*own.shape[:-1], s, 3), own[..., 3 * s :]
-
-    def errors(self, x: State) -> Array:
-        """Measured minus predicted lengths: (..., s, m), NaN where not measured [m]."""
-        anchors, offsets = self.split(x.effects)
-        gap = places(self.model, x)[..., None, :, :] - anchors[..., None]
-        return np.asarray(self.length.T - np.linalg.norm(gap, axis=-2) - offsets[..., None])
-
-    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
-        """Measured minus predicted (..., rows), and the derivative of the predicted.
-
-        A row for each measured length: it grows as the target moves along the wire.  active: (p,).
-        The derivative is (..., active, rows).
-        """
-        arm = self.model.names.count
-        point, arms = motion(self.model, x, active[:arm])
-        anchors, offsets = self.split(x.effects)
-        gap = point[..., None, :, :] - anchors[..., None]
-        distance = np.maximum(np.linalg.norm(gap, axis=-2), 1e-12)
-        unit = gap / distance[..., None, :]
-        *batch, s, m = distance.shape
-        own = np.zeros((*batch, 4 * s, s, m))
-        for i in range(s):
-            own[..., 3 * i : 3 * i + 3, i, :] = -unit[..., i, :, :]
-            own[..., 3 * s + i, i, :] = 1.0
-        along = np.einsum("...scm,...pcm->...psm", unit, arms)
-        jacobian = np.concatenate([along, own[..., active[arm:], :, :]], axis=-3)
-        seen = np.isfinite(self.length.T)
-        error = self.length.T - distance - offsets[..., None]
-        return error[..., seen], jacobian[..., seen]
-
-
-@dataclass(frozen=True, eq=False)
-class Closures:
-    """Visits to sockets, about each socket's barycentre; known distances between sockets.
-
-    model: the arm at the m poses, sorted by socket.  first: (g,) where each socket begins.
-    pairs: (l, 2) sockets whose distance (l,) is known [m].
-    """
-
-    model: Model
-    first: Array
-    pairs: Array
-    distance: Array
-
-    @staticmethod
-    def of(robot: Robot, q: Array, socket: Array, pairs: Array, distance: Array) -> Closures:
-        """Closures of a robot.  socket: (m,) numbers from 0, each there.  pairs: of these."""
-        order = np.argsort(socket, kind="stable")
-        _, first = np.unique(socket[order], return_index=True)
-        return Closures(arm_at(robot, q[order]), first, pairs.reshape(-1, 2), distance)
-
-    @property
-    def names(self) -> Names:
-        """The arm's parameters: the sockets' places are eliminated."""
-        return self.model.names
-
-    @property
-    def points(self) -> int:
-        """Number of visits."""
-        return len(self.model.q)
-
-    @property
-    def weights(self) -> Array:
-        """(rows,) one each for visits, and as much as all of them for a known distance."""
-        coordinates = 3 * self.points
-        return np.concatenate([np.ones(coordinates), np.full(len(self.pairs), coordinates)])
-
-    @property
-    def visits(self) -> Array:
-        """(g,) how often each socket was visited."""
-        return np.diff(np.append(self.first, self.points))
-
-    def barycentres(self, values: Array) -> Array:
-        """Means over the visits of each socket: (..., g).  values: (..., m), in sorted order."""
-        return np.asarray(np.add.reduceat(values, self.first, axis=-1) / self.visits)
-
-    def centred(self, values: Array) -> Array:
-        """Values (..., m) without their socket's mean."""
-        return np.asarray(values - np.repeat(self.barycentres(values), self.visits, axis=-1))
-
-    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
-        """Measured minus predicted (..., rows), and the derivative of the predicted.
-
-        Three rows a visit, and one for each known distance.  active: (p,).  The derivative is
-        (..., active, rows).
-
-        The best place of a socket is the visits' barycentre, whatever the other parameters are:
-        eliminating it leaves the visits about it.  A known distance weighs as all of them together:
-        else the fit would shrink the arm to shrink its misclosures.
-        """
-        point, arms = motion(self.model, x, active)
-        *batch, p, _, m = arms.shape
-        error, jacobian = -self.centred(point), self.centred(arms)
-        parts = [error.reshape(*batch, 3 * m), jacobian.reshape(*batch, p, 3 * m)]
-        if len(self.pairs):
-            a, b = self.pairs.T
-            place, moved = self.barycentres(point), self.barycentres(arms)
-            gap = place[..., a] - place[..., b]
-            length = np.maximum(np.linalg.norm(gap, axis=-2), 1e-12)
-            weight = np.sqrt(3.0 * m)
-            along = (gap / length[..., None, :])[..., None, :, :] * (moved[..., a] - moved[..., b])
-            parts[0] = np.concatenate([parts[0], weight * (self.distance - length)], axis=-1)
-            parts[1] = np.concatenate([parts[1], weight * along.sum(axis=-2)], axis=-1)
-        return parts[0], parts[1]
-
-
-# Both have: model, the arm at the poses measured; names, all p parameters, the instrument's own at
-# the end; points, how many are compared; weights of the rows; and `rows`.
-Instrument = Wires | Closures
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """What is known of the links before any measurement.
-
-    mean: (5 n,) as drawn.  sigma: (5 n,) how far they may be from there, infinite where nothing is
-    known [SI].
-    """
-
-    mean: Array
-    sigma: Array
-
-    @property
-    def any(self) -> bool:
-        """Whether anything is known."""
-        return bool(np.isfinite(self.sigma).any())
-
-    def weights(self, variance: float, count: int) -> Array:
-        """(count,) weights of all parameters beside rows of a variance [m^2 per unit^2]."""
-        return np.pad(variance / self.sigma**2, (0, count - len(self.sigma)))
-
-    def off(self, x: State) -> Array:
-        """(..., 5 n) how far the links are from their mean."""
-        links = np.swapaxes(x.mdh, -1, -2)  # in the order of `parameters.links_of`
-        return np.asarray(self.mean - links.reshape(*links.shape[:-2], -1))
-
-
-@dataclass(frozen=True, eq=False)
-class Squares:
-    """The sum of squared rows over the active parameters, for `solvers.least_squares`.
-
-    Nothing is left to eliminate linearly: sockets are gone, and lengths of wires are affine in
-    none of the parameters but the offsets.  known: of the links, which counts with the weights (p,)
-    where these are given.
-    """
-
-    instrument: Instrument
-    active: Array
-    known: Known | None = None
-    weight: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def linear(self) -> Array:
-        """(free,) False: all parameters count as nonlinear."""
-        return np.zeros(int(self.active.sum()), dtype=bool)
-
-    def normal(self, x: State) -> tuple[Array, Array, Array]:
-        """Cost (...), gradient (..., free) and Gram matrix (..., free, free)."""
-        error, jacobian = self.instrument.rows(x, self.active)
-        cost = np.einsum("...r,...r->...", error, error)
-        gradient = (jacobian @ error[..., None])[..., 0]
-        gram = jacobian @ np.swapaxes(jacobian, -1, -2)
-        if self.known and len(self.weight):
-            off = np.zeros((*cost.shape, len(self.active)))
-            off[..., : len(self.known.mean)] = self.known.off(x)
-            off, weight = off[..., self.active], self.weight[self.active]
-            cost = cost + (weight * off**2).sum(axis=-1)
-            gradient = gradient + weight * off
-            gram = gram + np.diag(weight)
-        return np.asarray(cost), np.asarray(gradient), gram
-
-    def reduced(self, x: State, *, full: bool) -> tuple[State, Array, Array, Array, Array]:
-        """The same: there is nothing to eliminate."""
-        cost, gradient, gram = self.normal(x)
-        return x, cost, gradient, gram, np.zeros((len(cost), 0, gradient.shape[-1]))
-
-    def step(self, x: State, dx: Array) -> State:
-        """The states moved by a step in the active parameters."""
-        whole = np.zeros((*dx.shape[:-1], self.instrument.names.count))
-        whole[..., self.active] = dx
-        return x.step(whole)
-
-
-def gram_of(instrument: Instrument, x: State) -> Array:
-    """The Gram matrix of all parameters at a state: (p, p)."""
-    every = np.ones(instrument.names.count, dtype=bool)
-    _, jacobian = instrument.rows(x, every)
-    return np.asarray(jacobian @ jacobian.T)
+def scaled_lstsq(matrix: Array, right: Array) -> Array:
+    """Least squares with columns scaled to one; the least solution where poses do not tell."""
+    norm = np.linalg.norm(matrix, axis=0)
+    norm = np.where(norm > 0.0, norm, 1.0)
+    return np.asarray(np.linalg.lstsq(matrix / norm, right, rcond=LINEAR_RANK)[0] / norm)

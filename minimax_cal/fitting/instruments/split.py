@@ -1,8 +1,6 @@
-"""Which lengths and visits are held out, and what an error of a visit is about."""
+"""Which rows are held out, and what an error of a visit is about."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -10,15 +8,15 @@ from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
-from minimax_cal.measuring.grouping import groups, split
+from minimax_cal.measuring.grouping import groups, held_out
 
 WHOLE = 5  # sockets from which on whole ones are held out
 
 
-def held_out(data: RelativeData, options: RelativeOptions) -> tuple[Array, tuple[str, ...]]:
-    """(m,) True where a length or a visit is held out, and notices."""
+def held_back(data: RelativeData, options: RelativeOptions) -> tuple[Array, tuple[str, ...]]:
+    """(m,) True where a row is held out, as `grouping.held_out` chooses or as sockets need."""
     if data.kind != "closures":
-        return split_rows(data, options.holdout, options.seed)
+        return held_out(data.at, options.holdout, options.seed)
     needed = tuple(label for known in options.known_distances for label in known[:2])
     return split_sockets(data, options.holdout, options.seed, needed)
 
@@ -33,15 +31,6 @@ def before_and_after(nominal: Array, calibrated: Array, held: Array) -> dict[str
     }
 
 
-def split_rows(data: RelativeData, holdout: float, seed: int) -> tuple[Array, tuple[str, ...]]:
-    """(m,) True where a pose is held out, as `data.split` chooses, and notices."""
-    marked = replace(data.at, columns={**data.at.columns, "row": np.arange(data.poses)})
-    _, held, notices = split(marked, holdout, seed)
-    out = np.zeros(data.poses, dtype=bool)
-    out[held.columns["row"]] = True
-    return out, notices
-
-
 def split_sockets(
     data: RelativeData, holdout: float, seed: int, needed: tuple[str, ...]
 ) -> tuple[Array, tuple[str, ...]]:
@@ -50,7 +39,7 @@ def split_sockets(
     Whole sockets where there are enough: nothing of them shaped the fit.  Else visits, of which
     each socket keeps two.  needed: sockets that must stay, those of known distances.
     """
-    held, notices = split_rows(data, holdout, seed)  # raises for a wrong option
+    held, notices = held_out(data.at, holdout, seed)  # raises for a wrong option
     if "split" in data.at.columns:
         gone = [label for label in needed if held[data.socket == label].all()]
         if gone:
@@ -125,3 +114,22 @@ def free_numbers(socket: Array, held: Array) -> tuple[int, int]:
     trained, left = np.unique(socket[~held]), np.unique(socket[held])
     alone = len(left) - int(np.isin(left, trained).sum())
     return 3 * (int((~held).sum()) - len(trained)), 3 * (int(held.sum()) - alone)
+
+
+def count_numbers(data: RelativeData, held: Array) -> dict[str, int]:
+    """Independent numbers behind the errors, by the keys of a result."""
+    if data.kind == "closures":
+        trained, left = free_numbers(data.socket, held)
+    else:
+        each = numbers_by_row(data)
+        trained, left = int(each[~held].sum()), int(each[held].sum())
+    return {"nominal": left, "holdout": left, "train": trained, "nominal_train": trained}
+
+
+def numbers_by_row(data: RelativeData) -> Array:
+    """(m,) how many numbers each row holds; of poses and points in space."""
+    if data.kind == "poses":
+        return np.full(data.poses, 6)
+    if data.kind == "points":
+        return np.asarray(3 * data.at.seen.sum(axis=1))
+    return np.asarray(np.isfinite(data.length).sum(axis=1))

@@ -1,0 +1,248 @@
+"""Points of a tracker, and whole poses as virtual ones, in a frame of the instrument's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from minimax_cal.fitting.fit import Parameter
+from minimax_cal.fitting.identify import plenty_of_poses
+from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.poses import (
+    TOOL,
+    pose_errors,
+    poses_as_targets,
+    spots_of,
+    tool_of,
+)
+from minimax_cal.fitting.start import fit_base
+from minimax_cal.ground.arrays import Array
+from minimax_cal.measuring.measurements import Measurements
+from minimax_cal.modelling.cell import Cell, pose_to_dict
+from minimax_cal.modelling.model import Block as Poses
+from minimax_cal.modelling.model import Model, model_of
+from minimax_cal.modelling.parameters import BASE_NAMES, State
+from minimax_cal.robots import kinematics
+from minimax_cal.robots.kinematics import hat, rotation_vector
+from minimax_cal.robots.robot import Robot
+
+
+def right_jacobian(w: Array) -> Array:
+    """J with exp(w + dw) = exp(w) exp(J dw): (..., 3, 3).  w: (..., 3) rotation vectors [rad]."""
+    size = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = size < 1e-4  # where the quotients are their limits to rounding
+    safe = np.where(small, 1.0, size)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    skew = hat(w)
+    return np.asarray(np.eye(3) - first * skew + second * skew @ skew)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Targets that an instrument sees from a place of its own, as a block, see `rows.Block`.
+
+    Its own: the base's place and turn along and from the axes of the base that fits the arm as
+    drawn; then the k targets.  robot: as drawn.  drawn: links, base and targets of that fit.
+    """
+
+    model: Model
+    robot: Robot
+    drawn: State
+
+    kind = "points"
+    row_noise = 1.0
+    given_up: ClassVar[tuple[str, ...]] = ()
+    whole = "all targets moved together"
+    has_length = True
+
+    @staticmethod
+    def of(robot: Robot, at: Measurements) -> Points:
+        """Points of a robot."""
+        model = model_of(robot, at)
+        return Points(model, robot, fit_base(model, robot.mdh).state)
+
+    @property
+    def spots(self) -> slice:
+        """The targets come last."""
+        return slice(6, None)
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Base and targets."""
+        return (
+            *BASE_NAMES,
+            *(f"{t}_{axis}" for t in self.model.names.target_names for axis in "xyz"),
+        )
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The targets."""
+        return self.model.names.target_names
+
+    @property
+    def points(self) -> int:
+        """Number of measured points."""
+        return int(self.model.counts.sum())
+
+    @property
+    def numbers(self) -> int:
+        """Three a point."""
+        return 3 * self.points
+
+    @property
+    def weights(self) -> Array:
+        """(rows,) one each."""
+        return np.ones(3 * self.model.weight.size)
+
+    def arm_state(self, x: State) -> State:
+        """Links, base in the instrument's frame, targets."""
+        axes, own = self.drawn.rotation, x.effects
+        rotation, origin = axes @ kinematics.rotation(own[..., 3:6]), own[..., :3] @ axes.T
+        targets = own[..., 6:].reshape(*own.shape[:-1], -1, 3)
+        return State(x.mdh, rotation, origin, targets)
+
+    def rows(self, x: State, active: Array) -> tuple[Array, Array]:
+        """Three rows for each target at each pose, 0 where it was not measured."""
+        n, m = self.model.names.joints, len(self.model.q)
+        state, first = self.arm_state(x), 5 * n
+        links = kinematics.chain(x.mdh, self.model.q, self.model.prismatic)
+        every = np.concatenate([active[:first], [True] * 6, active[first + 12 :]])
+        error, turned = self.model.weighted_rows(state, Poses(slice(0, m), links), every)
+        links_free = int(active[:first].sum())
+        base = turned[..., links_free : links_free + 6, :, :]
+        move = np.swapaxes(kinematics.rotation(x.effects[..., 3:6]), -1, -2)
+        turn = right_jacobian(x.effects[..., 3:6])
+        moved = np.einsum("...ij,...kicm->...kjcm", move, base[..., :3, :, :])
+        swung = np.einsum("...ij,...kicm->...kjcm", turn, base[..., 3:, :, :])
+        own = np.concatenate([moved, swung], axis=-3)[..., active[first + 6 : first + 12], :, :]
+        parts = [turned[..., :links_free, :, :], own, turned[..., links_free + 6 :, :, :]]
+        jacobian = np.moveaxis(np.concatenate(parts, axis=-3), -3, -4)
+        *batch, p, k, _, _ = jacobian.shape
+        return error.reshape(*batch, 3 * k * m), jacobian.reshape(*batch, p, 3 * k * m)
+
+    def start(self, robot: Robot, free: Array) -> Array:
+        """In closed form."""
+        base, targets = self.drawn.rotation.T @ self.drawn.origin, self.drawn.target_positions
+        return np.concatenate([base, np.zeros(3), targets.reshape(-1)])
+
+    def reference(self, robot: Robot, x: State) -> Self:
+        """At plenty of random poses."""
+        return replace(self, model=plenty_of_poses(robot, self.model))
+
+    def closed(self, robot: Robot, x: State) -> Self:
+        """The same: points need no arm that fits."""
+        return self
+
+    def mean_square(self, x: State) -> float:
+        """Of the errors of points [m^2]."""
+        error = self.model.error(self.arm_state(x))
+        return float(np.nanmean((error**2).sum(axis=-1)))
+
+    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+        """Of the points, along the axes of the base."""
+        return model_of(robot, data.at).error(self.arm_state(x))
+
+    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def listed(
+        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
+    ) -> tuple[Parameter, ...]:
+        """As they are."""
+        return fitted
+
+    def placed(self, x: State, nominal: State) -> dict[str, Any]:
+        """Base in the instrument's frame, targets in the flange."""
+        state = self.arm_state(x)
+        spots = (1e3 * state.target_positions).tolist()
+        return {
+            "base": pose_to_dict(state.base),
+            "nominal_base": pose_to_dict(self.drawn.base),
+            "targets_mm": dict(zip(self.parts, spots, strict=True)),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class WholePoses(Points):
+    """Whole poses of a frame on the flange, as virtual reflectors at the corners of a tetrahedron.
+
+    lever: that a radian counts as [m].
+    """
+
+    lever: float = 0.0
+
+    kind = "poses"
+    parts = ("position",)
+    row_noise = 2.0  # of the root of its four reflectors
+    whole = "the tool"
+
+    @staticmethod
+    def seen(robot: Robot, data: RelativeData, lever: float) -> WholePoses:
+        """Poses of a robot."""
+        model = model_of(robot, poses_as_targets(data, lever))
+        return WholePoses(model, robot, fit_base(model, robot.mdh).state, lever)
+
+    @property
+    def numbers(self) -> int:
+        """Six a pose, not the twelve of its reflectors.
+
+        With four reflectors their errors' covariance is 4 s^2 times the projector on rigid motions,
+        s^2 being the variance of a coordinate of the pose.  No other motion is in the fit's slopes,
+        so that its covariance is that of 4 s^2 I.  The reflectors' shape is known, and its
+        parameters take no number.
+        """
+        return 6 * len(self.model.q) + 3 * len(self.model.y) - 6
+
+    def tool(self, state: State) -> tuple[Cell, Array]:
+        """The cell, and the pose (4, 4) of the measured frame in its flange [m]."""
+        cell = Cell.of(self.robot, state, self.model.names.target_names)
+        return cell, tool_of(cell, spots_of(self.lever))
+
+    def errors(self, robot: Robot, x: State, data: RelativeData, held: Array) -> Array:
+        """Of positions, in the measurement frame."""
+        return pose_errors(*self.tool(self.arm_state(x)), data)[0][None]
+
+    def turns(self, robot: Robot, x: State, data: RelativeData) -> Array:
+        """(m,) angles between orientations [rad]."""
+        return pose_errors(*self.tool(self.arm_state(x)), data)[1]
+
+    def listed(
+        self, fitted: tuple[Parameter, ...], nominal: State, x: State, covariance: Array
+    ) -> tuple[Parameter, ...]:
+        """The base, and the tool instead of its reflectors."""
+        (_, before), (_, tool) = (self.tool(self.arm_state(each)) for each in (nominal, x))
+        arm = spots_of(self.lever) @ tool[:3, :3].T  # in the flange's axes
+        k = len(arm)
+        rigid = np.concatenate([np.tile(np.eye(3), (k, 1)), -hat(arm).reshape(3 * k, 3)], axis=1)
+        back = np.linalg.pinv(rigid)
+        spread = back @ covariance[6:, 6:] @ back.T
+        turn = rotation_vector(tool[:3, :3] @ before[:3, :3].T)
+        was, found = [*before[:3, 3], *np.zeros(3)], [*tool[:3, 3], *turn]
+        told = all(each.identifiable for each in fitted[6:])
+        stem = fitted[0].name.removesuffix(BASE_NAMES[0])
+        return fitted[:6] + tuple(
+            Parameter(
+                name=stem + name,
+                value=float(found[i]),
+                nominal=float(was[i]),
+                sigma=float(np.sqrt(spread[i, i])) if told else np.nan,
+                unit="m" if i < 3 else "rad",
+                identifiable=told,
+                reason="" if told else "same motion as links and base",
+            )
+            for i, name in enumerate(TOOL)
+        )
+
+    def placed(self, x: State, nominal: State) -> dict[str, Any]:
+        """Base in the measurement frame, measured frame in the flange, and the lever."""
+        out: dict[str, Array] = {}
+        for stem, each in (("", x), ("nominal_", nominal)):
+            state = self.arm_state(each)
+            out |= {f"{stem}base": state.base, f"{stem}tool": self.tool(state)[1]}
+        return {name: pose_to_dict(pose) for name, pose in out.items()} | {
+            "lever_mm": 1e3 * self.lever
+        }
