@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 from scipy.io import loadmat
 
+from experiments import real
 from minimax_cal.fitting.minimax_problem import measured_distances, minimax_problem
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.simulate import simulate
@@ -18,7 +18,7 @@ from minimax_cal.solvers import minimax
 from qp_backends import Problem, Solution
 from qp_backends import solve as solve_qp
 
-SHARED = Path(__file__).parents[2] / "shared" / "data" / "maros_meszaros"
+SHARED = real.SHARED / "maros_meszaros"
 
 
 @dataclass(frozen=True, eq=False)

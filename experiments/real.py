@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import os
+from functools import cache
 from pathlib import Path
 
+import click
+
+from minimax_cal.measuring.datasets import FOLDER
 from minimax_cal.measuring.measurements import Measurements, read_measurements
 from minimax_cal.robots.robot import Robot, load_robot
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
+SHARED = Path(os.environ.get(FOLDER) or Path(__file__).parents[2] / "shared" / "data")
 
 
 def here(name: str) -> bool:
-    """Whether the measurements of an arm, as irb120, are on this machine."""
-    return (SHARED / name).is_dir()
+    """Whether the measurements of an arm, as irb120, are on this machine; says so if not."""
+    there = (SHARED / name).is_dir()
+    if not there:
+        report_absent(name)
+    return there
+
+
+@cache
+def report_absent(name: str) -> None:
+    """Say once that an arm takes no part, and where its measurements can be had."""
+    click.echo(f"{name} takes no part: no {SHARED / name}; docs/data.md has its source", err=True)
 
 
 def real(name: str) -> tuple[Robot, Measurements]:

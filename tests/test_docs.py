@@ -278,8 +278,8 @@ def figured_pages() -> dict[str, str]:
     """Text of each page by name whose figures a study prints."""
     texts = {page.stem: page.read_text(encoding="utf-8") for page in DOCS.glob("*.md")}
     shown = (name for name, text in texts.items() if re.search(r"-m experiments[ .][a-z]", text))
-    # the list is compared with what the command writes, and mathematics has no figures
-    return {name: texts[name] for name in shown if name not in ("errata", "mathematics")}
+    # the list is compared with what the command writes; mathematics and data have no figures
+    return {name: texts[name] for name in shown if name not in ("errata", "mathematics", "data")}
 
 
 def test_every_page_of_figures_is_of_one_version() -> None:
