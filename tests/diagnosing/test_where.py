@@ -21,11 +21,9 @@ from minimax_cal.diagnosing.where.mean_squares import (
     shape_scatter,
 )
 from minimax_cal.diagnosing.where.residual import (
-    joint_rows,
     residual_of,
 )
-from minimax_cal.diagnosing.where.significance import flips, score_flips, structure_by_pose
-from minimax_cal.diagnosing.where.smooth import factors, levelled, smooth_rows
+from minimax_cal.diagnosing.where.significance import flips, score_flips
 from minimax_cal.evidence.evened import TOGETHER, evened, times_before
 from minimax_cal.evidence.noise import orthonormal
 from minimax_cal.ground.arrays import Array
@@ -133,30 +131,6 @@ def test_flips_against_flipping(features: int, rng: np.random.Generator) -> None
         assert_allclose(score_flips(at, score), flips(at, score @ score.T), rtol=1e-6)
 
 
-def test_factors_make_the_kernel(rng: np.random.Generator) -> None:
-    x = rng.normal(size=(30, 3))
-    square = (x[:, None] - x[None]) ** 2
-    kernel = np.exp(-0.5 * square).mean(-1) + np.exp(-square.mean(-1))
-    found = factors(x, 30)
-    assert_allclose(found @ found.T, kernel, atol=2e-6)
-    few = factors(x, 10)
-    assert few.shape == (30, 10)
-    assert np.trace(kernel - few @ few.T) < 0.35 * np.trace(kernel)
-
-
-# ---------------------------------------------------------------- structure
-
-
-@cache
-def kernel() -> tuple[Array, Array]:
-    """Features of the scene without what the fit spans: (m, 9, r), levelled and as they are."""
-    made = scene()
-    bare = residual_of(np.zeros(made.shape), made.jacobian, groups(made.data))
-    motion = joint_rows(made.joint_jacobian, np.ones((made.data.poses, 9), dtype=bool))
-    rows = bare.without_fit(smooth_rows(made.data, motion))
-    return levelled(rows), rows
-
-
 def smooth_error(made: Scene, rng: np.random.Generator, size: float) -> Array:
     """A gear error at a joint with |projected effect| = size."""
     joint, turns, phase = rng.integers(6), rng.integers(1, 3), rng.uniform(0, 6.3)
@@ -164,33 +138,6 @@ def smooth_error(made: Scene, rng: np.random.Generator, size: float) -> Array:
     dq[:, joint] = np.cos(turns * made.data.q[:, joint] + phase)
     left = made.fitted(made.turned(dq))
     return np.asarray(size * left / np.linalg.norm(left))
-
-
-def test_structure_finds_smooth_effects() -> None:
-    """Effects as strong as lambda = 60 [sum (effect / sigma)^2], half of what 1035 rows of noise
-    scatter by twice their standard deviation, are seen nearly always."""
-    made, (rows, plain) = scene(), kernel()
-    found, steep = [], []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        error = made.noise(rng) + smooth_error(made, rng, math.sqrt(60.0) * SIGMA)
-        rest = residual_of(error, made.jacobian, groups(made.data))
-        found.append(structure_by_pose(rest, rows))
-        steep.append(structure_by_pose(rest, plain))
-    assert np.mean(np.array(found) < 0.05) > 0.85
-    assert np.median(found) < 0.3 * np.median(steep)  # what `levelled` is for
-
-
-def test_jitter_of_the_joints_is_not_structure() -> None:
-    """Poses may scatter as they like, alike for all their targets."""
-    made, (rows, _) = scene(), kernel()
-    p = []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(seed)
-        error = made.noise(rng) + made.turned(20e-6 * rng.normal(size=(made.data.poses, 6)))
-        rest = residual_of(error, made.jacobian, groups(made.data), made.joint_jacobian, SIGMA)
-        p.append(structure_by_pose(rest, rows))
-    assert by_chance(p)
 
 
 # ---------------------------------------------------------------- nothing there
@@ -206,7 +153,6 @@ def test_white_noise_lies_nowhere() -> None:
         for gap in found.by_joint:
             p.setdefault(gap.joint, []).append(gap.p)
         p.setdefault("order", []).append(found.order.p)
-        p.setdefault("structure", []).append(found.structure)
         for name in ("shape", "repeat", "pose"):
             p.setdefault(name, []).append(getattr(found.triage, name).p)
         shares.append([part.share for part in vars(found.triage).values()])
@@ -240,7 +186,6 @@ def test_compliance_of_a_joint_appears_at_that_joint() -> None:
     assert np.argmax(share) == 1
     assert share[1] > 0.5
     assert found.by_joint[1].p < 1e-6
-    assert found.structure < 1e-6
     assert found.triage.pose.share > 0.9
     assert found.order.p > 1e-3
 
@@ -474,7 +419,6 @@ def test_one_target_a_row(rng: np.random.Generator) -> None:
     found = made.where(error)
     assert sum(gap.points for gap in found.by_target) == made.data.poses
     assert found.triage.to_dict()["shape"] is None
-    assert found.structure < 0.01
 
 
 def test_a_slide_is_in_millimetres(rng: np.random.Generator) -> None:
@@ -491,7 +435,6 @@ def test_a_slide_is_in_millimetres(rng: np.random.Generator) -> None:
 def test_no_error_at_all() -> None:
     made = scene()
     found = made.where(np.zeros(made.shape), fit=False)
-    assert found.structure == 1.0
     assert all(gap.share == 0.0 for gap in found.by_joint)
     json.dumps(found.to_dict(), allow_nan=False)
 
@@ -531,7 +474,6 @@ def test_a_real_arm() -> None:
     found = where(data, error, joint_jacobian, cell.base, math.nan, fitted=jacobian)
     share = {gap.joint: gap.share for gap in found.by_joint}
     assert max(share, key=lambda joint: share[joint]) in ("J2", "J3")
-    assert found.structure < 1e-12
     assert found.noise < 30e-6
     json.dumps(found.to_dict(), allow_nan=False)
 

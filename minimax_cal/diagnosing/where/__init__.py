@@ -2,7 +2,7 @@
 
 Nothing here knows a displacement law.  Errors are cut by target, joint, direction, region and visit
 order; mean squares tell the instrument's noise, the targets' scatter against each other, the
-scatter between revisits and the static rest apart; a kernel test tells whether structure is left.
+scatter between revisits and the static rest apart.
 """
 
 from minimax_cal.diagnosing.where.answer import Where, triage_table

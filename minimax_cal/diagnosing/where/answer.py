@@ -133,7 +133,7 @@ class Triage:
 class Where:
     """Where the errors of a fit lie.
 
-    by_direction: RMS per axis [m].  structure: p that residuals are unrelated to the joint values.
+    by_direction: RMS per axis [m].
     noise: of the instrument, per coordinate, given or estimated, NaN if neither [m].
     turn: (m, n) joint-equivalent residual, see `joint_equivalent` [rad, m].
     """
@@ -145,7 +145,6 @@ class Where:
     order: Trend
     temperature: Trend
     triage: Triage
-    structure: float
     noise: float
     turn: Array
 
@@ -181,7 +180,6 @@ class Where:
                 "temperature": self.temperature.to_dict(),
             },
             "triage": self.triage.to_dict(),
-            "structure_p": plain(self.structure),
             "noise_mm": plain(1e3 * self.noise),
         }
 

@@ -10,13 +10,10 @@ from minimax_cal.diagnosing.where.answer import Where
 from minimax_cal.diagnosing.where.cuts import by_direction, by_region, by_target
 from minimax_cal.diagnosing.where.mean_squares import noise_of, triage
 from minimax_cal.diagnosing.where.residual import NO_FIT, base_rows, joint_rows, residual_of
-from minimax_cal.diagnosing.where.significance import structure_by_pose
 from minimax_cal.diagnosing.where.smooth import (
     by_joint,
     clock,
     joint_equivalent,
-    levelled,
-    smooth_rows,
     trend,
 )
 from minimax_cal.ground.arrays import Array
@@ -67,7 +64,6 @@ def where(
         order=trend(rest, shared, clock(data)),
         temperature=trend(rest, shared, hot),
         triage=triage(data, rest, noise, known, dof),
-        structure=structure_by_pose(rest, levelled(rest.without_fit(smooth_rows(data, motion)))),
         noise=known,
         turn=turn,
     )

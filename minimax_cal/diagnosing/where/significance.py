@@ -22,7 +22,7 @@ def explained(rest: Residual, features: Array, size: float) -> tuple[float, floa
     """Share of the residual's energy that features (m, 3k, r) explain, and p that it is chance.
 
     Share: that of the least-squares fit less what unrelated poses would give it, so that it is 0 on
-    average where there is nothing.  p: as `structure_by_pose`.  The features must be without what
+    average where there is nothing.  p: as `score_flips`.  The features must be without what
     was fitted; size: energy of one before, to tell which are nothing now.
     """
     flat = flat_of(features)
@@ -39,18 +39,6 @@ def explained(rest: Residual, features: Array, size: float) -> tuple[float, floa
     expected = float(((left**2).sum(1) / (1.0 - lever)).sum())
     share = (float(pull @ pull) - expected) / total
     return min(1.0, max(0.0, share)), score_flips(float(pull @ pull), score)
-
-
-def structure_by_pose(rest: Residual, features: Array) -> float:
-    """p that poses (groups of revisits) have residuals unrelated to the features (m, 3k, r).
-
-    U = |F'r|^2 sums s_g's_h over all pairs of poses, s_g = F_g'r_g.  Signs of whole poses are
-    flipped in thought (see `flips`), so that nothing is assumed about noise or jitter but that
-    poses are independent.
-    """
-    bare = rest.without_fit(features)
-    pull, score = scores(rest, bare)
-    return score_flips(float(pull @ pull), score)
 
 
 def scores(rest: Residual, features: Array) -> tuple[Array, Array]:
@@ -74,7 +62,12 @@ def flips(total: float, gram: Array) -> float:
 
 
 def score_flips(total: float, score: Array) -> float:
-    """`flips` with gram = score score', for fewer features than poses.  score: (g, r)."""
+    """`flips` with gram = score score', for fewer features than poses.  score: (g, r).
+
+    U = |F'r|^2 sums s_g's_h over all pairs of poses, s_g = F_g'r_g.  Signs of whole poses are
+    flipped in thought, so that nothing is assumed about noise or jitter but that poses are
+    independent.
+    """
     if len(score) <= score.shape[1]:
         return flips(total, score @ score.T)
     own = (score**2).sum(axis=1)

@@ -13,7 +13,6 @@ from minimax_cal.ground.arrays import Array, rms
 from minimax_cal.measuring.measurements import Measurements
 
 WAVES = 6  # half-waves over the range of a joint that count as smooth
-RANK = 24  # features of the kernel over the joints
 
 
 def scaled(x: Array) -> Array:
@@ -31,65 +30,6 @@ def products(motion: Array, feature: Array) -> Array:
     """Every motion (m, 3k, n) times every feature of the pose (m, r): (m, 3k, n r)."""
     m, wide, _ = motion.shape
     return (motion[..., None] * feature[:, None, None, :]).reshape(m, wide, -1)
-
-
-def circles(data: Measurements) -> Array:
-    """Joint values as points whose distance a kernel may use: (m, n, 2), a turn is a circle."""
-    spread = np.maximum(data.q.std(axis=0), 1e-12)
-    slide = np.stack([data.q / spread, np.zeros_like(data.q)], axis=-1)
-    turn = np.stack([np.cos(data.q), np.sin(data.q)], axis=-1)
-    return np.where(data.sliding[:, None], slide, turn)
-
-
-def smooth_rows(data: Measurements, motion: Array) -> Array:
-    """Features (m, 3k, r) that span smooth motions of the joints, for `structure_by_pose`.
-
-    Every joint moves by a random function of its own value and by one of all values, of equal
-    energy; joints weigh alike, wrist or shoulder.  motion: (m, 3k, n) as `joint_rows`.
-    """
-    even = motion / np.maximum(np.sqrt((motion**2).mean(axis=(0, 1))), 1e-12)
-    fade = 1.0 / np.arange(1, WAVES + 1)
-    wave = np.stack([waves(column, WAVES - 1, start=0) * fade for column in data.q.T])
-    own = np.einsum("mrj,jmw->mrjw", even, wave).reshape(*motion.shape[:2], -1)
-    shared = products(even, factors(circles(data), RANK, width=2.0))
-    parts = [part / max(float(np.sqrt((part**2).sum())), 1e-300) for part in (own, shared)]
-    return np.concatenate(parts, axis=2)
-
-
-def levelled(features: Array) -> Array:
-    """F (..., r) with the kernel FF' replaced by its square root: weaker directions count more.
-
-    Apply it after the fit was taken out.  A smooth kernel otherwise looks at its first few
-    directions only; most of those the geometric fit has taken.
-    """
-    flat = features.reshape(-1, features.shape[-1])
-    value, vector = np.linalg.eigh(flat.T @ flat)
-    kept = value > 1e-6 * max(float(value[-1]), 1e-300)
-    turned = flat @ (vector[:, kept] * value[kept] ** -0.25)
-    return np.asarray(turned.reshape(*features.shape[:-1], -1))
-
-
-def factors(coordinates: Array, rank: int, width: float = 1.0) -> Array:
-    """F (m, <= rank) with F F' nearly a kernel K over the poses.
-
-    K(a, b) = mean_i exp(-|a_i - b_i|^2 / 2 w^2) + exp(-mean_i |a_i - b_i|^2 / w^2), for functions
-    of one coordinate each and of all together.  coordinates: (m, c, d), c of d numbers each, or
-    (m, c), in units in which `width` is a small step.  Pivoted Cholesky: Nystroem at the poses that
-    tell most [Harbrecht, Peters & Schneider 2012].
-    """
-    x = coordinates[..., None] if coordinates.ndim == 2 else coordinates
-    left, columns = np.full(len(x), 2.0), np.zeros((min(rank, len(x)), len(x)))
-    for i in range(len(columns)):
-        pivot = int(np.argmax(left))
-        if left[pivot] < 1e-6:
-            return columns[:i].T
-        off = ((x - x[pivot]) ** 2).sum(-1) / width**2
-        column = np.exp(-0.5 * off).mean(-1) + np.exp(-off.mean(-1))
-        column -= columns[:i, pivot] @ columns[:i]
-        columns[i] = column / math.sqrt(left[pivot])
-        left = np.maximum(left - columns[i] ** 2, 0.0)
-        left[pivot] = 0.0
-    return columns.T
 
 
 def joint_equivalent(error: Array, jacobian: Array, noise: float) -> Array:
