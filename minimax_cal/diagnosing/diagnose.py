@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -39,7 +41,7 @@ from minimax_cal.diagnosing.last_question import answered, known_noise
 from minimax_cal.diagnosing.moved import session_notices
 from minimax_cal.diagnosing.remainder import remainder
 from minimax_cal.diagnosing.reseats import sized, with_targets
-from minimax_cal.diagnosing.result import Diagnosis, Step
+from minimax_cal.diagnosing.result import Diagnosis, Finding, Step
 from minimax_cal.diagnosing.set_aside import judged_with
 from minimax_cal.diagnosing.study import SUM, Study, studied
 from minimax_cal.diagnosing.tails import are_wrong, unpulled, wrong_rows
@@ -194,6 +196,15 @@ class DiagnosisOptions:
     exclude: tuple[str, ...]
     quick: bool
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """For the file."""
+        return vars(self) | {"exclude": list(self.exclude)}
+
+    def step_of(self, progress: Progress, name: str) -> Progress:
+        """Progress of one of STEPS."""
+        return number_step(progress, STEPS.index(name) + 1, len(STEPS) - self.quick, name)
+
 
 @dataclass(frozen=True, eq=False)
 class Asked:
@@ -214,24 +225,18 @@ class Asked:
 def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: float) -> Diagnosis:
     """The diagnosis of checked measurements.  began: when the work did [s]."""
     robot, options = asked.robot, asked.options
-    count = len(STEPS) - options.quick
-
-    def step_of(name: str) -> Progress:
-        return number_step(progress, STEPS.index(name) + 1, count, name)
-
+    step_of = partial(options.step_of, progress)
     clean = cleaned(asked, step_of(FAULTY))
     train = asked.train(clean.data)
     judges = judges_of(asked, clean, train)
-    study = studied(robot, train, clean.fit or fit_cell(robot, train, SUM, progress))
-    study = replace(study, moments=clean.moments)
+    fit = clean.fit or fit_cell(robot, train, SUM, progress)
+    study = replace(studied(robot, train, fit), moments=clean.moments)
     workers = asked.jobs, asked.cluster
     study, causes = causes_of(study, clean.faults, options.exclude, step_of(CAUSES), *workers)
     causes, spoken, ladder = in_rungs(study, causes, step_of(BUDGET))
-    noise = causes.choice.noise
     last, late = judges.marked(ladder.fits[0].cell, ladder.last.cell)
     steps = steps_of(asked, study, last, spoken, ladder)
-    for step in steps:
-        progress(name_rung(name_step(step.name), step.holdout.rms_mm))
+    tell_steps(steps, progress)
     floor = floor_beneath(robot, clean.data, ladder.last, steps[-1])
     share, interval = closed(ladder, last, floor, options.seed)
     effects = valued(spoken.effects, ladder)
@@ -239,15 +244,11 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     step_of(REMAINING)
     rest = remainder(ladder.last, floor)
     verdict, structure_left = judged(findings, causes)
-    noise = replace(noise, variance=study.uneven * noise.variance)  # of a mean coordinate
     known = known_noise(ladder.last, floor, clean.data, robot.repeatability)
     verdict, unexplained = answered(verdict, structure_left[0], findings, known)
-    beyond = NOT_ASKED
-    if not options.quick:
-        beyond = beyond_of(study, causes, judges, options.holdout_by, step_of(PARTS))
+    beyond = NOT_ASKED if options.quick else beyond_of(study, causes, judges, step_of(PARTS))
     wrong = against(robot, floor, steps[-1])
     gone, counted = judged_with(asked.data, clean.data, clean.left, judges.held, ladder.last.cell)
-    settings = vars(options) | {"exclude": list(options.exclude)}
     return Diagnosis(
         robot=robot.name,
         status=Status.FAILED if wrong else study.fit.status,
@@ -258,8 +259,8 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         closed=share,
         closed_ci=interval,
         beyond=beyond,
-        noise=float(np.sqrt(noise.variance)),
-        jitter=noise.jitter,
+        noise=float(np.sqrt(study.uneven * causes.choice.noise.variance)),  # of a mean coordinate
+        jitter=causes.choice.noise.jitter,
         structure=structure_left[1],
         structure_in=unexplained,
         where=located(study).to_dict(),
@@ -267,14 +268,10 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
         notices=(
             *asked.data.notices,
             *notices,
-            *notices_of(study, clean, ladder, late),
-            *session_notices(study, effects),
-            *study.fit.notices,
-            *foot_notices(ladder.last, clean.data),
-            *doubts(robot, study.fit, study.nominal.error(study.data)),
+            *notices_of(study, clean, ladder, late, effects),
             *filter(None, [wrong]),
         ),
-        provenance=Provenance.of(robot, asked.data, settings),
+        provenance=Provenance.of(robot, asked.data, options.settings),
         seconds=time.perf_counter() - began,
         data=study.geometric.placed(clean.data),
         held=~np.isin(clean.data.line, train.line),
@@ -287,14 +284,23 @@ def examined(asked: Asked, notices: tuple[str, ...], progress: Progress, began: 
     )
 
 
-def notices_of(study: Study, clean: Clean, ladder: Ladder, late: tuple[str, ...]) -> Iterator[str]:
-    """What the reader should know about the data.  late: outliers that the gap had hidden."""
+def notices_of(
+    study: Study, clean: Clean, ladder: Ladder, late: tuple[str, ...], effects: Sequence[Finding]
+) -> Iterator[str]:
+    """What the reader should know.
+
+    late: outliers that the gap had hidden.  effects: with the values of the last fit.
+    """
     yield from clean.remarks
     yield from filter(None, [study.scene.unused_torques])
     if late:
         yield f"outliers that no effect found explains: {name_first(late)}"
     every = ladder.last.cell.placed(clean.given)
     yield from contradictions(every, ladder.last.cell.error(every))
+    yield from session_notices(study, effects)
+    yield from study.fit.notices
+    yield from foot_notices(ladder.last, clean.data)
+    yield from doubts(study.robot, study.fit, study.nominal.error(study.data))
 
 
 def in_rungs(study: Study, causes: Causes, progress: Progress) -> tuple[Causes, Causes, Ladder]:
@@ -365,13 +371,19 @@ def steps_of(
     return steps
 
 
+def tell_steps(steps: Sequence[Step], progress: Progress) -> None:
+    """Each step of the budget with its held-out error."""
+    for step in steps:
+        progress(name_rung(name_step(step.name), step.holdout.rms_mm))
+
+
 def judges_of(asked: Asked, clean: Clean, train: Measurements) -> Judges:
     """Who judges: every held-out point as measured, those that stand out marked."""
     held = asked.data.take(asked.held)
     right = dict(zip(clean.given.line, clean.given.y, strict=True))
     held = held.with_y(np.array([right.get(line, held.y[i]) for i, line in enumerate(held.line)]))
     sound = of_lines(held.line, clean.data.line, clean.data.seen).T
-    return Judges(train, held, held.seen.T & ~sound)
+    return Judges(train, held, held.seen.T & ~sound, asked.options.holdout_by)
 
 
 def against(robot: Robot, floor: Floor, last: Step) -> str:

@@ -49,18 +49,13 @@ def fold_errors(
     return fits[-1].cell.error(left), fits[0].cell.error(left)
 
 
-def beyond_of(
-    study: Study, causes: Causes, judges: Judges, by: str | None, progress: Progress
-) -> Beyond:
-    """Every part of the poses judges a model that was sought without it.
-
-    by: whose groups are the parts, as in `grouping.parts`.
-    """
+def beyond_of(study: Study, causes: Causes, judges: Judges, progress: Progress) -> Beyond:
+    """Every part of the poses judges a model that was sought without it."""
     data = judges.everyone
     known = not_claimed(study.robot, study.data)
     if known.narrow:
         return known
-    found = parts(data, by)
+    found = parts(data, judges.by)
     masks = [np.isin(study.data.line, data.line[part.rows]) for part in found]
     estimator = Estimator(
         study.model.only(study.fit.identification.active), np.ones(len(study.model.y))

@@ -239,12 +239,14 @@ def motions(scene: Scene, finding: Finding) -> tuple[float, ...]:
 class Judges:
     """Poses that judge: those of the fit, those held out, and points held out that stand out.
 
-    far: (k, m) True for points of `held` that no sound arm shows.
+    far: (k, m) True for points of `held` that no sound arm shows.  by: whose groups are left out
+    in turn, as in `grouping.parts`.
     """
 
     train: Measurements
     held: Measurements
     far: Array
+    by: str | None = None
 
     @property
     def whole(self) -> Measurements:

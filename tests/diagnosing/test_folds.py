@@ -57,7 +57,7 @@ def test_every_part_is_left_out_and_judges(
         return SimpleNamespace(fits=[SimpleNamespace(cell=cell) for cell in reversed(cells)])
 
     monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, ALONE, judges, None, told.append)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, judges, told.append)  # type: ignore[arg-type]
     every = judges.everyone
     left_out = parts(every)
     assert [one.where for one in found.folds] == [part.name for part in left_out]
@@ -85,11 +85,11 @@ def test_a_part_that_the_fit_needs_judges_nothing(
 
     monkeypatch.setattr(folds, "fold_of", fold)
     monkeypatch.setattr(folds, "without", some)
-    found = beyond_of(play, ALONE, judges, None, silent)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, judges, silent)  # type: ignore[arg-type]
     assert [one.where for one in found.folds] == [p.name for p in parts(judges.everyone)][1:]
     monkeypatch.setattr(folds, "parts", lambda data, by: ())
     monkeypatch.setattr(folds, "without", plain)
-    nothing = beyond_of(play, ALONE, judges, None, silent)  # type: ignore[arg-type]
+    nothing = beyond_of(play, ALONE, judges, silent)  # type: ignore[arg-type]
     assert nothing.folds == ()
     assert nothing.reason == "the poses are too few or too much alike"
 
@@ -111,10 +111,10 @@ def test_a_session_left_out_has_no_frame(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(folds, "fold_of", fold)
     every = tuple(f"session {name}" for name in "abc")
-    found = beyond_of(study, ALONE, judges, None, silent)  # type: ignore[arg-type]
+    found = beyond_of(study, ALONE, judges, silent)  # type: ignore[arg-type]
     assert found.missed == every
     assert found.folds
-    grouped = beyond_of(study, ALONE, judges, "session", silent)  # type: ignore[arg-type]
+    grouped = beyond_of(study, ALONE, replace(judges, by="session"), silent)  # type: ignore[arg-type]
     assert len(grouped.missed) == 3
     assert not grouped.folds
 
@@ -126,7 +126,7 @@ def test_groups_that_are_named_are_the_parts(
         return SimpleNamespace(fits=[SimpleNamespace(cell=play.geometric)])
 
     monkeypatch.setattr(folds, "fold_of", fold)
-    found = beyond_of(play, ALONE, judges, "region", silent)  # type: ignore[arg-type]
+    found = beyond_of(play, ALONE, replace(judges, by="region"), silent)  # type: ignore[arg-type]
     known = [part.name for part in parts(judges.everyone, "region")]
     assert [one.where for one in found.folds] == known
     assert all(name.startswith("the region of line") for name in known)
