@@ -28,7 +28,7 @@ from minimax_cal.diagnosing.remainder import (
     gain_chance,
 )
 from minimax_cal.diagnosing.result import Finding
-from minimax_cal.evidence.limits import NEARLY
+from minimax_cal.evidence.limits import GAIN_LEVEL, NEARLY, NEEDLESS, ONE_WAVE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.modelling.effects.gears import GEAR_RIPPLE, sweeping
 from minimax_cal.modelling.effects.maps import FINEST, JOINT_ERROR_MAP, range_of, sines
@@ -36,11 +36,8 @@ from minimax_cal.modelling.effects.scene import BESIDE, Effect, Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.periodogram import Line, elsewhere, expected
 
-LEVEL = 1e-3  # chance that groups gain so much by a map of a joint that has none
 USUAL = 1e-3  # size of slow laws [rad]
 SLOW = 4.0  # waves a turn of the slowest that is called a ripple
-ONE_WAVE = 0.9  # share of a curve's square that makes it a wave
-NEEDLESS = 2e-2  # of what maps and laws of these angles explain: a rise that is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +136,7 @@ def fine_waves(fit: Joint, left: Left) -> list[Found]:
     for block, turns, tries in waiting:
         wide = at.with_block(block)
         chance = asked * tries * gain_chance(at, wide, left.group)
-        if chance < LEVEL:
+        if chance < GAIN_LEVEL:
             out.append(Found(block, chance, Term(GEAR_RIPPLE.name, block.place, {"turns": turns})))
             at = wide
     return out
@@ -182,7 +179,7 @@ def chosen(fit: Joint, left: Left, beside: Sequence[Block]) -> list[Found]:
             plain = at.with_block(slow(left, waiting[number].place))
             each = [gain_chance(base, tried[number], left.group) for base in (at, plain)]
             chance = tries * max(each)
-            if chance < LEVEL:
+            if chance < GAIN_LEVEL:
                 at = tried[number]
                 out.append(Found(waiting.pop(number), chance))
                 break

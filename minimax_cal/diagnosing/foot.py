@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.joint import Joint
+from minimax_cal.evidence.limits import DISAGREE
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
 from minimax_cal.measuring.stations import moved, station
@@ -18,7 +19,6 @@ from minimax_cal.modelling.effects.words import name_effect
 
 BLOCKS = 10  # of the visits, left out in turn: what the law misses goes on for a while
 LEAST = 30  # poses at which a reflector was measured
-AGREE = 3.0  # sigmas of a difference that is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def foot_notices(fit: Joint, data: Measurements) -> Iterator[str]:
         spread = across @ np.nan_to_num(fit.uncertainty.covariance[own, own]) @ across.T
         own_sigma = np.sqrt(np.diag(spread))
         sigma = np.hypot(own_sigma, told.sigma)
-        wrong = np.abs(value - told.value) > AGREE * sigma
+        wrong = np.abs(value - told.value) > DISAGREE * sigma
         shown = ", ".join(
             f"{axis} {1e6 * a:+.0f} +- {1e6 * u:.0f} um named, "
             f"{1e6 * b:+.0f} +- {1e6 * s:.0f} um measured"

@@ -12,7 +12,7 @@ from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
 from minimax_cal.diagnosing.trial import Predicting, Trials
-from minimax_cal.evidence.limits import FOLDS
+from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
@@ -28,14 +28,9 @@ from minimax_cal.modelling.effects.scene import Scene, joint_of
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.parameters import State
 
-MINOR = 0.05  # of the squared held-out error that geometry leaves: less makes a cause minor
 RESAMPLES = 1000
-NOTHING = 0.95  # width of the 95 % interval of a share of which nothing is known
 FEWEST = 100  # of them that show a gap
 SPARED = 10  # groups of training poses that are left out in turn, for the interval
-HELPS = 1e-6  # relative fall of the error by groups that is one
-END = 0.2  # of the poses at an end of what drives an effect
-ALIKE = 0.5  # of a point's error, which geometry alone must see too if the point is wrong
 FAULTS = ("outliers", "swapped_rows", RESEAT)  # that are mended before anything is fitted
 
 Ends = tuple[float, float]
@@ -270,7 +265,7 @@ class Judges:
         whole = self.whole
         before, error = (cell.error(whole) for cell in (first, last))
         sound = mended(whole, standing_out(last.placed(whole), error)).seen
-        alike = (before * error).sum(axis=-1) > ALIKE * (error**2).sum(axis=-1)
+        alike = (before * error).sum(axis=-1) > SEEN_BEFORE * (error**2).sum(axis=-1)
         far = whole.seen & ~sound & alike.T
         points = [
             f"{whole.called(whole.line[row])} {whole.target_names[i]}"
@@ -348,7 +343,7 @@ def closed(ladder: Ladder, judges: Judges, floor: Floor, seed: int) -> tuple[flo
 def told(share: float, ends: Ends) -> tuple[float, Ends]:
     """The same between 0 and 1, without an interval that says nothing."""
     low, high = np.clip(ends, 0.0, 1.0).tolist()
-    if not high - low < NOTHING:
+    if not high - low < SAYS_NOTHING:
         low = high = float("nan")
     return float(np.clip(share, 0.0, 1.0)), (low, high)
 

@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from minimax_cal.diagnosing.joint import Joint
 from minimax_cal.diagnosing.remainder import joint_units
 from minimax_cal.diagnosing.result import Finding
-from minimax_cal.evidence.limits import MAX_JOINT_JITTER
+from minimax_cal.evidence.limits import MAX_JOINT_JITTER, MAX_OVER_NOISE
 from minimax_cal.fitting.intervals import rms_interval
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import noise_between
@@ -24,7 +24,6 @@ from minimax_cal.measuring.floor import REPEATS, Floor, least_scatter, of_coordi
 from minimax_cal.measuring.grouping import clusters
 from minimax_cal.measuring.measurements import Measurements
 
-MAX_OVER_NOISE = 1.1  # error, or scatter of visits, over the noise that may be: less is no matter
 ABOVE_NOISE = "the remaining error is above the known noise"
 ONLY_MINOR = "every confirmed cause is minor, and the remaining error is above the known noise"
 

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.limits import ENOUGH
+from minimax_cal.evidence.limits import COVERED, ENOUGH, HELPFUL, NO_POWER
 from minimax_cal.evidence.noise import Noise, identified
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.measurements import Measurements
@@ -29,12 +29,9 @@ MORE, AGAIN = (10, 20, 40, 80), (10, 20, 40)  # poses of a proposal
 MINUTE = 1.0  # to move, settle and measure all targets of a pose [min]
 PREPARE = {"more": 0.0, "late": 5.0, "side": 5.0, "load": 15.0, "foot": 20.0}  # once [min]
 GOLDEN = 0.6180339887498949
-COVERED = 0.8  # share of a joint's range that counts as the whole
 STEP = 0.1  # move by which a pose is approached from its other side [rad, m]
 LOAD = 0.03  # payload that is proposed, as a share of the arm's mass
 FOOT = 0.2  # radius of the reflectors on the foot, as a share of the reach
-HELPFUL = 0.5  # share of `ENOUGH` below which nothing is proposed
-NOTHING = 0.01  # power that no proposal exceeds where a rival includes the effect
 SAME = 1e-6  # relative change of a field below which a proposal does not concern an effect
 
 
@@ -482,7 +479,7 @@ def separate_with(site: Site, pair: Pair) -> str:
         if advice.power >= ENOUGH:
             return advice.text
     best = max(advices, key=lambda advice: advice.power)
-    if pair.one.effect == pair.other.effect and best.power < NOTHING:
+    if pair.one.effect == pair.other.effect and best.power < NO_POWER:
         return "no measurement can: one includes the other; more poses show what it has besides"
     raises = f"raises the power to {best.power:.2g} of the {ENOUGH:.0f} needed"
     if best.power < HELPFUL * ENOUGH:

@@ -22,7 +22,7 @@ from scipy.spatial.distance import cdist
 
 from minimax_cal.diagnosing.gap import folds
 from minimax_cal.diagnosing.joint import Joint
-from minimax_cal.evidence.limits import FOLDS
+from minimax_cal.evidence.limits import FAR_OUT, FOLDS, GAIN_LEVEL, LEAST_SWEEP
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.floor import Floor
 from minimax_cal.measuring.grouping import clusters
@@ -30,15 +30,12 @@ from minimax_cal.modelling.effects.maps import range_of, sines, spread, waves_ov
 from minimax_cal.modelling.effects.scene import Scene
 
 FEWEST = 10  # groups that can say anything
-LEVEL = 1e-3  # chance that groups gain so much by one block that tells nothing
 LENGTHS = np.radians([4.0, 8.0, 20.0, 60.0]).tolist()  # of a joint's curve [rad]
 SHAPES = list(product((5e-5, 2e-4, 8e-4), LENGTHS))  # its size, beside what is left, and length
-LEAST_SWEEP = np.radians(10.0)  # a joint must turn so far to have a curve
 LEAST_LEVER = 0.1  # of the largest: joints that move the targets less count so much
 CENTRES = 150  # poses about which the functions of all joints are built, at most
 WIDTHS = (1.0, 2.0, 4.0, 8.0)  # of them, in typical distances between those poses
 SHIFTS = (3e-5, 1e-4, 3e-4)  # sizes of the shift [m]
-FAR_OUT = 10.0  # times the median error of a pose: one that does not judge
 JITTER = 1e-8  # added to a correlation, so that it is one for any poses
 RIDGE = 1e-10  # of a parameter's own weight: what poses do not tell stays where it is
 
@@ -171,7 +168,7 @@ def climbed(left: Left) -> tuple[list[Beside], list[str]]:
         while waiting:
             tried = [rungs[-1].with_block(block) for block in waiting]
             best = min(range(len(tried)), key=lambda i: tried[i].square)
-            if gain_chance(rungs[-1], tried[best], left.group) > LEVEL:
+            if gain_chance(rungs[-1], tried[best], left.group) > GAIN_LEVEL:
                 break
             place = waiting[best].place
             waiting = [block for block in waiting if block.place != place]
@@ -213,7 +210,7 @@ class Block:
 def by_joint(left: Left) -> Iterator[Block]:
     """A turn of each joint that is smooth in its own angle; of a slide, in its place."""
     for j, q in enumerate(left.q.T):
-        if np.ptp(q) < LEAST_SWEEP:
+        if np.ptp(q) < np.radians(LEAST_SWEEP):
             continue
         low, high = range_of(q)
         count = max(min(waves_over(high - low), left.groups // 2), 1)

@@ -6,15 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from minimax_cal.evidence.limits import HEAVY, MAX_GAUSSIAN
 from minimax_cal.fitting.suspects import Scores, Spread, spread_of
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.faults import Fault, far_off
 from minimax_cal.measuring.faults.distances import between
 from minimax_cal.measuring.history import visits
 from minimax_cal.measuring.measurements import Measurements
-
-LARGE = 3.5  # times the median error: the largest of 10,000 Gaussian ones in space are 3.2 times it
-HEAVY = 10.0  # degrees of freedom of Student's t, and fewer: single points far off are usual
 
 
 def wrong_rows(data: Measurements, error: Array) -> Array:
@@ -40,7 +38,7 @@ def unpulled(error: Array, again: Callable[[], Array], data: Measurements) -> tu
     nor are poses that were visited one after the other.
     """
     size = np.linalg.norm(error, axis=-1)
-    if not np.nanmax(size, initial=0.0) > LARGE * np.nanmedian(size):
+    if not np.nanmax(size, initial=0.0) > MAX_GAUSSIAN * np.nanmedian(size):
         return ()
     robust = again()
     spread, far = judged(np.linalg.norm(robust, axis=-1), 3)

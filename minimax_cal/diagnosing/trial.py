@@ -16,6 +16,7 @@ import numpy as np
 
 from minimax_cal.diagnosing.sizes import unsized, weights_of
 from minimax_cal.diagnosing.study import Study
+from minimax_cal.evidence.limits import MAX_RISE
 from minimax_cal.fitting.beyond import needed, step_without
 from minimax_cal.fitting.uncertainty import Estimator, Linearised, Poses
 from minimax_cal.ground.arrays import Array
@@ -24,8 +25,6 @@ from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.solvers.bounded import bounded
 from minimax_cal.solvers.least_squares import solve_normal
-
-MAX_RISE = 1e-3  # of the training error, relative: more is worse
 
 
 class Predicting(ABC):

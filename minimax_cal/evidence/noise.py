@@ -12,13 +12,13 @@ from typing import Self
 
 import numpy as np
 
+from minimax_cal.evidence.limits import LEAST_NOISE_DOF
 from minimax_cal.evidence.ratios import likeliest
 from minimax_cal.ground.arrays import Array
 
 RANK = 1e-5  # singular value of the scaled Jacobian below which a direction is no direction
 SAME = 1e-12  # added to products of unit columns where some are the same
 ROUNDING = 0.1  # of the noise of computed rows: no variance is estimated below its square
-FREE = 3  # degrees of freedom below which no noise is told from another
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def restricted(rows: Problem, known: Array) -> Noise:
     """Noise by restricted maximum likelihood.  known: (N, q) further columns that are fitted."""
     columns = np.concatenate([rows.basis, known, rows.error[:, None]], axis=1)
     dof = rows.count - columns.shape[1] + 1
-    if dof < FREE:
+    if dof < LEAST_NOISE_DOF:
         return Noise(
             0.0,
             float(rows.error @ rows.error) / max(rows.count, 1) + (ROUNDING * rows.exact) ** 2,

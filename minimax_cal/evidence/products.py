@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from minimax_cal.evidence.noise import FREE, Noise, Problem, costs, noise_of, triangles
+from minimax_cal.evidence.limits import LEAST_NOISE_DOF
+from minimax_cal.evidence.noise import Noise, Problem, costs, noise_of, triangles
 from minimax_cal.evidence.ratios import NODES, RATIOS, interpolation, likeliest, nodes
 from minimax_cal.ground.arrays import Array
 
@@ -315,7 +316,7 @@ class Products:
     def estimated(self, index: Array) -> Noise:
         """The noise, computed."""
         rows, dof = self.columns.rows, self.dof(index)
-        if dof < FREE:
+        if dof < LEAST_NOISE_DOF:
             square = float(rows.error @ rows.error)
             return Noise(0.0, square / max(self.count, 1) + 1e-18, 0.0)
         chosen = np.concatenate([self.columns.fixed + index, [self.columns.fixed - 1]])

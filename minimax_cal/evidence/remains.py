@@ -16,12 +16,12 @@ from itertools import groupby
 import numpy as np
 
 from minimax_cal.evidence.evened import evened
+from minimax_cal.evidence.limits import AUDIBLE, SCATTERS
 from minimax_cal.evidence.noise import Noise, Problem
 from minimax_cal.ground.arrays import Array
 
 DRAWS = 499  # of rows, and of signs: the least p-value that is reported is 0.002
-AUDIBLE, ASKED = 0.5, 40  # chance above which none is asked about scatter, and how many at most
-SCATTERS = 0.05  # chance by flipped signs above which a motion scatters, and follows nothing
+ASKED = 40  # of the loudest, at most, are asked whether they scatter
 FOLLOWING = " following "  # between a place and what drives it
 SHOWN = 6  # components that are told at most
 

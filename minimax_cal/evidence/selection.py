@@ -29,15 +29,17 @@ from minimax_cal.evidence.library import Candidate, Library
 from minimax_cal.evidence.limits import (
     CONTENDERS,
     LEAST_DOF,
+    LEAST_NOISE_DOF,
     LEVEL,
     MOST,
     NEAR,
+    NEAR_SHARE,
     REFINED,
     SELDOM,
     TIE,
     TUNINGS,
 )
-from minimax_cal.evidence.noise import FREE, Noise
+from minimax_cal.evidence.noise import Noise
 from minimax_cal.evidence.products import Products
 from minimax_cal.evidence.sweeping import Grams
 from minimax_cal.ground.arrays import Array
@@ -219,11 +221,11 @@ def addition(
     best: Added | None = None
     least = against_signs(lib, fits, table.noise)
     seen: set[tuple[str, str]] = set()
-    room = table.dof - FREE  # parameters that rows can still tell
+    room = table.dof - LEAST_NOISE_DOF  # parameters that rows can still tell
     for one in table.everyone:
         if one.evidence <= 0.0 or len(one.candidate.main) > room:
             continue
-        if best and one.evidence < best.evidence - max(NEAR, 0.2 * best.gain):
+        if best and one.evidence < best.evidence - max(NEAR, NEAR_SHARE * best.gain):
             break
         if one.candidate.key in seen or repeated(one.candidate, table.chosen):
             continue

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from minimax_cal.evidence.noise import FREE, Noise, costs, noise_of, told_apart, triangles
+from minimax_cal.evidence.limits import LEAST_NOISE_DOF
+from minimax_cal.evidence.noise import Noise, costs, noise_of, told_apart, triangles
 from minimax_cal.evidence.products import LEAST, At, Columns
 from minimax_cal.ground.arrays import Array
 
@@ -93,7 +94,7 @@ class Swept:
     def estimated(self, index: Array) -> Noise:
         """The noise, computed."""
         rows, dof = self.columns.rows, self.dof(index)
-        if dof < FREE:
+        if dof < LEAST_NOISE_DOF:
             error = rows.error[self.kept]
             return Noise(0.0, float(error @ error) / max(self.count, 1) + 1e-18, 0.0)
         chosen = np.concatenate([1 + index, [0]])

@@ -15,7 +15,6 @@ from experiments.machines import Asked
 from experiments.machines import make as machine
 from minimax_cal.diagnosing import gap
 from minimax_cal.diagnosing.gap import (
-    HELPS,
     RESAMPLES,
     SPARED,
     Judges,
@@ -37,7 +36,7 @@ from minimax_cal.diagnosing.joint import joint
 from minimax_cal.diagnosing.result import Finding, Step
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.diagnosing.trial import Trial
-from minimax_cal.evidence.limits import FOLDS
+from minimax_cal.evidence.limits import FOLDS, HELPS
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.accuracy import Accuracy, accuracy
 from minimax_cal.measuring.floor import REPEATS, Floor

@@ -149,7 +149,7 @@ def test_of_few_poses_or_of_computed_points_nothing_is_said(
     monkeypatch.setattr(scatter, "UNLIKE", 1.0)  # noises alike are weighed anew too
     made = drawn(plain, np.full(6, QUIET), POINT, POINT, 1)
     rows = 3 * made.scene.targets
-    few = -(-(made.rows.basis.shape[1] + LEAST_DOF) // rows)  # poses that are just enough
+    few = -(-(made.rows.basis.shape[1] + int(LEAST_DOF)) // rows)  # poses that are just enough
     for count in (few - 1, few):
         data = made.data.take(np.arange(made.scene.poses) < count)
         some = studied(made.robot, data, made.fit)

@@ -16,7 +16,8 @@ from minimax_cal.diagnosing.study import Study
 from minimax_cal.evidence.bench import bench
 from minimax_cal.evidence.dictionary import Dictionary, Spec
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.noise import FREE, Noise, Problem, orthonormal, remaining, restricted
+from minimax_cal.evidence.limits import LEAST_NOISE_DOF
+from minimax_cal.evidence.noise import Noise, Problem, orthonormal, remaining, restricted
 from minimax_cal.evidence.selection import NOTHING, Choice, select, tuned_again
 from minimax_cal.evidence.sweeping import COUNT, Grams, Swept, ratios_about
 from minimax_cal.ground.arrays import Array
@@ -110,10 +111,10 @@ def test_ratios_lie_about_those_of_the_whole() -> None:
 
 
 def test_few_rows_have_the_noise_of_their_mean_square(whole: Choice, rough: Study) -> None:
-    """Fewer than `FREE` degrees of freedom tell no two noises apart."""
+    """Fewer than `LEAST_NOISE_DOF` degrees of freedom tell no two noises apart."""
     number = np.arange(rough.scene.poses)
     parts = [Swept(whole.grams, rough.rows.at(number < count)) for count in (1, 2, 3)]
-    few = next(part for part in parts if part.dof(NOTHING) < FREE)
+    few = next(part for part in parts if part.dof(NOTHING) < LEAST_NOISE_DOF)
     noise, error = few.noise(NOTHING), rough.rows.error[few.kept]
     assert noise.ratio == noise.jitter == 0.0
     assert_allclose(noise.variance, float(error @ error) / few.kept.sum(), rtol=1e-6)

@@ -11,6 +11,7 @@ from scipy.stats import chi2, f
 from minimax_cal.diagnosing.where.answer import CANNOT_TELL, Part, Triage
 from minimax_cal.diagnosing.where.residual import Residual
 from minimax_cal.diagnosing.where.significance import flips
+from minimax_cal.evidence.limits import LEAST_SCATTER_DOF, TARGETS_SCATTER
 from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring.grouping import from_means, visits
 from minimax_cal.measuring.measurements import Measurements
@@ -51,7 +52,7 @@ def triage(data: Measurements, rest: Residual, noise: float, known: float, dof: 
     if given and shape_free >= 1.0:
         p = above(shape, shape_free, least, behind)
         told["shape"] = (max(0.0, shape / shape_free - known**2) * left, p)
-        if p < 0.01:
+        if p < TARGETS_SCATTER:
             least, behind = shape / shape_free, shape_free
     repeat, repeat_free, again = revisit_scatter(data)
     if repeat_free >= 1.0 and (given or shape_free >= 1.0):
@@ -69,7 +70,9 @@ def triage(data: Measurements, rest: Residual, noise: float, known: float, dof: 
 def above(energy: float, free: float, variance: float, behind: float) -> float:
     """p that energy / free is that large if its expectation is variance, known from `behind`."""
     ratio = energy / variance
-    return float(f.sf(ratio / free, free, behind) if behind < 1e9 else chi2.sf(ratio, free))
+    return float(
+        f.sf(ratio / free, free, behind) if math.isfinite(behind) else chi2.sf(ratio, free)
+    )
 
 
 def noise_of(data: Measurements) -> float:
@@ -78,12 +81,12 @@ def noise_of(data: Measurements) -> float:
     Distances: median over pairs of the robust scatter / sqrt(2).  NaN if there are neither.
     """
     off, weight = from_means(distances(data), np.zeros(data.poses, dtype=int))
-    if weight.sum() >= 8.0:
+    if weight.sum() >= LEAST_SCATTER_DOF:
         spread = [np.median(np.abs(c[w > 0])) for c, w in zip(off.T, weight.T, strict=True)]
         return float(np.median(spread)) * 1.4826 / math.sqrt(2.0)
     off, weight = from_means(data.y.reshape(data.poses, -1), visits(data))
     dof = float(weight.sum())
-    return math.sqrt(float((off**2).sum()) / dof) if dof >= 8.0 else math.nan
+    return math.sqrt(float((off**2).sum()) / dof) if dof >= LEAST_SCATTER_DOF else math.nan
 
 
 def pairs(k: int) -> Array:
