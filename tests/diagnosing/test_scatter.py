@@ -154,7 +154,7 @@ def test_of_few_poses_or_of_computed_points_nothing_is_said(
         data = made.data.take(np.arange(made.scene.poses) < count)
         some = studied(made.robot, data, made.fit)
         assert (weighed_anew(some, nothing(some)) is some) == (count < few)
-    spare = rows * few - made.rows.basis.shape[1] - LEAST_DOF
+    spare = rows * few - made.rows.basis.shape[1] - int(LEAST_DOF)
     columns = np.eye(rows * few)[:, : spare + 1]  # each known column costs a degree of freedom
     assert weighed_anew(some, columns[:, :spare]) is not some
     assert weighed_anew(some, columns) is some
