@@ -123,7 +123,8 @@ def features(found: mc.MotionDiagnosis, runs: Sequence[Run]) -> tuple[Array, Arr
     scene = columns.scene
     known = (logs.motion.q, logs.motion.qd, logs.motion.qdd, scene.load, scene.since_reversal)
     every = np.concatenate([part[logs.picked] for part in known], axis=1)
-    return np.concatenate([every, scene.held], axis=1), missed(model, logs, columns), logs.moving
+    bent = scene.bristles.reshape(len(every), -1)
+    return np.concatenate([every, bent], axis=1), missed(model, logs, columns), logs.moving
 
 
 def logs_of(arm: str, seed: int) -> tuple[Robot, Sequence[Run]]:

@@ -84,11 +84,12 @@ class LeftOut:
         return missed if self.normal.place[FRICTION].start not in index else self.less_held(missed)
 
     def less_held(self, missed: Array) -> Array:
-        """(R, n) the same less the friction that stays at rest, as the other folds show it."""
+        """(R, n) the same less the friction of bristles, as the other folds show it."""
         scene, out = self.normal.columns.scene, missed.copy()
         for f in range(len(self.gram)):
             rows = self.fold == f
-            out[rows] -= held_friction(scene, missed, ~rows) * scene.held[rows]
+            held = held_friction(scene, missed, ~rows)
+            out[rows] -= (held * scene.bristles[rows]).sum(axis=-1)
         return out
 
     def rms(self, missed: Array, moving: Array | None = None) -> Array:

@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from minimax_cal.dynamics.laws import Term
 from minimax_cal.dynamics.rows import Logs, Whitening
-from minimax_cal.dynamics.scene import Arm, Scene
+from minimax_cal.dynamics.scene import YIELD, Arm, Scene
 from minimax_cal.dynamics.search import RIDGE, Columns, least_squares
 from minimax_cal.ground.arrays import Array
 
@@ -52,7 +52,7 @@ class TorqueModel:
     """Torques of an arm, as fitted.
 
     body: of the fit.  terms: its laws, value: (d,) of each.  context: the body by which the laws
-    know load and friction.  held: (n,) friction that stays when a joint stops [unit of the log].
+    know load and friction.  held: (n, k) friction of each joint's bristles [unit of the log].
     delay: by which torques are logged after the motion [s].
     """
 
@@ -75,7 +75,7 @@ class TorqueModel:
         for term, value in zip(self.terms, self.value, strict=True):
             joints, rows = columns.rows_of(term)
             out[joints] += rows @ value
-        return np.asarray(out.T + self.held * columns.scene.held)
+        return np.asarray(out.T + (self.held * columns.scene.bristles).sum(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,18 +179,23 @@ class Normal:
         """The fit of the rigid body alone."""
         body = self.body(self.solve([RIGID]))
         arm = self.columns.scene.arm
-        return TorqueModel(name, arm, body, (), (), context, np.zeros(len(body.usual)), 0.0)
+        none = np.zeros((arm.robot.joints, len(YIELD)))
+        return TorqueModel(name, arm, body, (), (), context, none, 0.0)
 
 
 def held_friction(scene: Scene, missed: Array, rows: Array | None = None) -> Array:
-    """(n,) friction that stays when a joint stops, by what a fit misses (R, n); never below 0.
+    """(n, 2) friction of the bristles by what a fit misses (R, n); none below 0.
 
     rows: (R,) that count, all if None.
     """
-    some = slice(None) if rows is None else rows
-    held = scene.held[some]
-    size = np.maximum((held**2).sum(axis=0), 1e-300)
-    return np.asarray(np.maximum((held * missed[some]).sum(axis=0) / size, 0.0))
+    bent = scene.bristles if rows is None else scene.bristles[rows]
+    off = missed if rows is None else missed[rows]
+    gram, pull = np.einsum("rjk,rjl->jkl", bent, bent), np.einsum("rjk,rj->jk", bent, off)
+    size = np.maximum(np.einsum("jkk->jk", gram), 1e-300)
+    one = np.maximum(pull / size, 0.0)
+    alone = np.where(np.arange(2) == (one * pull).argmax(axis=1)[:, None], one, 0.0)
+    both = np.array([solve_scaled(*each) for each in zip(gram, pull, strict=True)])
+    return np.where((both >= 0.0).all(axis=1, keepdims=True), both, alone)
 
 
 def first_body(columns: Columns) -> Body:

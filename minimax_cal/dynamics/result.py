@@ -15,7 +15,7 @@ from pydantic import Field
 from minimax_cal.dynamics.laws import LAWS, USUAL, Term
 from minimax_cal.dynamics.model import Body, TorqueModel
 from minimax_cal.dynamics.probes import Unexplained
-from minimax_cal.dynamics.scene import Arm
+from minimax_cal.dynamics.scene import YIELD, Arm
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import CalibrationError
 from minimax_cal.ground.files import finite, json_of, json_text, read_text, write_whole
@@ -356,9 +356,9 @@ def model_of(content: Mapping[str, Any], arm: Arm) -> TorqueModel:
         for t in content["terms"]
     )
     value: tuple[Array, ...] = tuple(np.array(t["value"], dtype=float) for t in content["terms"])
+    held = np.array(content["held"], dtype=float).reshape(n, len(YIELD))
     return TorqueModel(content["name"], arm, body(content["body"]), terms, value,
-                       body(content["context"]), np.array(content["held"], dtype=float),
-                       float(content["delay"]))  # fmt: skip
+                       body(content["context"]), held, float(content["delay"]))  # fmt: skip
 
 
 class MotionPart(Part):

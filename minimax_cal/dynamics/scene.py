@@ -18,12 +18,13 @@ from minimax_cal.dynamics.regressor import (
     inverse_dynamics,
     regressor,
 )
-from minimax_cal.dynamics.rows import REST, SLOWEST, Logs
+from minimax_cal.dynamics.rows import SLOWEST, Logs
 from minimax_cal.ground.arrays import Array
 from minimax_cal.robots.robot import Robot
 
-KEPT = ("regressor", "base_rows", "known_torque", "sense", "held", "since_reversal")
+KEPT = ("regressor", "base_rows", "known_torque", "sense", "bristles", "since_reversal")
 SOFT = 0.0025  # of a joint's largest speed: where friction changes its sign
+YIELD = np.array([1e-4, 1e-3])  # way after which each of a joint's bristles slides [rad, m]
 
 
 def sense_of(qd: Array, soft: Array | float) -> Array:
@@ -127,20 +128,24 @@ class Scene:
         return sense_of(self.logs.motion.qd, self.arm.soft)
 
     @cached_property
-    def held(self) -> Array:
-        """(R, n) sense of the last motion where a joint is at rest, less the one it has there.
+    def bristles(self) -> Array:
+        """(R, n, k) how far bristles are bent, -1 to 1, less the sense of the motion.
 
-        A joint that stops keeps a part of its friction, which the drive holds on to.
+        A joint that stops or turns round keeps the friction of those that it has not bent over
+        yet: Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
         """
-        qd = self.logs.motion.qd
-        still = np.abs(qd) < np.maximum(REST * self.arm.fastest, SLOWEST)
-        last = np.zeros_like(qd)
+        bent = np.zeros((*self.logs.torque.shape, len(YIELD)))
         for a, b in zip(self.logs.start[:-1], self.logs.start[1:], strict=True):
-            at = np.where(still[a:b], -1, np.arange(b - a)[:, None])
-            at = np.maximum.accumulate(at, axis=0)
-            sense = np.take_along_axis(np.sign(qd[a:b]), np.maximum(at, 0), axis=0)
-            last[a:b] = np.where(at >= 0, sense, 0.0)
-        return self.logs.filtered(np.where(still, last - self.sense, 0.0))
+            q = self.logs.motion.q[a:b]
+            way = np.diff(q, axis=0, prepend=q[:1])[..., None] / YIELD
+            stays = np.exp(-np.abs(way))
+            bent[a:b] = np.sign(way) * (1.0 - stays)
+            step = 1
+            while step < b - a:  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
+                bent[a + step : b] += stays[step:] * bent[a : b - step]
+                stays[step:] *= stays[:-step].copy()
+                step *= 2
+        return self.logs.filtered(bent - self.sense[..., None])
 
     @cached_property
     def since_reversal(self) -> Array:

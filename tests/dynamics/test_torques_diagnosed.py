@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import run
-from dynamics.motions import Extra, simulated, three_joints
+from dynamics.motions import Extra, fourier, simulated, three_joints
 from numpy.testing import assert_allclose
 
 import minimax_cal as mc
@@ -256,3 +257,31 @@ def test_the_picture_shows_every_joint() -> None:
     off = np.asarray(measured) - np.asarray(predicted)
     assert np.sqrt(np.mean(off**2)) < 3.0 * found.budget[-1].holdout_rms[0]
     assert_allclose(cells[2].lines[0].get_xdata()[-1], found.budget[-1].holdout_rms_moving[0])
+
+
+def stopping(seed: int) -> mc.Run:
+    """A run that stops and creeps back, with friction of bristles that yield after 1 mrad."""
+    rng, time = np.random.default_rng(seed), np.arange(0.0, 20.0, 0.01)
+    rate = 0.5 - 0.5 * np.tanh(4.0 * (time - 14.0))  # of the motion, which ends at 14 s
+    q = fourier(rng, np.cumsum(rate) * 0.01, 3, 0.15)[0]
+    q -= np.sign(np.gradient(q, axis=0)[1380]) * 4e-4 * np.clip((time[:, None] - 15.0) / 4, 0, 1)
+    qd = np.gradient(q, time, axis=0)
+    motion = Motion(q, qd, np.gradient(qd, time, axis=0))
+    torque = inverse_dynamics(ARM, motion, inertial_parameters(ARM)) + qd * [3.0, 4.0, 1.0]
+    bent = np.zeros(3)
+    for i in range(len(time)):
+        step = q[i] - q[max(i - 1, 0)]
+        sense = np.sign(step)
+        bent = sense + (bent - sense) * np.exp(-np.abs(step) / 1e-3)
+        torque[i] += bent * [4.0, 3.0, 1.5]
+    torque += 0.05 * rng.normal(size=torque.shape)
+    return mc.Run(f"run{seed}", f"run{seed}.csv", time, q, None, None, torque, "N m")
+
+
+def test_a_joint_that_stops_keeps_the_friction_of_its_bristles() -> None:
+    found = mc.diagnose_motion(ARM, [stopping(seed) for seed in range(3)])
+    whole = np.array(mc.evaluate_motion(found, [stopping(7)]).steps[-1].rms)
+    last = found.models[-1]
+    bare = replace(found, models=(replace(last, held=np.zeros_like(last.held)),))
+    assert np.all(whole < 0.25 * np.array(mc.evaluate_motion(bare, [stopping(7)]).steps[-1].rms))
+    assert_allclose(last.held, [[0.0, 4.0], [0.0, 3.0], [0.0, 1.5]], rtol=0, atol=0.4)
