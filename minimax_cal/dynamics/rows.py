@@ -164,18 +164,22 @@ class Logs:
         return np.asarray(QUARTERS * self.run + part)
 
     @cached_property
-    def moving(self) -> Array:
-        """(R, n) True where a joint is neither at rest nor near a reversal."""
+    def sliding(self) -> Array:
+        """(M, n) True where a joint is neither at rest nor near a reversal."""
         qd = self.motion.qd
         still = np.abs(qd) < np.maximum(REST * np.abs(qd).max(axis=0), SLOWEST)
         still[1:] |= qd[1:] * qd[:-1] < 0.0
-        out = np.empty((len(self.picked), self.joints), dtype=bool)
+        out = np.empty(qd.shape, dtype=bool)
         reach = int(REVERSAL_S * SAMPLE_HZ)
         for a, b in zip(self.start[:-1], self.start[1:], strict=True):
             count = np.cumsum(np.pad(still[a:b], ((reach + 1, reach), (0, 0))), axis=0)
-            rows = (self.run >= 0) & (self.picked >= a) & (self.picked < b)
-            out[rows] = (count[2 * reach + 1 :] == count[: -2 * reach - 1])[self.picked[rows] - a]
+            out[a:b] = count[2 * reach + 1 :] == count[: -2 * reach - 1]
         return out
+
+    @cached_property
+    def moving(self) -> Array:
+        """(R, n) the same of the rows."""
+        return np.asarray(self.sliding[self.picked])
 
     @cached_property
     def fitted(self) -> Array:

@@ -129,7 +129,7 @@ class Scene:
 
     @cached_property
     def bristles(self) -> Array:
-        """(R, n, k) how far bristles are bent, -1 to 1, less the sense of the motion.
+        """(R, n, k) how far bristles are bent, -1 to 1, less the sense; 0 while a joint slides.
 
         A joint that stops or turns round keeps the friction of those that it has not bent over
         yet: Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
@@ -145,7 +145,8 @@ class Scene:
                 bent[a + step : b] += stays[step:] * bent[a : b - step]
                 stays[step:] *= stays[:-step].copy()
                 step *= 2
-        return self.logs.filtered(bent - self.sense[..., None])
+        stuck = ~self.logs.sliding
+        return self.logs.filtered(stuck[..., None] * (bent - self.sense[..., None]))
 
     @cached_property
     def since_reversal(self) -> Array:
