@@ -194,11 +194,19 @@ def make_cell(
         seen = (seen_by(view, true, law(found), world, on_flange) for view in views)
         share = np.mean([np.isfinite(each[..., 0]).mean(axis=1) for each in seen], axis=0)
         q = np.concatenate([q, found[share >= least]])
-    q = q[:poses]
-    pixel = np.stack([seen_by(view, true, law(q), world, on_flange) for view in views])
-    pixel = pixel + noise * rng.normal(size=pixel.shape)
     names = tuple(f"c{i}" for i in range(len(points)))
-    return Cell(drawn, true, on_flange, views, points, place, q, pixel, names, law)
+    none = np.zeros((len(views), 0, len(points), 2))
+    cell = Cell(drawn, true, on_flange, views, points, place, q[:0], none, names, law)
+    return taken(cell, q[:poses], rng, noise)
+
+
+def taken(cell: Cell, q: Array, rng: np.random.Generator, noise: float = NOISE) -> Cell:
+    """The same cell at other joint values (m, n)."""
+    world = cell.points @ cell.place[:3, :3].T + cell.place[:3, 3]
+    pixel = np.stack([
+        seen_by(view, cell.true, cell.law(q), world, cell.on_flange) for view in cell.views
+    ])  # fmt: skip
+    return replace(cell, q=q, pixel=pixel + noise * rng.normal(size=pixel.shape))
 
 
 def write_cell(cell: Cell, folder: Path, *, board: bool = True) -> list[str]:

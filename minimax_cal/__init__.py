@@ -49,6 +49,7 @@ if TYPE_CHECKING:  # the same names for editors and type checkers
     from minimax_cal.modelling.cell import Cell, load_cell
     from minimax_cal.modelling.effects.table import EFFECTS, register
     from minimax_cal.modelling.simulate import Simulation, Truth, simulate
+    from minimax_cal.planning.cameras import plan_cameras
     from minimax_cal.planning.motion_plan import plan_motion
     from minimax_cal.planning.plan import plan
     from minimax_cal.reporting.fleet.overview import fleet
@@ -112,6 +113,7 @@ __all__ = [
     "minimize_max",
     "motion_gap",
     "plan",
+    "plan_cameras",
     "plan_motion",
     "read_campaigns",
     "read_measurements",
@@ -172,6 +174,7 @@ MODULES = {  # name: where it is defined
     "diagnose_motion": "dynamics.diagnose",
     "evaluate_motion": "dynamics.evaluate",
     "plan": "planning.plan",
+    "plan_cameras": "planning.cameras",
     "plan_motion": "planning.motion_plan",
     "Compensation": "correcting.compensate",
     "compensate": "correcting.compensate",

@@ -22,17 +22,34 @@ from minimax_cal.cli.options import (
     result_options,
     writable,
 )
+from minimax_cal.fitting.pixels.options import camera_of
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.files import write_whole
+from minimax_cal.ground.stages import Progress
+from minimax_cal.planning.camera_options import GROUP as CAMERAS
+from minimax_cal.planning.camera_options import CameraOptions
 from minimax_cal.planning.motion_plan import GROUP, MotionOptions, plan_motion
 from minimax_cal.planning.options import PlanOptions, limits_of
 from minimax_cal.planning.plan import plan
+from minimax_cal.planning.result import Plan
 from minimax_cal.planning.stops import ANGLES
 from minimax_cal.reporting.plots.plan import save_plan
 from minimax_cal.robots.robot import Robot, load_robot
 
 MOTION = tuple(field.name for field in fields(MotionOptions))  # options of motions alone
 SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
+IMAGES = ("criterion", "jitter", "revisit", "approach", "candidates", *SHARED)  # of poses too
+SEES = ("camera", "board", *(field.name for field in fields(CameraOptions)))
+ALLOWED = {  # what is planned, and the options that are about it
+    "motion": {*MOTION, "waypoints", *SHARED},
+    "cameras": {*SEES, *IMAGES, "poses", "fit", "figure"},
+    "poses": {*(one.name for one in fields(PlanOptions)), "poses", "fit", "data", "figure"},
+}
+OTHERWISE = {  # what an option is about that is not about what is planned
+    "motion": "a motion; add motion=", "cameras": "cameras; add camera= and board=",
+    "poses": "poses, not about",
+}  # fmt: skip
+NAMED = {"motion": "a motion", "cameras": "cameras"}
 
 
 @click.command(name="plan", cls=InGroups)
@@ -54,6 +71,21 @@ SHARED = ("joints", "volume", "floor", "body", "seed")  # of poses and motions
 @plain_option(
     GROUP, "--waypoints", type=PATH, help="Write points and speeds at 10 Hz to this CSV file too."
 )
+@plain_option(
+    CAMERAS,
+    "--camera",
+    multiple=True,
+    metavar="NAME=FILE",
+    help="The K, D and image size of a camera (YAML); images of a board are planned then.",
+)
+@plain_option(
+    CAMERAS,
+    "--board",
+    type=PATH,
+    metavar="FILE",
+    help="The places of the board's corners (CSV): target, x_mm, y_mm, z_mm.",
+)
+@options_from(CameraOptions)
 @plain_option(
     "What is known",
     "--fit",
@@ -85,11 +117,13 @@ def plan_command(
 ) -> int:
     """Which poses of ROBOT to measure next, in which order, and how accurate they will make it.
 
-    Or, with --motion, a motion to drive while torques or currents are logged.
+    With --camera, poses at which cameras see a board; with --motion, a motion to drive while
+    torques or currents are logged.
     """
     if unit not in ANGLES:
         raise OptionError(f"no unit {unit!r}; choose {' or '.join(ANGLES)}")
-    check_given(motion)
+    kind = "motion" if motion else "cameras" if chosen["camera"] or chosen["board"] else "poses"
+    check_given(kind)
     arm = load_robot(robot)
     chosen["joints"] = limits_of(chosen["joints"], arm)
     if motion:
@@ -97,10 +131,8 @@ def plan_command(
         return show_motion(arm, unit, to, waypoints, chosen, details=details)
     if poses is None:
         raise OptionError("give the number of poses=, or motion= for a motion")
-    for name in MOTION:
-        chosen.pop(name)
     with to.stages() as progress:
-        found = plan(arm, poses, progress=progress, **chosen)
+        found = poses_of(arm, poses, kind, chosen, progress)
     to.notice(*found.notices)
     to.write_rows(lambda: found.csv(unit), found.json)
     to.draw(save_plan, found)
@@ -115,14 +147,28 @@ def plan_command(
     return 0
 
 
-def check_given(motion: bool) -> None:
-    """Raise OptionError for options of poses with a motion, or the other way round."""
+def poses_of(arm: Robot, poses: int, kind: str, chosen: dict[str, Any], progress: Progress) -> Plan:
+    """The poses for a tracker, or for cameras.  Raises OptionError."""
+    files = [camera_of(text) for text in chosen["camera"]]
+    own = {name: value for name, value in chosen.items() if name in ALLOWED[kind]}
+    if kind == "poses":
+        return plan(arm, poses, progress=progress, **own)
+    if not files or chosen["board"] is None:
+        raise OptionError("images need both camera='NAME=FILE' and board=")
+    if len(dict(files)) < len(files):
+        raise OptionError("camera= gives one name twice; each camera has its own")
+    from minimax_cal.planning.cameras import plan_cameras
+
+    return plan_cameras(arm, poses, progress=progress, **{**own, "camera": dict(files)})
+
+
+def check_given(kind: str) -> None:
+    """Raise OptionError for options that are not about what is planned.  kind: of ALLOWED."""
     at = click.get_current_context()
-    theirs = {field.name for field in fields(PlanOptions)} - set(SHARED)
-    theirs = {*theirs, "poses", "fit", "data", "figure"} if motion else {*MOTION, "waypoints"}
-    for name in sorted(theirs):
+    for name in sorted(set().union(*ALLOWED.values()) - ALLOWED[kind]):
         if at.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            what = "poses, not about a motion" if motion else "a motion; add motion="
+            about = next(each for each, names in ALLOWED.items() if name in names)
+            what = OTHERWISE[about] + (f" {NAMED[kind]}" if about == "poses" else "")
             raise OptionError(f"{name}= is about {what}")
 
 

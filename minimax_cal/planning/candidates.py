@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
 from minimax_cal.ground.tables import Table
 from minimax_cal.measuring.measurements import Measurements
-from minimax_cal.planning.visibility import ARM, TRACKER, Room, Sight, View
+from minimax_cal.planning.visibility import ARM, Condition, Room, Sight, View
 from minimax_cal.robots.robot import Robot
 
 SLIDE = 0.5  # how far a slide without limits goes to either side [m]
-BATCH, VAIN, MOST = 2**13, 2**16, 2**19  # poses drawn at a time, in vain, and at most
-Conditions = Mapping[str, Callable[[View], Array]]
+Conditions = Mapping[str, Condition]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +118,7 @@ def candidates(room: Room, sight: Sight, count: int, seed: int) -> Poses:
 
     Fewer where they are rare.  Raises OptionError where there is none, with what rejects most.
     """
-    return drawn(room, sight, count, seed, ARM, TRACKER)
+    return drawn(room, sight, count, seed, ARM, sight.conditions)
 
 
 def near(
@@ -134,7 +132,7 @@ def near(
     spread = step * (room.upper - room.lower)
     around = np.repeat(q, each, axis=0)
     tried = np.clip(around + spread * rng.normal(size=around.shape), room.lower, room.upper)
-    good, seen, _ = judged(room, sight, tried, ARM, TRACKER)
+    good, seen, _ = judged(room, sight, tried, ARM, sight.conditions)
     return tried[good], seen[good]
 
 
@@ -142,11 +140,11 @@ def drawn(
     room: Room, sight: Sight, count: int, seed: int, arm: Conditions, tracker: Conditions
 ) -> Poses:
     """Poses of the sequence that meet the conditions.  Raises OptionError where there is none."""
-    sequence = qmc.Sobol(len(room.lower), scramble=True, rng=np.random.default_rng(seed))
+    proposals = sight.proposals(room, seed)
     kept_q, kept_seen, tested, found = [], [], 0, 0
     total = dict.fromkeys((*arm, *tracker), 0)
-    while found < count and tested < (MOST if found else VAIN):
-        q = room.lower + (room.upper - room.lower) * sequence.random(BATCH)
+    while found < count and tested < sight.tries[found > 0]:
+        q = next(proposals)
         good, seen, against = judged(room, sight, q, arm, tracker)
         total = {name: number + against[name] for name, number in total.items()}
         tested += len(q)
@@ -190,7 +188,9 @@ MENDS = {
     "volume": "make volume= larger",
     "self-collision": "give a thinner body as body=",
     "acceptance": "give another tracker=, normals= or a wider acceptance=",
-    "range": "give another tracker= or reach=",
+    "range": "give another tracker= or reach= (of cameras distance=)",
+    "image": "give another camera_at= or board_at=, a larger distance= or a smaller share=",
+    "incidence": "give another camera_at= or board_at=, or a larger incidence=",
     "elevation": "give another tracker= or elevation=",
     "line of sight": "give another tracker= or a thinner body as body=",
 }

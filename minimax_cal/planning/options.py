@@ -201,6 +201,9 @@ def joint(text: str, robot: Robot) -> tuple[int, tuple[float, float]]:
 
 def check_options(options: PlanOptions, poses: int, robot: Robot) -> None:
     """Raise OptionError for options that make no sense."""
+    criteria = [name for name in MEANINGS if name != POWER]
+    if options.criterion not in criteria:
+        raise OptionError(f"no criterion {options.criterion!r}; choose {', '.join(criteria)}")
     if not 1 <= poses <= MOST_POSES:
         raise OptionError(f"poses={poses}: give 1 to {MOST_POSES}")
     if not poses <= options.candidates <= MOST_CANDIDATES:

@@ -23,7 +23,8 @@ from minimax_cal.planning.outlook import grown, indices, remarks, separated
 from minimax_cal.planning.result import POWER, Plan
 from minimax_cal.planning.route import shortest, travel, visits
 from minimax_cal.planning.setting import ground_of, surroundings
-from minimax_cal.planning.task import CRITERIA, Task, task_of
+from minimax_cal.planning.task import Task, task_of
+from minimax_cal.planning.visibility import Room, Sight
 from minimax_cal.robots.robot import Robot, load_robot
 
 STEPS = (0.2, 0.1, 0.05, 0.02)  # around the best so far, as a share of the joints' ranges
@@ -169,25 +170,41 @@ def planned(
 ) -> Plan:
     """As `plan`.  fit, data: "" where there is none."""
     began = time.perf_counter()
-    if options.criterion not in CRITERIA:
-        raise OptionError(f"no criterion {options.criterion!r}; choose {', '.join(CRITERIA)}")
     check_options(options, poses, robot)
     progress("start")
     ground = ground_of(robot, fit, data, options)
     room, sight, said = surroundings(ground.cell, options, ground.measured)
     progress("candidate poses")
+    found = enough(room, sight, options, poses)
+    task = task_of(robot, ground, room, sight, found, options)
+    return chosen(task, found, poses, said, progress, began)
+
+
+def enough(room: Room, sight: Sight, options: PlanOptions, poses: int) -> Poses:
+    """Candidates for so many poses.  Raises OptionError where there are fewer."""
     found = candidates(room, sight, options.candidates, options.seed)
     if len(found.q) < poses:
         raise OptionError(
             f"only {len(found.q)} of {found.tested} poses can be taken and seen, but {poses} are "
             f"asked for; {rarest(found.rejected)}"
         )
-    task = task_of(robot, ground, room, sight, found, options)
+    return found
+
+
+def chosen(
+    task: Task,
+    found: Poses,
+    poses: int,
+    said: Sequence[str],
+    progress: Progress,
+    began: float,
+) -> Plan:
+    """The plan of the best poses.  said: notices.  began: by `time.perf_counter`."""
     found, first = refined(task, found, poses, progress)
     aim = task.aim(found)
     best = best_design(*aim, first, progress)
     progress("comparison")
-    notices = (*ground.notices, *said, *remarks(task, found, best))
+    notices = (*task.ground.notices, *said, *remarks(task, found, best))
     return assembled(task, found, aim, best, notices, began)
 
 
@@ -266,7 +283,7 @@ def assembled(
         separation=separation,
         candidates=found,
         instrument=task.ground.instrument,
-        place=task.sight.place,
+        place=np.atleast_2d(task.sight.place)[0],
         travel=(
             travel(q, robot.prismatic),
             travel(found.q[best.design.chosen], robot.prismatic),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -45,6 +46,31 @@ class Instrument:
             "noise_um_per_m": 1e6 * self.per_metre,
             "jitter_urad": 1e6 * self.jitter,
         }
+
+
+class Ahead(Protocol):
+    """What poses can tell about a cell, as `Prospect`."""
+
+    @property
+    def cell(self) -> Cell:
+        """The cell."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of f parameters."""
+
+    @property
+    def scale(self) -> Array:
+        """(f,)."""
+
+    def ahead(self, q: Array, seen: Array) -> Array:
+        """(m, r, f)."""
+
+    def jacobian(self, q: Array, seen: Array) -> Array:
+        """(N, f)."""
+
+    def predictions(self, q: Array) -> Array:
+        """B (w, r, f)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,9 @@ class Plan:
     indices: observability, planned and random.  growth: with the number of poses.
     candidates: what was chosen from.  instrument: noise that was assumed, place: (3,) where it
     stands in base axes [m].  travel: of the largest joint moves, as ordered and as chosen [rad].
-    at_hand: number of poses measured before, which count.  solver: of the relaxation.
+    at_hand: number of poses measured before, which count.  solver: of the relaxation.  cameras:
+    that are planned for, and seen (N, c) by which the board is seen; none for a tracker.
+    still: what stands at `place`: the tracker, else the board or the camera.
     """
 
     cell: Cell
@@ -73,6 +75,8 @@ class Plan:
     settings: Mapping[str, object]
     notices: tuple[str, ...]
     seconds: float
+    cameras: tuple[str, ...] = ()
+    still: str = "tracker"
 
     @property
     def poses(self) -> int:
@@ -214,6 +218,7 @@ class Plan:
             "q": self.q,
             "q_units": ["m" if sliding else "rad" for sliding in slides],
             "seen": self.seen,
+            **({"cameras": self.cameras} if self.cameras else {}),
             "visits": self.visits.to_dict(),
             "value": {f"{name}_{unit}": self.shown(size) for name, size in sizes.items()},
             "efficiency_at_least": self.efficiency,

@@ -15,7 +15,7 @@ from minimax_cal.planning.candidates import Poses, free_poses
 from minimax_cal.planning.designs.criteria import Criterion, Determinant, Eigenvalue, Largest, Trace
 from minimax_cal.planning.designs.exchange import Menu
 from minimax_cal.planning.options import PlanOptions
-from minimax_cal.planning.prospect import Prospect, prospect, with_effects
+from minimax_cal.planning.prospect import Ahead, prospect, with_effects
 from minimax_cal.planning.separating import Contest, Question
 from minimax_cal.planning.setting import Ground
 from minimax_cal.planning.visibility import Room, Sight
@@ -23,7 +23,7 @@ from minimax_cal.robots.robot import Robot
 
 WORK = 1000  # poses of the workspace at which positions are predicted
 
-CRITERIA: Mapping[str, Callable[[Prospect, Array], Criterion]] = {
+CRITERIA: Mapping[str, Callable[[Ahead, Array], Criterion]] = {
     # of the parameters' covariance, or of the variances at workspace poses by B (w, 3k, f)
     "D": lambda ahead, b: Determinant(),
     "A": lambda ahead, b: Trace(np.eye(len(ahead.scale)) / len(ahead.scale)),
@@ -45,7 +45,7 @@ class Task:
     ground: Ground
     room: Room
     sight: Sight
-    ahead: Prospect
+    ahead: Ahead
     work: Array
     known: Array
     asked: tuple[Question, ...]

@@ -7,11 +7,13 @@ checked the poses for collisions.  Everything is in the robot's base axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
+from scipy.stats import qmc
 
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import OptionError
@@ -23,16 +25,20 @@ THICK = 0.04  # radius of the body, as a share of the arm's reach
 ANYWHERE = np.pi  # acceptance of a target that can be seen from everywhere [rad]
 NEIGHBOUR_RADII = 2.5  # radii of arm between two segments below which they are neighbours
 NORMALS = ("flange", "radial")
+BATCH = 2**13  # poses proposed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
     """Where the instrument stands and what it can see.
 
-    place: (3,) in base axes [m].  up: (3,) its vertical, that of the world.
+    place: (3,) in base axes [m], or (k, 3) where each target is looked at from its own.  up: (3,)
+    its vertical, that of the world.
     acceptance: half angle of a target's cone [rad].  near, far: limits of range [m].
     low, high: limits of elevation [rad].
     """
+
+    tries: ClassVar[tuple[int, int]] = (2**16, 2**19)  # poses proposed in vain, and at most
 
     place: Array
     up: Array
@@ -41,6 +47,17 @@ class Sight:
     far: float = 50.0
     low: float = np.radians(-50.0)
     high: float = np.radians(75.0)
+
+    def proposals(self, room: Room, seed: int) -> Iterator[Array]:
+        """(b, n) joint values within the limits, again and again: a Sobol sequence."""
+        sequence = qmc.Sobol(len(room.lower), scramble=True, rng=np.random.default_rng(seed))
+        while True:
+            yield room.lower + (room.upper - room.lower) * sequence.random(BATCH)
+
+    @property
+    def conditions(self) -> Mapping[str, Condition]:
+        """What each target (k, m) has to meet."""
+        return TRACKER
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +125,7 @@ class View:
     @cached_property
     def sights(self) -> Array:
         """(k, 3, m) from the targets to the instrument [m]."""
-        return np.asarray(self.sight.place[:, None] - self.points)
+        return np.asarray(self.sight.place[..., None] - self.points)
 
     @cached_property
     def ranges(self) -> Array:
@@ -188,20 +205,21 @@ def unobstructed(view: View) -> Array:
     short = np.minimum(2.0 * view.room.radius / np.maximum(view.ranges, 1e-9), 1.0)[:, None]
     end = view.points + short * view.sights
     free = np.ones((k, m), dtype=bool)
-    eye = np.broadcast_to(view.sight.place[:, None], (3, m))
+    eye = view.points + view.sights
     for bone in view.bones:
         for target in range(k):
-            away = gap(eye, end[target], view.skeleton[bone], view.skeleton[bone + 1])
+            away = gap(eye[target], end[target], view.skeleton[bone], view.skeleton[bone + 1])
             free[target] &= away > view.room.radius
     return free
 
 
-ARM: Mapping[str, Callable[[View], Array]] = {  # (m,) of the arm
+Condition = Callable[[View], Array]
+ARM: Mapping[str, Condition] = {  # (m,) of the arm
     "floor": above_floor,
     "volume": in_box,
     "self-collision": clear_of_itself,
 }
-TRACKER: Mapping[str, Callable[[View], Array]] = {  # (k, m) of each target
+TRACKER: Mapping[str, Condition] = {  # (k, m) of each target
     "acceptance": faces,
     "range": within_range,
     "elevation": within_elevation,

@@ -26,9 +26,9 @@ def transform(rotation: Array, origin: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """The inverse of a rigid transform (4, 4)."""
-    turned = pose[:3, :3].T
-    return transform(turned, -turned @ pose[:3, 3])
+    """The inverse of rigid transforms (..., 4, 4)."""
+    turned = np.swapaxes(pose[..., :3, :3], -1, -2)
+    return transform(turned, -(turned @ pose[..., :3, 3, None])[..., 0])
 
 
 def turn(axis: int, angle: float) -> Array:

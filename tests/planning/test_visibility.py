@@ -11,10 +11,11 @@ from scipy.optimize import minimize
 
 import minimax_cal as mc
 from minimax_cal.ground.arrays import Array
-from minimax_cal.planning.candidates import BATCH, candidates, free_poses, limits_of, near
+from minimax_cal.planning.candidates import candidates, free_poses, limits_of, near
 from minimax_cal.planning.visibility import (
     ANYWHERE,
     ARM,
+    BATCH,
     TRACKER,
     Room,
     Sight,

@@ -1,0 +1,222 @@
+"""Plan the images of a camera cell: poses that see the board and tell most of the arm.
+
+Arm, cameras, lenses and board are unknown together, as in `fitting.pixels`; what counts is what is
+then known of positions of the arm, base and tool fitted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minimax_cal.fitting.pixels.camera import FLANGE, GROUND, Camera, read_camera
+from minimax_cal.fitting.pixels.data import read_board
+from minimax_cal.fitting.pixels.judge import everywhere
+from minimax_cal.fitting.pixels.options import PixelOptions
+from minimax_cal.fitting.pixels.result import PixelCalibration
+from minimax_cal.ground.arrays import Array
+from minimax_cal.ground.errors import OptionError
+from minimax_cal.ground.files import plain
+from minimax_cal.ground.stages import Progress, silent
+from minimax_cal.modelling.cell import Cell, pose_from_dict, saved_content
+from minimax_cal.planning.camera_options import PIXEL_NOISE, SIDES, CameraOptions, check_cameras
+from minimax_cal.planning.camera_prospect import CameraProspect, PixelNoise
+from minimax_cal.planning.camera_sight import CameraSight
+from minimax_cal.planning.options import USUAL, PlanOptions, check_options
+from minimax_cal.planning.plan import chosen, enough
+from minimax_cal.planning.result import Plan
+from minimax_cal.planning.setting import Ground, check_same, surroundings
+from minimax_cal.planning.task import Task
+from minimax_cal.robots.robot import Robot, load_robot
+
+
+def plan_cameras(
+    robot: Robot | str | Path,
+    poses: int,
+    camera: Mapping[str, Path | str],
+    board: Path | str,
+    *,
+    fit: Mapping[str, Any] | Path | str | None = None,
+    camera_on: str = FLANGE,
+    camera_at: Sequence[Array] = (),
+    board_at: Array | None = None,
+    print_looks: str = "-z",
+    distance: tuple[float, float] = (0.3, 1.0),
+    incidence: float = np.radians(60.0),
+    share: float = 0.8,
+    pixel_noise: float = PIXEL_NOISE,
+    camera_prior: str = "",
+    criterion: str = "I",
+    joints: Mapping[int, tuple[float, float]] | None = None,
+    volume: Sequence[Sequence[float]] = (),
+    floor: float = 0.0,
+    body: float | None = None,
+    jitter: float | None = None,
+    revisit: int = 0,
+    approach: str = "none",
+    candidates: int = 2000,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Plan:
+    """Which images of a board to take with cameras, and how well they will tell the arm.
+
+    Parameters
+    ----------
+    robot
+        Loaded, or a name or path.
+    poses
+        How many.
+    camera
+        Files of K, D and image size by the cameras' names (OpenCV or ROS, YAML).
+    board
+        Places of the board's corners (target, x_mm, y_mm, z_mm).
+    fit
+        A calibration by cameras: arm, cameras and board are where it has them.
+    camera_on
+        flange or ground.
+    camera_at
+        (4, 4) about where each camera is in the flange or base [m].
+    board_at
+        (4, 4) about where the board is in the base or flange [m].
+    print_looks
+        z or -z of the board's frame: the side of its print.
+    distance
+        From how near to how far a camera is sharp [m].
+    incidence
+        Largest angle to the board's normal [rad].
+    share
+        Of the corners that an image must show.
+    pixel_noise
+        Of u and v [px].
+    camera_prior
+        How well the files know the lenses, as ``f 0.1%, c 2px``.
+    criterion, joints, volume, floor, body, jitter, revisit, approach, candidates, seed, progress
+        As in `plan`.
+
+    Returns
+    -------
+    Plan
+        The poses in order; its sigma of positions is that of `calibrate_pixels`, of noise alone.
+
+    Raises
+    ------
+    CalibrationError
+        For wrong input.
+
+    Examples
+    --------
+    >>> found = mc.plan_cameras("ur5", 30, {"cam": "camera.yaml"}, "board.csv", fit="fit.json")
+    """
+    options = PlanOptions(
+        criterion=criterion, joints=joints or {}, volume=volume, floor=floor, body=body,
+        jitter=jitter, revisit=revisit, approach=approach, candidates=candidates, seed=seed,
+        whole=len(camera) == 1,
+    )  # fmt: skip
+    sees = CameraOptions(
+        camera_on, camera_at, board_at, print_looks, distance, incidence, share, pixel_noise,
+        camera_prior,
+    )  # fmt: skip
+    began = time.perf_counter()
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    check_options(options, poses, robot)
+    progress("start")
+    if fit is not None:
+        robot, sees = placed_by(robot, fit, list(camera), sees)
+    check_cameras(sees, len(camera))
+    cameras = tuple(read_camera(name, path) for name, path in camera.items())
+    corners = np.array(list(read_board(board).values()))
+    return planned_images(robot, poses, cameras, corners, options, sees, progress, began)
+
+
+def planned_images(
+    robot: Robot,
+    poses: int,
+    cameras: tuple[Camera, ...],
+    corners: Array,
+    options: PlanOptions,
+    sees: CameraOptions,
+    progress: Progress,
+    began: float,
+) -> Plan:
+    """As `plan_cameras`, of files that are read.  began: by `time.perf_counter`."""
+    sight = sight_of(robot, sees, cameras, corners)
+    jitter = USUAL.jitter if options.jitter is None else options.jitter
+    noise = PixelNoise(sees.pixel_noise, jitter=jitter)
+    middle = np.tile(middle_of(sight), (len(cameras), 1))
+    rides = sight.camera[:, :3, 3] if sight.on_flange else middle
+    names = tuple(one.name for one in cameras)
+    cell = Cell(robot, np.eye(4), names, rides)
+    room, _, said = surroundings(cell, options)
+    progress("candidate poses")
+    found = enough(room, sight, options, poses)
+    ahead = CameraProspect.of(cell, room, sight, cameras, noise, found.q, found.seen)
+    text = (
+        f"noise of a pixel {noise.noise:.3g} px, jitter of a joint {1e6 * noise.jitter:.3g} urad; "
+        "errors that no link holds come on top of the predicted sigma"
+    )
+    lenses = PixelOptions(camera_prior=sees.camera_prior).lens_sigma(sight.intrinsic)
+    ground = Ground(cell, (), noise, (text,))
+    task = Task(options, ground, room, sight, ahead, everywhere(robot), ahead.known(lenses), ())
+    out = chosen(task, found, poses, said, progress, began)
+    return replace(
+        out,
+        cell=Cell(robot, np.eye(4), (), np.zeros((0, 3))),
+        expected=np.zeros((poses, 0, 3)),
+        cameras=names,
+        still="board" if sight.on_flange else "camera",
+        settings={**out.settings, **plain(vars(sees))},
+    )
+
+
+def middle_of(sight: CameraSight) -> Array:
+    """(3,) of the board, in the base or flange [m]."""
+    return np.asarray((sight.board @ np.append(sight.corners.mean(axis=0), 1.0))[:3])
+
+
+def sight_of(
+    robot: Robot, sees: CameraOptions, cameras: Sequence[Camera], corners: Array
+) -> CameraSight:
+    """What the cameras see.  corners: (k, 3) in the board's frame [m].  Raises OptionError."""
+    for one in cameras:
+        if not all(one.size):
+            raise OptionError(
+                f"{one.source}: image_width and image_height are missing; give them: they "
+                "say what is in the image"
+            )
+    near, far = sees.distance
+    poses, board = np.stack(sees.camera_at), np.asarray(sees.board_at)
+    sight = CameraSight(
+        place=poses[:, :3, 3], up=robot.up, near=near, far=far, camera=poses,
+        intrinsic=np.stack([one.intrinsic for one in cameras]),
+        size=np.array([one.size for one in cameras], dtype=float), corners=corners, board=board,
+        on_flange=sees.camera_on == FLANGE, side=SIDES[sees.print_looks], least=sees.share,
+        incidence=sees.incidence,
+    )  # fmt: skip
+    return replace(sight, place=middle_of(sight)) if sight.on_flange else sight
+
+
+def placed_by(
+    robot: Robot, fit: Mapping[str, Any] | Path | str, names: Sequence[str], sees: CameraOptions
+) -> tuple[Robot, CameraOptions]:
+    """Arm, cameras and board as a calibration by cameras has them.  Raises CalibrationError."""
+    if len(sees.camera_at) or sees.board_at is not None:
+        raise OptionError(
+            "the fit tells where cameras and board are: leave camera_at= and board_at= out"
+        )
+    content, source = (fit, "fit") if isinstance(fit, Mapping) else (saved_content(fit), str(fit))
+    known = PixelCalibration.from_dict(content, source)
+    check_same(robot, known.calibrated or known.robot)
+    poses, board = known.instrument["cameras"], known.instrument.get("board")
+    strange = [name for name in names if name not in poses]
+    if strange or board is None:
+        what = f"camera {strange[0]}" if strange else "board"
+        raise OptionError(f"{source}: has no {what}; give camera_at= and board_at= instead")
+    on = FLANGE if known.instrument["cameras_in"] == FLANGE else GROUND
+    at = tuple(pose_from_dict(poses[name]["pose"]) for name in names)
+    placed = replace(sees, camera_on=on, camera_at=at, board_at=pose_from_dict(board))
+    return known.calibrated or known.robot, placed
