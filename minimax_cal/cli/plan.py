@@ -42,8 +42,8 @@ IMAGES = ("criterion", "jitter", "revisit", "approach", "candidates", *SHARED)  
 SEES = ("camera", "board", *(field.name for field in fields(CameraOptions)))
 ALLOWED = {  # what is planned, and the options that are about it
     "motion": {*MOTION, "waypoints", *SHARED},
-    "cameras": {*SEES, *IMAGES, "poses", "fit", "figure"},
     "poses": {*(one.name for one in fields(PlanOptions)), "poses", "fit", "data", "figure"},
+    "cameras": {*SEES, *IMAGES, "poses", "fit", "figure"},
 }
 OTHERWISE = {  # what an option is about that is not about what is planned
     "motion": "a motion; add motion=", "cameras": "cameras; add camera= and board=",
