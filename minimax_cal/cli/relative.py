@@ -32,10 +32,12 @@ from minimax_cal.fitting.options import Options
 def relative_command(
     robot: str, data: tuple[Path, ...], details: bool, to: Output, **chosen: Any
 ) -> int:
-    """Calibrate ROBOT without coordinates, from the lengths, closures or poses in DATA.
+    """Calibrate ROBOT without coordinates, from lengths, closures, contacts or poses in DATA.
 
     DATA has joint columns and one of: wire1_mm ... (lengths from unknown fixed points to a target
     on the flange); socket (rows with the same label held the flange's ball in the same socket);
+    surface with kind, plane or sphere (what a probe's ball touched; where known radius_mm,
+    ball_radius_mm, and normal_x, normal_y, normal_z, offset_mm of a body's faces);
     flange_x_mm, flange_y_mm, flange_z_mm with flange_rx_rad ... or flange_qw ... (whole poses).
 
     Several files, of any kinds, are one fit: all share the arm, each counts by its own noise.  A

@@ -4,7 +4,14 @@ Lengths and closures know no base frame, closures no length either: what that le
 with the parameters, by name and reason.
 """
 
-from minimax_cal.fitting.instruments.data import RelativeData, closures, distances, flange_poses
+from minimax_cal.fitting.instruments.data import (
+    RelativeData,
+    Surface,
+    closures,
+    contacts,
+    distances,
+    flange_poses,
+)
 from minimax_cal.fitting.instruments.file import read_relative, write_relative
 from minimax_cal.fitting.instruments.kinds import relative
 from minimax_cal.fitting.instruments.options import RelativeOptions
@@ -15,7 +22,9 @@ __all__ = [
     "RelativeCalibration",
     "RelativeData",
     "RelativeOptions",
+    "Surface",
     "closures",
+    "contacts",
     "distances",
     "flange_poses",
     "poses_as_targets",

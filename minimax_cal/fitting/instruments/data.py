@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,10 +12,38 @@ from minimax_cal.ground.errors import DataError
 from minimax_cal.measuring.grouping import groups
 from minimax_cal.measuring.measurements import FARTHEST, Measurements
 
-KINDS = ("distances", "closures", "poses", "points")
+KINDS = ("distances", "closures", "poses", "points", "contacts")
+PLANE, SPHERE = "plane", "sphere"
 NO_POSES: Array = np.zeros((0, 4, 4))
 NORM = 1e-3  # a quaternion farther from unit length is no rotation
 LEAST_LENGTHS = 5  # of one wire; its anchor alone has three unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What a probe touches.
+
+    kind: PLANE or SPHERE.  size: radius of a sphere, or offset of a face from the body's origin
+    along its normal, NaN where not known [m].  normal: (3,) outward in the body's frame of a plane
+    that is a face of the body, else (0,).
+    """
+
+    label: str
+    kind: str = PLANE
+    size: float = np.nan
+    normal: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def is_face(self) -> bool:
+        """Whether it is a face of the body."""
+        return bool(len(self.normal))
+
+    @property
+    def ends(self) -> tuple[str, ...]:
+        """Endings of its own parameters' names, the size last."""
+        if self.kind == SPHERE:
+            return ("x", "y", "z", "radius")
+        return ("offset",) if self.is_face else ("tilt1", "tilt2", "offset")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +53,9 @@ class RelativeData:
     at: the m poses (q, line, columns), with points where the kind is points.  kind: one of KINDS.
     wires: s names, as wire1.  length: (m, s) from an anchor to the target, NaN where not measured
     [m].  socket: (m,) label of the socket that held the ball.  pose: (m, 4, 4) of the flange in
-    the measurement frame [m].  What is not of the kind is empty: s = 0, labels '', no poses.
+    the measurement frame [m].  surface: (m,) label of the one of `surfaces` that the probe's ball
+    touched; ball_radius: NaN where not known [m].  What is not of the kind is empty: s = 0, labels
+    '', no poses.
     """
 
     at: Measurements
@@ -34,6 +64,9 @@ class RelativeData:
     length: Array = field(default_factory=lambda: np.zeros((0, 0)))
     socket: Array = field(default_factory=lambda: np.zeros(0, dtype=str))
     pose: Array = field(default_factory=lambda: NO_POSES)
+    surface: Array = field(default_factory=lambda: np.zeros(0, dtype=str))
+    surfaces: tuple[Surface, ...] = ()
+    ball_radius: float = np.nan
 
     @property
     def poses(self) -> int:
@@ -53,6 +86,7 @@ class RelativeData:
             length=self.length[rows] if self.wires else self.length,
             socket=self.socket[rows] if len(self.socket) else self.socket,
             pose=self.pose[rows] if len(self.pose) else self.pose,
+            surface=self.surface[rows] if len(self.surface) else self.surface,
         )
 
     def says(self, row: int) -> str:
@@ -100,6 +134,26 @@ def flange_poses(q: Array, pose: Array, **columns: Array) -> RelativeData:
     """Whole poses from arrays.  q: (m, n) [rad, m].  pose: (m, 4, 4) [m]."""
     pose = np.array(pose, dtype=float)
     return check(RelativeData(bare(q, columns, pose=pose), "poses", pose=pose))
+
+
+def contacts(
+    q: Array,
+    surface: Array,
+    surfaces: Sequence[Surface],
+    ball_radius: float = np.nan,
+    **columns: Array,
+) -> RelativeData:
+    """Contacts of a probe's ball with surfaces, from arrays.
+
+    q: (m, n) [rad, m].  surface: (m,) labels of surfaces.  ball_radius: NaN where not known [m].
+    """
+    labels = np.asarray(surface).astype(str)
+    at = bare(q, columns, surface=labels)
+    return check(
+        RelativeData(
+            at, "contacts", surface=labels, surfaces=tuple(surfaces), ball_radius=ball_radius
+        )
+    )
 
 
 def check(data: RelativeData) -> RelativeData:
@@ -178,7 +232,36 @@ def check_points(data: RelativeData) -> None:
         raise DataError(f"{data.at.source}: holds no measured point")
 
 
+LEAST_CONTACTS = {PLANE: 4, SPHERE: 5}  # one more than the surface itself has unknowns
+
+
+def check_contacts(data: RelativeData) -> None:
+    """Raise DataError for surfaces that are none, or that are touched too seldom."""
+    where, known = data.at.source, [surface.label for surface in data.surfaces]
+    unknown = sorted(set(data.surface.tolist()) - set(known))
+    if unknown or len(set(known)) < len(known):
+        wrong = f"{unknown[0]!r} is none of the surfaces" if unknown else "two have one label"
+        raise DataError(f"{where}: column surface: {wrong}")
+    group = groups(data.at)
+    for surface in data.surfaces:
+        if surface.kind not in LEAST_CONTACTS:
+            raise DataError(
+                f"{where}: column kind: {surface.kind!r} of surface {surface.label!r}; "
+                "write plane or sphere"
+            )
+        rows = np.flatnonzero(data.surface == surface.label)
+        count, least = len(np.unique(group[rows])), LEAST_CONTACTS[surface.kind]
+        if count < least:
+            raise DataError(
+                f"{where}: column surface: {surface.label!r} is touched at {count} different "
+                f"poses; touch a {surface.kind} at {least} or more"
+            )
+    if data.ball_radius <= 0.0 or any(s.kind == SPHERE and s.size <= 0 for s in data.surfaces):
+        raise DataError(f"{where}: a radius must be positive; leave it empty if not known")
+
+
 CHECKS = {
+    "contacts": check_contacts,
     "points": check_points,
     "distances": check_lengths,
     "closures": check_sockets,

@@ -12,7 +12,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from minimax_cal.fitting.instruments.data import NORM, RelativeData, check, points, wire_names
+from minimax_cal.fitting.instruments.data import (
+    NORM,
+    SPHERE,
+    RelativeData,
+    Surface,
+    check,
+    points,
+    wire_names,
+)
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.errors import DataError
 from minimax_cal.ground.files import write_whole
@@ -40,6 +48,7 @@ WIRE = re.compile(r"wire(\d+)_(mm|m)")
 PLACE = re.compile(r"flange_([xyz])_(mm|m)")
 TURN = re.compile(r"flange_r([xyz])_(rad|deg)")
 QUATERNION = re.compile(r"flange_q([wxyz])()")
+CONTACT = re.compile(r"surface|kind|(?:radius|ball_radius|offset)_(?:mm|m)|normal_[xyz]")
 DOUBT = re.compile(r"rotation_u95_(rad|deg)")  # of a pose, beside u95_mm of its position
 ANY_TARGET = ("smr1_x_mm", "smr1_y_mm", "smr1_z_mm")  # the header's rules ask for one
 
@@ -50,6 +59,7 @@ def kind_of(path: Path | str, header: Sequence[str]) -> str:
         "distances": [n for n in header if n.startswith("wire")],
         "closures": [n for n in header if n == "socket"],
         "poses": [n for n in header if n.startswith("flange")],
+        "contacts": [n for n in header if n == "surface"],
     }
     known = (WIRE, PLACE, TURN, QUATERNION)
     for name in (*families["distances"], *families["poses"]):
@@ -63,8 +73,8 @@ def kind_of(path: Path | str, header: Sequence[str]) -> str:
         return "points"
     if not found:
         raise DataError(
-            f"{path}:1: no measured columns; name them wire1_mm ..., or socket, or flange_x_mm, "
-            "flange_y_mm, flange_z_mm, flange_rx_rad ..., or smr1_x_mm ..."
+            f"{path}:1: no measured columns; name them wire1_mm ..., or socket, or surface with "
+            "kind, or flange_x_mm, flange_y_mm, flange_z_mm, flange_rx_rad ..., or smr1_x_mm ..."
         )
     if len(found) > 1:
         first, second = (families[kind][0] for kind in found[:2])
@@ -110,6 +120,7 @@ def optional_columns(file: Rows, kind: str) -> tuple[dict[str, Array], tuple[str
         family, match = optional_kind(name)
         match = match or DOUBT.fullmatch(name)
         own = name == "socket" or name.startswith(("wire", "flange"))
+        own |= kind == "contacts" and bool(CONTACT.fullmatch(name))
         if family in TEXT:
             columns[name] = np.array(file.text(name))
         elif match and (kind == "poses" or "u95" not in name):
@@ -194,7 +205,70 @@ def unit_rotation(file: Rows, quaternion: Array, seen: Array) -> Rotation:
     return Rotation.from_quat(quaternion[seen], scalar_first=True)
 
 
-READERS = {"distances": read_lengths, "closures": read_sockets, "poses": read_poses}
+def read_contacts(file: Rows, at: Measurements) -> tuple[RelativeData, Array]:
+    """Contacts of a probe, and which rows have none.  Raises DataError."""
+    labels = np.array(file.text("surface"))
+    rows = len(labels)
+    if "kind" not in file.header:
+        raise DataError(f"{file.path}:1: column kind is missing; it says plane or sphere")
+    kinds = np.array([text.strip().lower() for text in file.text("kind")])
+    sizes = {stem: sized(file, stem) for stem in ("radius", "offset", "ball_radius")}
+    faces = [name for name in file.header if name.startswith("normal_")]
+    if faces and len(faces) < 3:
+        raise DataError(
+            f"{file.path}:1: a face has normal_x, normal_y and normal_z; give all three"
+        )
+    normals = (
+        np.stack([file.number(f"normal_{axis}", unit="", empty=True) for axis in "xyz"], axis=1)
+        if faces
+        else np.full((rows, 3), np.nan)
+    )
+    touched = labels != ""
+    surfaces = []
+    for label in dict.fromkeys(labels[touched].tolist()):
+        here = np.flatnonzero(labels == label)
+        stem = "radius" if kinds[here[0]] == "sphere" else "offset"
+        told = np.column_stack([sizes[stem][here], normals[here]])
+        alike = (kinds[here] == kinds[here[0]]) & np.isclose(
+            told, told[0], rtol=0, atol=1e-9, equal_nan=True
+        ).all(axis=1)
+        if not alike.all():
+            line = file.line[here[int(np.argmin(alike))]]
+            raise DataError(
+                f"{file.path}:{line}: surface {label!r} has another kind, size or normal than in "
+                f"line {file.line[here[0]]}; a surface has one of each"
+            )
+        surfaces.append(Surface(label, str(kinds[here[0]]), float(told[0, 0]), normal_of(told[0])))
+    ball = np.unique(sizes["ball_radius"][np.isfinite(sizes["ball_radius"])])
+    if len(ball) > 1:
+        raise DataError(f"{file.path}: column ball_radius_mm: {len(ball)} values; a probe has one")
+    radius = float(ball[0]) if len(ball) else np.nan
+    data = RelativeData(
+        at, "contacts", surface=labels, surfaces=tuple(surfaces), ball_radius=radius
+    )
+    return data, ~touched
+
+
+def normal_of(told: Array) -> Array:
+    """(3,) unit normal of a face, (0,) where none is given.  told: (4,) size and normal."""
+    length = float(np.linalg.norm(told[1:]))
+    return told[1:] / length if np.isfinite(length) and length > 0.0 else np.zeros(0)
+
+
+def sized(file: Rows, stem: str) -> Array:
+    """(m,) a length by its name without the unit, NaN where it is empty or not there [m]."""
+    for unit in ("mm", "m"):
+        if f"{stem}_{unit}" in file.header:
+            return file.number(f"{stem}_{unit}", unit=unit, empty=True)
+    return np.full(len(file.rows), np.nan)
+
+
+READERS = {
+    "contacts": read_contacts,
+    "distances": read_lengths,
+    "closures": read_sockets,
+    "poses": read_poses,
+}
 
 
 def write_relative(path: Path | str, data: RelativeData) -> None:
@@ -207,6 +281,8 @@ def write_relative(path: Path | str, data: RelativeData) -> None:
     columns |= {f"{name}_mm": 1e3 * data.length[:, i] for i, name in enumerate(data.wires)}
     if data.kind == "closures":
         columns["socket"] = data.socket
+    if data.kind == "contacts":
+        columns |= contact_columns(data)
     if data.kind == "poses":
         turn = Rotation.from_matrix(data.pose[:, :3, :3]).as_rotvec()
         columns |= {f"flange_{axis}_mm": 1e3 * data.pose[:, i, 3] for i, axis in enumerate("xyz")}
@@ -220,6 +296,26 @@ def write_relative(path: Path | str, data: RelativeData) -> None:
     for row in zip(*columns.values(), strict=True):
         writer.writerow([cell(value) for value in row])
     write_whole(path, stream.getvalue())
+
+
+def contact_columns(data: RelativeData) -> dict[str, Array]:
+    """What was touched, as `read_relative` reads it."""
+    touched = {surface.label: surface for surface in data.surfaces}
+    each = [touched[str(label)] for label in data.surface]
+    sizes = {
+        "radius_mm": [s.size if s.kind == SPHERE else np.nan for s in each],
+        "offset_mm": [s.size if s.is_face else np.nan for s in each],
+        "ball_radius_mm": [data.ball_radius] * len(each),
+    }
+    normals = np.array([s.normal if s.is_face else np.full(3, np.nan) for s in each])
+    columns = {"surface": data.surface, "kind": np.array([s.kind for s in each])}
+    columns |= {name: 1e3 * np.array(values) for name, values in sizes.items()}
+    columns |= {f"normal_{axis}": normals[:, i] for i, axis in enumerate("xyz")}
+    return {
+        name: column
+        for name, column in columns.items()
+        if column.dtype.kind == "U" or np.isfinite(column).any()
+    }
 
 
 def cell(value: str | float) -> str:

@@ -24,6 +24,7 @@ from minimax_cal.fitting.instruments.options import (
 )
 from minimax_cal.fitting.instruments.points import Points, WholePoses
 from minimax_cal.fitting.instruments.poses import TOOL, lever_of, poses_as_targets
+from minimax_cal.fitting.instruments.probe import Contacts
 from minimax_cal.fitting.instruments.rows import Block
 from minimax_cal.fitting.instruments.sockets import Closures
 from minimax_cal.fitting.instruments.stack import Known, Squares, Stack
@@ -100,7 +101,13 @@ def poses_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Blo
     return WholePoses.seen(robot, train, lever_of(train, options.lever)[0])
 
 
+def contacts_of(robot: Robot, train: RelativeData, options: RelativeOptions) -> Block:
+    """Contacts as a block."""
+    return Contacts.of(robot, train)
+
+
 BLOCKS = {
+    "contacts": contacts_of,
     "distances": wires_of, "closures": closures_of, "points": points_of, "poses": poses_of,
 }  # fmt: skip
 
@@ -123,7 +130,7 @@ def allowed_of(stack: Stack, options: RelativeOptions) -> tuple[Array, Array]:
     allowed[5 * names.joints : names.geometric] = False
     for i, block in enumerate(stack.blocks):
         own = stack.columns(i)[names.geometric :]
-        allowed[own] &= [options.offset or not name.startswith("offset") for name in block.own]
+        allowed[own] &= [name not in block.held for name in block.own]
     return allowed, wanted
 
 
@@ -265,12 +272,17 @@ def numbers_of(train: RelativeData) -> int:
         return 3 * (sum(different) - len(labels))
     if train.kind == "poses":
         return 6 * len(np.unique(pose))
+    if train.kind == "contacts":
+        touched = [train.surface == surface.label for surface in train.surfaces]
+        return sum(len(np.unique(pose[here])) for here in touched)
     of_each = 3 if train.kind == "points" else 1
     seen = train.at.seen if train.kind == "points" else np.isfinite(train.length)
     return of_each * sum(len(np.unique(pose[column])) for column in seen.T)
 
 
-CALLED = {"distances": "lengths", "closures": "coordinates of visits"}
+CALLED = {
+    "distances": "lengths", "closures": "coordinates of visits", "contacts": "contacts",
+}  # fmt: skip
 
 
 def check_count(trains: Sequence[Train], stack: Stack, unknowns: int) -> None:

@@ -35,10 +35,16 @@ SHARED = 0.05  # of a direction that others leave open: a parameter with less is
 CLOSURES = "closures"
 FRAMELESS = "moves nothing that is measured"
 ALIKE = "moves or turns all sockets alike: closures know no base frame"
-SCALE = (
-    "all lengths together: a closure has no length standard; one known length, as "
-    "known_distances= A,B,MM, gives it"
-)
+LENGTHS = "all lengths together: "
+SCALE = {  # what lacks a length, and what gives it
+    CLOSURES: (
+        "a closure has no length standard", "one known length, as known_distances= A,B,MM, gives it"
+    ),
+    "contacts": (
+        "a contact has no length standard",
+        "a ball of known radius on a sphere or body of known size gives it",
+    ),
+}  # fmt: skip
 ALL_OWN = "all frames, anchors and targets of the files moved together"
 
 
@@ -128,7 +134,9 @@ def identified(
     keeper = scale_keeper(robot, kept.active, wanted) if no_length else []
     order = np.array(list(dict.fromkeys([*keeper, *(int(i) for i in order)])))
     gone = redundant(plain, kept.active, order, RANK_TOLERANCE)
-    kept = kept.without(gone, SAME_MOTION).without([i for i in gone if i in keeper], SCALE)
+    kept = kept.without(gone, SAME_MOTION).without(
+        [i for i in gone if i in keeper], LENGTHS + "; ".join(SCALE.get(stack.blocks[0].kind, ()))
+    )
     told = gram + np.diag(np.where(known, np.maximum(np.diag(gram), RANK_TOLERANCE), 0.0))
     kept = kept.without(redundant(told, kept.active, order, resolution), NOT_TOLD)
     whole = stack.blocks[0].whole if len(stack.blocks) == 1 else ALL_OWN

@@ -11,7 +11,7 @@ from minimax_cal.fitting.checks import EXPLAINED, MAX_TRIAL_POSES, POOR_FIT
 from minimax_cal.fitting.checks import check_plausible as of_points
 from minimax_cal.fitting.claims import MAX_MISS_OF_REACH
 from minimax_cal.fitting.identify import plenty_of_poses
-from minimax_cal.fitting.instruments.data import RelativeData
+from minimax_cal.fitting.instruments.data import SPHERE, RelativeData
 from minimax_cal.fitting.instruments.fit import (
     InstrumentFit,
     Train,
@@ -27,6 +27,7 @@ from minimax_cal.fitting.instruments.options import (
     silent,
 )
 from minimax_cal.fitting.instruments.poses import lever_of, poses_as_targets
+from minimax_cal.fitting.instruments.probe import Contacts
 from minimax_cal.fitting.instruments.result import Measured
 from minimax_cal.fitting.instruments.rows import Block, places
 from minimax_cal.fitting.instruments.sockets import Closures
@@ -39,6 +40,7 @@ from minimax_cal.robots.robot import Robot
 
 BETTER = 0.25  # of the mean square: what explains so much is worth a look
 LEAST = 5e-3  # a fit that misses by less leaves nothing to explain [mm]
+BETTER_RADIUS = 4.0  # times the mean square of a sphere whose radius is free
 FAR = 4.0  # sigmas of a prior that an arm may be off
 RESIZED = 0.25  # of what the arm sweeps: a fit that changes it by more is of no arm
 
@@ -53,6 +55,8 @@ def check_plausible(robot: Robot, data: RelativeData, options: RelativeOptions) 
         return
     data = data.take(some(data))
     block, x = started(robot, data, options)
+    if isinstance(block, Contacts):
+        check_radii(robot, data, options, block, x)
     given, limit = block.mean_square(x), POOR_FIT * robot.reach()
     if np.sqrt(given) <= limit:
         if isinstance(block, Closures):
@@ -108,7 +112,7 @@ def started(robot: Robot, data: RelativeData, options: RelativeOptions) -> tuple
 
 def size(block: Block, x: State) -> float:
     """What a mean square of closures is to be seen by: an arm that hardly moves closes anything."""
-    if not isinstance(block, Closures):
+    if not isinstance(block, Closures | Contacts):
         return 1.0
     return max(float(places(block.model, x).var(axis=-1).sum()), 1e-12)
 
@@ -147,6 +151,27 @@ def check_known(
         )
 
 
+def check_radii(
+    robot: Robot, data: RelativeData, options: RelativeOptions, contacts: Contacts, x: State
+) -> None:
+    """Raise DataError for a given radius that no arm like the drawn one can have found."""
+    if not (np.isfinite(data.ball_radius) and any(s.kind == SPHERE for s in data.surfaces)):
+        return
+    free = tuple(replace(s, size=np.nan) if s.kind == SPHERE else s for s in data.surfaces)
+    block, at = started(robot, replace(data, surfaces=free), options)
+    one, other = contacts.mean_square(x), block.mean_square(at)
+    found = block.placed(at, at)["surfaces"]
+    for surface in data.surfaces:
+        size_mm = found[surface.label].get("radius_mm", 0.0)
+        off = abs(size_mm - 1e3 * surface.size) if surface.kind == SPHERE else 0.0
+        if one > BETTER_RADIUS * other and off > FAR * 1e3 * np.sqrt(other):
+            raise DataError(
+                f"{data.at.source}: column radius_mm: by the arm as drawn surface "
+                f"{surface.label!r} has a radius of {size_mm:.4g} mm, not "
+                f"{1e3 * surface.size:.4g} mm; check radius_mm, ball_radius_mm and their units"
+            )
+
+
 def farthest(robot: Robot, options: RelativeOptions, closures: Closures, x: State) -> list[float]:
     """By how much the drawn arm may miss each known distance: more where priors let it [m]."""
     sigma = sigmas_of(closures.model.names, options)
@@ -163,6 +188,7 @@ def farthest(robot: Robot, options: RelativeOptions, closures: Closures, x: Stat
 WHICH = {
     "distances": "which length is which wire's",
     "closures": "the labels of the sockets",
+    "contacts": "the labels of the surfaces, and radii",
 }
 
 

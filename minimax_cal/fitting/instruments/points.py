@@ -55,6 +55,7 @@ class Points:
     kind = "points"
     row_noise = 1.0
     given_up: ClassVar[tuple[str, ...]] = ()
+    held: ClassVar[tuple[str, ...]] = ()
     whole = "all targets moved together"
     has_length = True
 

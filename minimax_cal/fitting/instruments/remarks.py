@@ -11,6 +11,7 @@ from minimax_cal.fitting.checks import POOR_FIT
 from minimax_cal.fitting.fit import Parameter
 from minimax_cal.fitting.instruments.data import RelativeData
 from minimax_cal.fitting.instruments.fit import InstrumentFit
+from minimax_cal.fitting.instruments.identify import LENGTHS, SCALE
 from minimax_cal.fitting.instruments.options import RelativeOptions
 from minimax_cal.fitting.instruments.poses import lever_of
 from minimax_cal.fitting.instruments.result import Measured, RelativeCalibration
@@ -20,6 +21,11 @@ from minimax_cal.ground.arrays import Array
 from minimax_cal.measuring import checks
 from minimax_cal.robots.kinematics import MDH_NAMES
 
+MORE = {  # what helps where positions are told weakly
+    "closures": "more sockets, farther apart",
+    "distances": "more anchors, around it",
+    "contacts": "more surfaces, of other directions and farther apart",
+}
 WEAK = 3.0  # times what was measured: positions that are told worse are weakly told
 WILD_LENGTH = 0.02  # of the reach: no link is farther from its drawing
 
@@ -42,16 +48,15 @@ def of_lever(
 def of_scale(fit: InstrumentFit) -> tuple[str, ...]:
     """What stands for the length standard that closures lack."""
     kept = [
-        name
-        for name, reason in fit.identification.reasons.items()
-        if reason.startswith("all lengths together")
+        name for name, reason in fit.identification.reasons.items() if reason.startswith(LENGTHS)
     ]
     if not kept:
         return ()
+    kind = fit.stack.blocks[0].kind
     return (
-        f"the scale is not identifiable from closures: {kept[0]} is kept as drawn, and if that is "
+        f"the scale is not identifiable from {kind}: {kept[0]} is kept as drawn, and if that is "
         "wrong by a part in a thousand, so is every length; sigmas leave this out; "
-        "known_distances= A,B,MM gives the scale",
+        + SCALE[kind][1],
     )
 
 
@@ -104,7 +109,7 @@ def weak(
     if kinds & {"points", "poses"} or (expected_mm <= WEAK * rms_mm and not untold):
         return ()
     where = f" ({', '.join(untold)} not at all)" if untold else ""
-    more = "more sockets, farther apart" if "closures" in kinds else "more anchors, around it"
+    more = next(MORE[kind] for kind in MORE if kind in kinds)
     return (
         f"positions are poorly determined{where}: by the sigmas to {expected_mm:.3g} mm, "
         f"what was measured fits to {rms_mm:.3g} mm, and model error makes positions worse still; "

@@ -31,6 +31,7 @@ from minimax_cal.solvers.status import Status
 SEVERAL = "several"  # kind of a calibration from several files
 QUANTITY = {
     "points": "point of the tracker",
+    "contacts": "gap between the probe's ball and its surface",
     SEVERAL: "what every file measured",
     "distances": "length of a wire",
     "closures": "ball about its socket",
@@ -39,6 +40,7 @@ QUANTITY = {
 }
 CAUTION = {
     "points": "",
+    "contacts": "A gap is no error of position: what moves along the surface does not show in it. ",
     SEVERAL: "Lengths, misclosures and positions are one number here; each file has its own. ",
     "distances": "An error of lengths is no error of position: what lies across the wires does "
     "not show in it. ",
@@ -47,6 +49,9 @@ CAUTION = {
     "poses": "",
     "pixels": "A pixel is no position: what moves along the line of sight does not show in it. ",
 }
+
+
+BY = {"distances": "by wire", "points": "by target", "contacts": "by surface"}
 
 
 class ErrorsPart(ScoresPart):
@@ -62,7 +67,7 @@ class ErrorsPart(ScoresPart):
 class MeasuredPart(Part):
     """What an instrument measured, and how well it is fitted, in a file."""
 
-    measured: Literal["distances", "closures", "poses", "points", "pixels", "several"]
+    measured: Literal["distances", "closures", "poses", "points", "contacts", "pixels", "several"]
     parts: tuple[str, ...]
     instrument: dict[str, Any] = Field(default_factory=dict)
     accuracy: dict[Literal["nominal", "holdout", "nominal_train", "train"], ErrorsPart]
@@ -312,13 +317,13 @@ class RelativeCalibration(Measured):
     def tables(self) -> tuple[Table, ...]:
         """Every table of the result."""
         parts = len(self.parts) > 1 and self.errors and not self.instruments
-        own: list[Table] = [self.parts_table("by wire")] if parts else []
+        own: list[Table] = [self.parts_table(BY.get(self.kind, "by part"))] if parts else []
         own += tables_of(self.frames)
         for one in self.instruments:
             own.append(one.scores(f"{one.name}: {QUANTITY[one.kind]}"))
             own += tables_of(one.frames)
             if len(one.parts) > 1 and one.errors:
-                own.append(one.parts_table(f"{one.name}, part by part"))
+                own.append(one.parts_table(f"{one.name}, {BY.get(one.kind, 'by part')}"))
         first = [self.files_table(), self.alone_table()] if self.instruments else [
             self.accuracy_table()
         ]  # fmt: skip

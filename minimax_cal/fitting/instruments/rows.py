@@ -50,6 +50,10 @@ class Block(Protocol):
         """Those of them that redundancy takes first."""
 
     @property
+    def held(self) -> tuple[str, ...]:
+        """Those of them that are not fitted, as their values are given."""
+
+    @property
     def spots(self) -> slice:
         """Where the model's targets stand among its own."""
 

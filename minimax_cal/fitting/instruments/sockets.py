@@ -48,6 +48,7 @@ class Closures:
     kind = "closures"
     own = SPOT
     given_up: ClassVar[tuple[str, ...]] = ()
+    held: ClassVar[tuple[str, ...]] = ()
     spots = slice(0, 3)
     row_noise = 1.0
     whole = ""

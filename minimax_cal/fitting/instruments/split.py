@@ -132,4 +132,6 @@ def numbers_by_row(data: RelativeData) -> Array:
         return np.full(data.poses, 6)
     if data.kind == "points":
         return np.asarray(3 * data.at.seen.sum(axis=1))
+    if data.kind == "contacts":
+        return np.ones(data.poses, dtype=int)
     return np.asarray(np.isfinite(data.length).sum(axis=1))

@@ -66,6 +66,11 @@ class Wires:
         return tuple(name for name in self.own if name.startswith("offset"))
 
     @property
+    def held(self) -> tuple[str, ...]:
+        """The offsets, unless they are to be fitted: 0."""
+        return () if self.with_offsets else self.given_up
+
+    @property
     def parts(self) -> tuple[str, ...]:
         """The wires."""
         return self.wires
