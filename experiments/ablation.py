@@ -86,11 +86,6 @@ def no_penalty(kind: Any, *_: Any) -> Any:
     return np.zeros(len(kind.free))
 
 
-def alike_alone(before: Any, wide: Any, folds: Any) -> bool:
-    """Groups left out are met better, all of them weighing alike."""
-    return bool(wide.cross_validated(folds) < before.cross_validated(folds))
-
-
 def no_maps(*_: Any, **__: Any) -> Any:
     """No joint has one."""
     return import_module("minimax_cal.diagnosing.error_maps").NO_MAPS
@@ -113,16 +108,7 @@ RULES: dict[str, dict[str, object]] = {
     "worth of a remainder": {"diagnosing.what_remains:WORTH": 0.0},
     "each joint's own scatter": {"diagnosing.causes:weighed_anew": first},
     "joints read back": {"diagnosing.causes:read_back_fault": nothing},
-    "a wave by itself is held back": {
-        "diagnosing.causes:held_back": never,
-        "diagnosing.folds:held_back": never,
-    },
-    "mostly loose": {
-        "diagnosing.causes:mostly_loose": never,
-        "diagnosing.verdict:mostly_loose": never,
-    },
-    "ends of an angle or the time": {"diagnosing.gap:ends_of": nothing},
-    "steps by the predicted error": {"diagnosing.gap:tells": alike_alone},
+    "mostly loose": {"diagnosing.verdict:mostly_loose": never},
     "priors of effects by their size": {
         "diagnosing.joint:weights_of": no_prior,
         "diagnosing.trial:weights_of": no_prior,

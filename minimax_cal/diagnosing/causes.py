@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from minimax_cal.diagnosing.error_maps import NO_MAPS, Mapped
-from minimax_cal.diagnosing.established import asked, judged_again, mostly_loose, often
+from minimax_cal.diagnosing.established import judged_again
 from minimax_cal.diagnosing.next_measurement import Pair, Site, separate_with
 from minimax_cal.diagnosing.result import Alternative, Finding
 from minimax_cal.diagnosing.scatter import weighed_anew
@@ -28,7 +28,6 @@ from minimax_cal.modelling.effects.gears import GEAR_RIPPLE
 from minimax_cal.modelling.effects.scene import Scene, joint_of, unmasked
 from minimax_cal.modelling.effects.table import EFFECTS, Term
 from minimax_cal.modelling.effects.time import SESSION_JUMP
-from minimax_cal.modelling.periodogram import elsewhere, in_company
 
 ADVISED = 3  # rivals of an effect for which a further measurement is worked out
 
@@ -39,8 +38,7 @@ class Causes:
 
     faults: of the data.  exclude: effects that were not looked for.
     choice: the effects selected, effects: as findings, the weightiest first.
-    left: what they leave.  untestable: effects, and what the data lack for them.  wary:
-    whether anything is left that matters, or names that change with the poses.  maps: of joints,
+    left: what they leave.  untestable: effects, and what the data lack for them.  maps: of joints,
     sought beside the effects, once there is a ladder.  jobs: processes that search parts of the
     poses, cluster: address of a Dask scheduler instead.
     """
@@ -51,7 +49,6 @@ class Causes:
     effects: tuple[Finding, ...]
     left: tuple[Remains, ...]
     untestable: tuple[tuple[str, str], ...]
-    wary: bool
     maps: Mapped = NO_MAPS
     jobs: int = 1
     cluster: str = ""
@@ -91,53 +88,17 @@ def causes_of(
     every, told = (*faults, *read_back), choice.library.untestable
     if read_back or study is not plain:
         left = left_by(study, choice)
-    causes = Causes(
-        every, tuple(exclude), choice, (), left, told, wary=False, jobs=jobs, cluster=cluster
-    )
+    causes = Causes(every, tuple(exclude), choice, (), left, told, jobs=jobs, cluster=cluster)
     return study, found_again(study, causes)
 
 
 def found_again(study: Study, causes: Causes) -> Causes:
-    """The causes with their effects as findings: rivals, and how often each is found again.
-
-    And whether what these leave matters, or most of them change with the poses.
-    """
+    """The causes with their effects as findings: rivals, and how often each is found again."""
     choice = causes.choice
     found = merged([finding(study, choice, i) for i in by_weight(choice)])
     found = [with_untested(one, study.scene, causes.exclude) for one in found]
     effects = judged_again(found, choice, study, causes.jobs, causes.cluster)
-    change = mostly_loose(effects, [found for found in effects if found.established])
-    wary = (change and asked(effects)) or loudest(causes.left) is not None
-    return replace(causes, choice=choice.portable(), effects=effects, wary=wary)
-
-
-def believed(causes: Causes, scene: Scene) -> list[Finding]:
-    """The effects that are in the model: found often enough, and not held back."""
-    every = [term for found in causes.effects for term in found.terms]
-    often_found = often(causes.effects)
-    return [one for one in often_found if not held_back(one.terms, every, causes, scene)]
-
-
-def held_back(terms: Sequence[Term], every: Sequence[Term], causes: Causes, scene: Scene) -> bool:
-    """Whether an effect is a best guess that is in no model: a wave by itself.
-
-    terms: of the effect, every: of all that were found with it.
-    """
-    return causes.wary and lone(terms, every, scene)
-
-
-def lone(terms: Sequence[Term], every: Sequence[Term], scene: Scene) -> bool:
-    """Whether it is waves of a joint that no gear tells: neither its ratio, nor other lines.
-
-    Among thousands of frequencies one fits a curve that has no name, and meets new poses no better.
-    """
-    effect, place = terms[0].key
-    if effect != GEAR_RIPPLE.name:
-        return False
-    lines = [term for term in every if term.effect == effect]
-    own = [line.choice["turns"] for line in lines if line.place == place]
-    ratio, q = scene.robot.ratio[joint_of(place)], scene.q[joint_of(place)]
-    return not in_company(float(ratio), q, own, elsewhere(place, lines))
+    return replace(causes, choice=choice.portable(), effects=effects)
 
 
 def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
@@ -155,13 +116,10 @@ def beside_curves(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
 
 
 def beside_maps(study: Study, causes: Causes, maps: Sequence[Term]) -> Causes:
-    """The causes with what their effects and some maps leave together.
-
-    Names that changed with the poses are no longer there to be wary of: the maps are.
-    """
+    """The causes with what their effects and some maps leave together."""
     fields = [study.rows.of(term.columns(study.scene).displacement(study.scene)) for term in maps]
     left = left_by(study, causes.choice, np.concatenate(fields, axis=1) if fields else None)
-    return replace(causes, left=left, wary=loudest(left) is not None)
+    return replace(causes, left=left)
 
 
 def chosen(study: Study, exclude: Sequence[str], first: Sequence[Added] = ()) -> Choice:

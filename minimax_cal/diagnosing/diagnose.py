@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 
 from minimax_cal.diagnosing.causes import (
     Causes,
-    believed,
     beside_curves,
     beside_maps,
     causes_of,
@@ -24,6 +23,7 @@ from minimax_cal.diagnosing.causes import (
     with_jumps,
 )
 from minimax_cal.diagnosing.error_maps import error_maps
+from minimax_cal.diagnosing.established import often
 from minimax_cal.diagnosing.folds import beyond_of
 from minimax_cal.diagnosing.foot import foot_notices
 from minimax_cal.diagnosing.gap import (
@@ -325,20 +325,19 @@ def with_maps(study: Study, causes: Causes, progress: Progress) -> tuple[Causes,
 
     With the error maps, and fine waves, that joints have besides.
     """
-    often = believed(causes, study.scene)
-    chosen = [term for finding in often for term in finding.terms]
-    causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in often))
-    ladder = climbed(study, [finding.terms for finding in causes.effects], wary=causes.wary)
+    found = often(causes.effects)
+    chosen = [term for finding in found for term in finding.terms]
+    causes = replace(causes, effects=tuple(whole(f, chosen, study.scene) for f in found))
+    ladder = climbed(study, [finding.terms for finding in causes.effects])
     progress("error maps of joints")
     maps = error_maps(ladder.last, causes.exclude)
     if not maps.terms:
         return causes, ladder
     effects = merged(maps.findings([causes.effects[i] for i in ladder.taken], study.scene))
-    causes = beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), maps.terms)
-    ladder = climbed(study, [finding.terms for finding in effects], wary=causes.wary)
+    ladder = climbed(study, [finding.terms for finding in effects])
     texts = {term.text for term in ladder.last.terms}
     held = [term for term in maps.terms if term.text in texts]
-    return (causes if len(held) == len(maps.terms) else beside_maps(study, causes, held)), ladder
+    return beside_maps(study, replace(causes, effects=tuple(effects), maps=maps), held), ladder
 
 
 def floor_beneath(robot: Robot, data: Measurements, last: Joint, step: Step) -> Floor:

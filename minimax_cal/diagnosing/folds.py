@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from minimax_cal.diagnosing.causes import Causes, effects_of, held_back
+from minimax_cal.diagnosing.causes import Causes, effects_of
 from minimax_cal.diagnosing.gap import Judges, Ladder, climbed
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence.selection import select, tuned_again
@@ -25,17 +25,12 @@ from minimax_cal.modelling.parameters import State
 def fold_of(study: Study, causes: Causes, rows: Array, state: State) -> Ladder:
     """Effects sought and fitted on some rows only; maps of joints only fitted.
 
-    causes: of all rows; the products of their library serve every fold, and what holds names back
-    holds them back in it.  rows: (m,) True for those used.  state: the geometry that was fitted to
-    them.
+    causes: of all rows; the products of their library serve every fold.  rows: (m,) True for those
+    used.  state: the geometry that was fitted to them.
     """
     small = studied(study.robot, study.data.take(rows), replace(study.fit, state=state))
     choice = tuned_again(select(causes.choice.part(study.rows.at(rows))))
-    every = [candidate.term for candidate in choice.chosen]
-    named = [
-        terms for terms in effects_of(choice) if not held_back(terms, every, causes, study.scene)
-    ]
-    return climbed(small, causes.maps.beside(named), wary=causes.wary)
+    return climbed(small, causes.maps.beside(effects_of(choice)))
 
 
 def fold_errors(

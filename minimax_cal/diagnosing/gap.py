@@ -11,8 +11,8 @@ import numpy as np
 from minimax_cal.diagnosing.joint import Joint, joint
 from minimax_cal.diagnosing.result import TOLD_AS, Finding, Step, as_motion
 from minimax_cal.diagnosing.study import Study
-from minimax_cal.diagnosing.trial import Predicting, Trials
-from minimax_cal.evidence.limits import END, FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
+from minimax_cal.diagnosing.trial import Trials
+from minimax_cal.evidence.limits import FOLDS, HELPS, MINOR, SAYS_NOTHING, SEEN_BEFORE
 from minimax_cal.fitting.beyond import without
 from minimax_cal.fitting.stations import steps_of
 from minimax_cal.ground.arrays import Array
@@ -94,15 +94,11 @@ def folds(data: Measurements, count: int) -> Array:
     return np.asarray(order[group] % count)
 
 
-def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = False) -> Ladder:
+def climbed(study: Study, effects: Sequence[Sequence[Term]]) -> Ladder:
     """The ladder of a study's effects, in their order; with maps of joints the largest first.
 
     What is refused is tried again beside what was taken after it: beside errors much larger than
     its own the prior of a map is too wide.
-
-    wary: where structure is left, or names change with the poses, they are a best guess.  Laws of a
-    joint's angle, or of the time, are then believed only if the ends of what drives them, left out,
-    are met no worse either: there a law that is not the machine's goes astray.
     """
     part, trials = folds(study.data, FOLDS), Trials(study, effects)
     last, taken = trials.trial(()), list[int]()
@@ -113,9 +109,9 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
         refused: list[tuple[int, int]] = []  # with how many were taken before
         for number in waiting:
             wide = trials.trial((*taken, number))
-            helps = wide.no_worse(last) and tells(last, wide, wide.spared(spared))
-            ends = ends_of(study.scene, effects[number][0]) if wary else []
-            if helps and not astray(last, wide, ends):
+            both = wide.spared(spared)
+            better = wide.cross_validated(both) < (1.0 - HELPS) * last.cross_validated(both)
+            if better and wide.no_worse(last):
                 last = wide
                 taken.append(number)
             else:
@@ -123,17 +119,6 @@ def climbed(study: Study, effects: Sequence[Sequence[Term]], *, wary: bool = Fal
         waiting = [number for number, before in refused if mapped and before < len(taken)]
     fits = Fits(study, [effects[number] for number in taken])
     return Ladder(fits, tuple(taken), tuple(spared))
-
-
-def tells(before: Predicting, wide: Predicting, folds: Sequence[Array]) -> bool:
-    """Whether groups that are left out are met better with more effects.
-
-    All alike, as they are claimed; or weighed as they can be foretold: where groups are clusters
-    few others tell the geometry there, and what it errs by drowns what an effect mends.
-    """
-    alike = [fit.cross_validated(folds) for fit in (before, wide)]
-    weighed = [fit.foretold(folds, wide) for fit in (before, wide)]
-    return any(new < (1.0 - HELPS) * old for old, new in (alike, weighed))
 
 
 def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> list[int]:
@@ -153,28 +138,6 @@ def by_size(trials: Trials, study: Study, effects: Sequence[Sequence[Term]]) -> 
             whole[number] += rows.of(np.tensordot(value, fields, 1)[None])[:, 0]
     clear = whole - (whole @ rows.basis) @ rows.basis.T
     return [int(number) for number in np.argsort(-(clear**2).sum(axis=1), kind="stable")]
-
-
-def astray(before: Predicting, wide: Predicting, ends: Sequence[Array]) -> bool:
-    """Whether the ends of what drives an effect are met worse with it, when they are left out."""
-    told = wide.spared(before.spared(ends))
-    return wide.cross_validated(told) > before.cross_validated(told)
-
-
-def ends_of(scene: Scene, term: Term) -> list[Array]:
-    """Poses (m,) at both ends of the angle or the time that a law follows; none of other laws.
-
-    A map is nothing beyond the angles that were measured.
-    """
-    effect, driver = EFFECTS[term.effect], np.zeros(0)
-    if effect.follows == "time":
-        driver = scene.column("clock")
-    elif effect.of_angle and not effect.is_map and term.place != "all":
-        driver = scene.q[joint_of(term.place)]
-    if not driver.size or np.ptp(driver) == 0.0:
-        return []
-    low, high = np.quantile(driver, (END, 1.0 - END))
-    return [driver <= low, driver >= high]
 
 
 def valued(findings: Sequence[Finding], ladder: Ladder) -> list[Finding]:

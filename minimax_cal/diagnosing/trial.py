@@ -24,7 +24,6 @@ from minimax_cal.modelling.effects.bounds import at_bounds, bounds
 from minimax_cal.modelling.effects.table import Term
 from minimax_cal.modelling.joint_fit import extended
 from minimax_cal.solvers.bounded import bounded
-from minimax_cal.solvers.least_squares import solve_normal
 
 
 class Predicting(ABC):
@@ -57,23 +56,6 @@ class Predicting(ABC):
         if len(self.spared(folds)) < len(folds):
             return float("inf")
         return sum((float((self.left_at(fold) ** 2).sum()) for fold in folds), 0.0)
-
-    def foretold(self, folds: Sequence[Array], known: Predicting) -> float:
-        """The same, errors weighed as a known fit predicts them without each fold.
-
-        left' (1 + A C A')^-1 left, C being the covariance of its parameters without the fold, over
-        the variance of a coordinate.  That is left' left - (A' left)' B^-1 (A' left), where B are
-        the products of all poses.  Where a direction is identified by a fold alone, its errors
-        count little.
-        """
-        poses, total = known.poses, 0.0
-        for fold in folds:
-            left = self.left_at(fold)
-            score = np.tensordot(poses.jacobian[fold], left, ((0, 1), (0, 1)))
-            total += float(
-                (left**2).sum() - score @ solve_normal(poses.normal_matrix, score[:, None])[:, 0]
-            )
-        return total
 
     def left_at(self, fold: Array) -> Array:
         """(f, r) errors at the poses of a fold, mask (m,), by a fit without them, linear."""
