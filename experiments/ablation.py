@@ -93,14 +93,11 @@ def no_maps(*_: Any, **__: Any) -> Any:
 
 # rule: what stands in its place, by module, or class, and name
 RULES: dict[str, dict[str, object]] = {
-    "one law for two of one driver": {"evidence.selection:one_course": first_two},
-    "drop what became needless": {"evidence.selection:needed": second},
     "replacement": {"evidence.selection:refined": first_two},
     "signs cost evidence": {"evidence.selection:against_signs": zero},
     "noise along a field by groups": {"evidence.bench:inflation": one},
     "usual sizes": {"evidence.bench:prior_penalty": no_penalty},
     "alternatives by luck": {"evidence.alternatives:LUCK": 0.0},
-    "alternatives by fit alone": {"evidence.alternatives:LIGHT": -1e9},
     "alternatives needed beside": {"evidence.bench:Bench.p_beside": one},
     "alternatives from subsamples": {"evidence.stability:Repeats.instead_of": nothing},
     "alternatives not testable": {"diagnosing.causes:with_untested": first},

@@ -109,7 +109,6 @@ class TorqueLaws:
             typical=law.typical * (self.size[term.joint] if law.of_torque else 1.0),
             tuned=len(term.tuned),
             repeats=law.repeats,
-            course="",
         )
 
     def finer(self, term: Term) -> list[Term]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from minimax_cal.evidence.bench import Added, Bench
 from minimax_cal.evidence.library import Library
-from minimax_cal.evidence.limits import BAND, ENOUGH, LEVEL, LIGHT, LUCK
+from minimax_cal.evidence.limits import BAND, ENOUGH, LEVEL, LUCK
 from minimax_cal.evidence.noise import restricted
 from minimax_cal.ground.arrays import Array
 
@@ -22,7 +22,7 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
     for other in table.everyone:
         if other.candidate.key in seen or other.evidence <= 0.0:
             continue
-        close = near(one, other)
+        close = other.evidence > one.evidence - BAND
         alike = other.candidate.family == one.candidate.family  # as all joints hold one
         if not close and (alike or other.evidence < one.evidence - LUCK):
             continue
@@ -32,20 +32,6 @@ def alternatives(table: Bench, one: Added) -> list[tuple[Added, float, float]]:
             seen.add(other.candidate.key)
             out.append((other, rho2, power))
     return out
-
-
-def near(one: Added, other: Added) -> bool:
-    """Whether another effect does nearly as well.
-
-    By evidence; or, if it is another effect, by fit alone, its parameters charged lightly: many
-    parameters are unlikely, but not impossible.
-    """
-    if other.evidence > one.evidence - BAND:
-        return True
-    if other.candidate.family == one.candidate.family:
-        return False
-    fit, rival = (x.gain - 2.0 * len(x.candidate.main) for x in (one, other))
-    return rival > fit - LIGHT
 
 
 def resemblances(lib: Library, column: Array) -> dict[tuple[str, str], float]:

@@ -25,7 +25,6 @@ class Spec:
     sigma per unit of the parameter owner (r,).  nonnegative: (d,) True for parameters that are
     never below 0.  typical: the usual size of a parameter.  tuned: numbers of the law that are
     searched, and cost as parameters do.  repeats: whether one place may hold several of the family.
-    course: what drives it, where two laws of one driver may be a single one; empty for none.
     """
 
     term: Any
@@ -38,7 +37,6 @@ class Spec:
     typical: float
     tuned: int
     repeats: bool
-    course: str
 
 
 class Dictionary(Protocol):

@@ -39,7 +39,6 @@ class Candidate:
     typical: float
     shapes: int
     repeats: bool
-    course: str
 
     @property
     def family(self) -> str:
@@ -253,5 +252,4 @@ class Stack:
             typical=found.typical,
             shapes=found.tuned,
             repeats=found.repeats,
-            course=found.course,
         )

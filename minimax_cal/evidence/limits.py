@@ -30,7 +30,6 @@ UNLIKE = 1e-6  # chance that noises alike look so unlike that rows are weighed o
 
 BAND = 12.0  # of evidence: what fits worse by less may be the truth (blind_gap: in all sets,
 # lambda 50 and more)
-LIGHT = 4.0  # of fit, in the same sense, parameters charged lightly
 ENOUGH, LUCK = 25.0, 22.0  # power that tells two effects apart; loss of evidence without it
 HELPFUL, NO_POWER = 0.5, 0.01  # shares of that power: less is not proposed; none can be had
 COVERED = 0.8  # share of a joint's range that counts as the whole

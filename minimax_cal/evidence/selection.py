@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -156,22 +155,7 @@ def select(
         noise = noise_beside(lib, fits)
     if len(fits) > REFINED or lib.is_part:
         lib, fits = refined(lib, fits, level)
-    lib, fits = one_course(lib, fits)
-    fits = needed(lib, fits, level)
     return Choice(lib, tuple(fits), noise_beside(lib, fits))
-
-
-def needed(lib: Library, fits: list[Added], level: float) -> list[Added]:
-    """The effects without those that the others made needless, the weakest first."""
-    while fits:
-        values = together(lib, fits, noise_beside(lib, fits), free=True)
-        weakest = int(np.argmin([np.mean((v / np.maximum(s, 1e-300)) ** 2) for v, s in values]))
-        chosen, others = without(fits, weakest)
-        table = bench(lib, chosen, others)
-        if table.p_value(table.added(fits[weakest].candidate)) <= level:
-            break
-        fits = others
-    return fits
 
 
 def begun(lib: Library, first: Sequence[Added]) -> tuple[Library, list[Added]]:
@@ -322,31 +306,6 @@ def refined(
                 fits[number] = own
         if not changed:
             break
-    return lib, fits
-
-
-def one_course(lib: Library, fits: list[Added]) -> tuple[Library, list[Added]]:
-    """Two names of one driver give way to one whose course is tuned, where that explains as much.
-
-    A law of time or moves with a course that is not quite its own calls for a second one.
-    """
-    for pair in combinations(fits, 2):
-        drivers = {one.candidate.course for one in pair}
-        keys = {one.candidate.key for one in pair}
-        free = [c for c in lib.candidates if c.key in keys and c.shapes]
-        if len(drivers) > 1 or "" in drivers or not free:
-            continue
-        others = [one for one in fits if one not in pair]
-        chosen = [one.candidate for one in others]
-        table = bench(lib, chosen, others)
-        first = table.added(pair[0].candidate)
-        beside = bench(lib, [*chosen, first.candidate], [*others, first])
-        both = first.evidence + beside.added(pair[1].candidate).evidence
-        near = table.ranked(free)[0]
-        best = shaped(table, near)
-        if best.evidence > both - TIE:
-            lib, best = adopted(lib, best, near.candidate)
-            return one_course(lib, [*others, best])
     return lib, fits
 
 

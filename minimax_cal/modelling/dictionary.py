@@ -17,7 +17,6 @@ from minimax_cal.modelling.periodogram import is_expected, strongest_lines
 from minimax_cal.modelling.rows import Rows
 
 SHAPES = FREE - {"turns"}  # tuned numbers; a line's frequency is paid by its tries
-COURSES = {"time": "time", "move": "move", "approach": "move"}  # of effects that follow one thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +47,6 @@ class ArmLaws:
             typical=effect.typical,
             tuned=int(sum(np.isfinite(value) for value in tuned)),
             repeats=effect.lines and term.place != "all",
-            course=COURSES.get(effect.follows, ""),
         )
 
     def finer(self, term: Term) -> list[Term]:

@@ -14,7 +14,7 @@ from minimax_cal.diagnosing.diagnose import resemblance
 from minimax_cal.diagnosing.study import Study, studied
 from minimax_cal.evidence import selection
 from minimax_cal.evidence.alternatives import alternatives
-from minimax_cal.evidence.bench import Added, against_signs, bench, columns_of, credible
+from minimax_cal.evidence.bench import against_signs, bench, columns_of, credible
 from minimax_cal.evidence.library import Kind
 from minimax_cal.evidence.limits import LEVEL
 from minimax_cal.evidence.noise import restricted
@@ -281,16 +281,3 @@ def test_terms_of_one_place_are_not_chosen_twice() -> None:
     keys = [c.key for c in choice.chosen if c.term.effect != "gear_ripple"]
     assert len(keys) == len(set(keys))
     assert Term("backlash", "J3").label == "backlash:J3"
-
-
-def test_a_wrong_sign_keeps_nothing_else_in() -> None:
-    """Of a compliance below zero, which no body has, beside effects that are not there."""
-    against = SOFT * np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
-    made = yielding(opened(seed=5), np.array([0.0, 0.0, 0.1]), against)
-    lib = arm_library(made.scene, made.rows)
-    fits: list[Added] = []
-    for label in ("joint_compliance:J3", "backlash:J1", "settling:J4"):
-        c = next(c for c in lib.candidates if c.term.label == label)
-        fits.append(bench(lib, [one.candidate for one in fits], fits).added(c))
-    kept = selection.needed(lib, fits, LEVEL)
-    assert [one.candidate.term.label for one in kept] == ["joint_compliance:J3"]
