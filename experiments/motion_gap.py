@@ -30,6 +30,7 @@ from experiments.sweep import Study, study_options
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.tables import Cell, Table
 from minimax_cal.simulators.chain import mujoco
+from minimax_cal.simulators.motion.ladder import MOTOR
 from minimax_cal.simulators.motion.module import loaded
 
 WITHHELD = (  # of the cases of an arm, in turn
@@ -39,17 +40,19 @@ WITHHELD = (  # of the cases of an arm, in turn
     ("friction", "armature"),
     ("friction", "load", "armature", "payload", "delay"),
 )
+REST = ("friction", "bristle")  # of an arm each, with and without motors that hold friction
 RUNS, SECONDS = 4, 10.0  # of the logs
 UNSEEN, UNSEEN_SPEED, UNSEEN_SECONDS = 77, 1.1, 8.0  # the run that judges
 
 
 @dataclass(frozen=True)
 class Case:
-    """A simulated arm and what its file lacks."""
+    """A simulated arm, what its file lacks, and what holds friction beside a constraint."""
 
     arm: str
     withheld: tuple[str, ...]
     seed: int
+    friction: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ def run(case: Case) -> Closed:
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "arm.xml", Path(folder) / "corrected.xml"
         path.write_bytes(arm.xml)
-        gap = mc.motion_gap(path, logged(arm, RUNS, SECONDS), write=out, driven=False)
+        gap = mc.motion_gap(path, logged(arm, RUNS, SECONDS), write=out,
+                            driven=False, friction=case.friction)  # fmt: skip
         module = Path(gap.module).read_text() if gap.module else ""
         first, plain, full = (mujoco().MjModel.from_xml_path(str(one)) for one in (path, out, out))
     at = commands(arm, UNSEEN, UNSEEN_SPEED)
@@ -115,33 +119,55 @@ class Left:
 class Judged:
     """RMS current (n,) under the measured motion of the run [A], all rows.
 
-    before: of the URDF.  plain: of the corrected file.  full: with its module.
+    before: of the URDF.  plain: of the corrected file.  full: with its module.  motor, both: the
+    same with motors that hold friction at rest.
     """
 
     name: str
     before: Array
     plain: Array
     full: Array
+    motor: Array
+    both: Array
 
 
 def judge(left: Left) -> Judged:
     """The corrected model on a run of the real arm that no fit saw."""
     files = sorted((SHARED / REAL).glob("*.csv"))
     name = files[left.run].stem
-    gap = mc.motion_gap(
-        SHARED / REAL / "ur10e.urdf",
-        files,
-        holdout_run=name,
-        drive_gain=DRIVE_GAIN,
-        ratio=RATIO,
-        driven=False,
-    )
-    inside = [rung for rung in gap.rungs if not rung.name.endswith("(module)")]
-    ends = (gap.rungs[0], inside[-1], gap.rungs[-1])
-    return Judged(name, *(np.array(rung.torque_rms) for rung in ends))
+    found = []
+    for friction in (None, MOTOR):
+        gap = mc.motion_gap(
+            SHARED / REAL / "ur10e.urdf",
+            files,
+            holdout_run=name,
+            drive_gain=DRIVE_GAIN,
+            ratio=RATIO,
+            driven=False,
+            friction=friction,
+        )
+        inside = [rung for rung in gap.rungs if not rung.name.endswith("(module)")]
+        found += [inside[-1], gap.rungs[-1]]
+    return Judged(name, *(np.array(rung.torque_rms) for rung in (gap.rungs[0], *found)))
 
 
 # ---- tables ------------------------------------------------------------------------------------
+
+
+SAID = {"before": "URDF", "plain": "corrected file", "full": "with its module",
+        "motor": "corrected file, dcmotor", "both": "with its module"}  # fmt: skip
+
+
+def rest_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
+    """What remains where friction is that of bristles, without and with motors that hold it."""
+    rows: list[tuple[Cell, ...]] = []
+    for i in range(0, len(cases), 2):
+        plain, motor = found[i : i + 2]
+        rows.append((cases[i].arm, plain.before, *shares(plain)[:2], *shares(motor)[:2]))
+    header = ("arm", "joint error as given mrad", "remains %", "worst torque %",
+              "with dcmotor %", "worst torque %")  # fmt: skip
+    title = "Friction that builds up over 1 mrad, on a run that no log holds"
+    return Table(title, header, tuple(rows), ("", ".3g", ".3g", ".3g", ".3g", ".3g"))
 
 
 def closed_table(cases: Sequence[Case], found: Sequence[Closed]) -> Table:
@@ -173,9 +199,8 @@ def real_table(found: Sequence[Judged]) -> Table:
     """RMS current of the real arm's runs, each judged by a model that did not see it."""
     n = len(found[0].before)
     rows: list[tuple[Cell, ...]] = []
-    for name in ("before", "plain", "full"):
+    for name, said in SAID.items():
         each = np.array([getattr(one, name) for one in found])
-        said = {"before": "URDF", "plain": "corrected file", "full": "with its module"}[name]
         rows.append((said, *np.sqrt((each**2).mean(axis=0)).tolist()))
     title = f"UR10e: RMS current [A] under measured motion, {len(found)} runs left out, all rows"
     return Table(title, ("model", *(f"J{j + 1}" for j in range(n))), tuple(rows),
@@ -191,18 +216,19 @@ def main(study: Study) -> None:
     cases = [Case(arm, kind, study.seed + number)
              for arm in arms for number, kind in enumerate(kinds)]  # fmt: skip
     found = study.sweep(run, cases, "simulated arms")
-    tables = [closed_table(cases, found)]
+    resting = [Case(arm, REST, study.seed, friction) for arm in arms for friction in (None, MOTOR)]
+    rested = study.sweep(run, resting, "arms with bristles")
+    tables = [closed_table(cases, found), rest_table(resting, rested)]
     content: dict[str, object] = {
         "cases": [{"arm": case.arm, "withheld": list(case.withheld), "seed": case.seed,
-                   "before_mrad": one.before, "remains_percent": list(shares(one))}
-                  for case, one in zip(cases, found, strict=True)]
+                   "friction": case.friction, "before_mrad": one.before, "remains_percent": list(shares(one))}
+                  for case, one in zip([*cases, *resting], [*found, *rested], strict=True)]
     }  # fmt: skip
     if not study.quick and here(REAL):
         count = len(list((SHARED / REAL).glob("*.csv")))
         judged = study.sweep(judge, [Left(i) for i in range(count)], "runs left out")
         tables.append(real_table(judged))
-        content["real"] = [{"run": one.name, "before": one.before.tolist(),
-                            "plain": one.plain.tolist(), "full": one.full.tolist()}
+        content["real"] = [{"run": one.name, **{name: getattr(one, name).tolist() for name in SAID}}
                            for one in judged]  # fmt: skip
     elif not study.quick:
         click.echo(f"{REAL}: its logs are not on this machine; only simulated arms", err=True)

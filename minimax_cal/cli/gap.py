@@ -29,7 +29,7 @@ from minimax_cal.simulators.ladder import simulator_gap
 from minimax_cal.simulators.motion.ladder import motion_gap
 
 ARM, LOGS = "The arm", "Logs of motion"
-OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains")
+OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains", "friction")
 
 
 @click.command(name="gap", cls=InGroups)
@@ -47,6 +47,11 @@ OF_LOGS = ("holdout_run", "payload", "drive_gain", "ratio", "gains")
     tip=Option("The last body of the arm, where there are several.", metavar="BODY", group=ARM),
     holdout_run=Option(
         "Judge on this run alone, which no fit sees.", metavar="NAME", many=tuple, group=LOGS
+    ),
+    friction=Option(
+        "What holds friction of joints at rest beside `frictionloss`: dcmotor.",
+        metavar="ELEMENT",
+        group=LOGS,
     ),
 )
 @motion_options(LOGS)

@@ -85,11 +85,11 @@ class LeftOut:
 
     def less_held(self, missed: Array) -> Array:
         """(R, n) the same less the friction of bristles, as the other folds show it."""
-        scene, out = self.normal.columns.scene, missed.copy()
+        bristles, out = self.normal.columns.scene.bristles, missed.copy()
         for f in range(len(self.gram)):
             rows = self.fold == f
-            held = held_friction(scene, missed, ~rows)
-            out[rows] -= (held * scene.bristles[rows]).sum(axis=-1)
+            held = held_friction(bristles[~rows], missed[~rows])
+            out[rows] -= (held * bristles[rows]).sum(axis=-1)
         return out
 
     def rms(self, missed: Array, moving: Array | None = None) -> Array:

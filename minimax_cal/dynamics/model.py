@@ -171,7 +171,7 @@ class Normal:
         value = self.solve([RIGID, FRICTION, *(t.text for t in terms)])
         found = tuple(value[self.place[t.text]] for t in terms)
         scene = self.columns.scene
-        held = held_friction(scene, (self.columns.error() - self.raw @ value).T)
+        held = held_friction(scene.bristles, (self.columns.error() - self.raw @ value).T)
         body = self.body(value)
         return TorqueModel(name, scene.arm, body, tuple(terms), found, context, held, delay)
 
@@ -183,13 +183,8 @@ class Normal:
         return TorqueModel(name, arm, body, (), (), context, none, 0.0)
 
 
-def held_friction(scene: Scene, missed: Array, rows: Array | None = None) -> Array:
-    """(n, 2) friction of the bristles by what a fit misses (R, n); none below 0.
-
-    rows: (R,) that count, all if None.
-    """
-    bent = scene.bristles if rows is None else scene.bristles[rows]
-    off = missed if rows is None else missed[rows]
+def held_friction(bent: Array, off: Array) -> Array:
+    """(n, 2) friction of bristles (R, n, 2) by what a fit misses (R, n); none below 0."""
     gram, pull = np.einsum("rjk,rjl->jkl", bent, bent), np.einsum("rjk,rj->jk", bent, off)
     size = np.maximum(np.einsum("jkk->jk", gram), 1e-300)
     one = np.maximum(pull / size, 0.0)

@@ -32,6 +32,26 @@ def sense_of(qd: Array, soft: Array | float) -> Array:
     return np.asarray(np.clip(qd / soft, -1.0, 1.0))
 
 
+def bent_bristles(logs: Logs, yields: Array) -> Array:
+    """(M, n, k) how far bristles are bent along a motion, -1 to 1.  yields: (k,) or (n, k).
+
+    A joint that stops or turns round keeps the friction of those that it has not bent over yet:
+    Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
+    """
+    out = np.zeros((*logs.torque.shape, yields.shape[-1]))
+    for a, b in zip(logs.start[:-1], logs.start[1:], strict=True):
+        q = logs.motion.q[a:b]
+        way = np.diff(q, axis=0, prepend=q[:1])[..., None] / yields
+        stays = np.exp(-np.abs(way))
+        bent, step = np.sign(way) * (1.0 - stays), 1
+        while step < b - a:  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
+            bent[step:] += stays[step:] * bent[:-step]
+            stays[step:] *= stays[:-step].copy()
+            step *= 2
+        out[a:b] = bent
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Arm:
     """An arm, and how its torques are read.
@@ -129,24 +149,13 @@ class Scene:
 
     @cached_property
     def bristles(self) -> Array:
-        """(R, n, k) how far bristles are bent, -1 to 1, less the sense; 0 while a joint slides.
+        """(R, n, k) how far bristles are bent, -1 to 1, less the sense; 0 while a joint slides."""
+        return self.stuck(YIELD)
 
-        A joint that stops or turns round keeps the friction of those that it has not bent over
-        yet: Maxwell-slip elements, each after the law of Dahl [Al-Bender, Lampaert, Swevers 2005].
-        """
-        bent = np.zeros((*self.logs.torque.shape, len(YIELD)))
-        for a, b in zip(self.logs.start[:-1], self.logs.start[1:], strict=True):
-            q = self.logs.motion.q[a:b]
-            way = np.diff(q, axis=0, prepend=q[:1])[..., None] / YIELD
-            stays = np.exp(-np.abs(way))
-            bent[a:b] = np.sign(way) * (1.0 - stays)
-            step = 1
-            while step < b - a:  # bent[i] += stays[i] * bent[i - 1], all i at once by doubling
-                bent[a + step : b] += stays[step:] * bent[a : b - step]
-                stays[step:] *= stays[:-step].copy()
-                step *= 2
-        stuck = ~self.logs.sliding
-        return self.logs.filtered(stuck[..., None] * (bent - self.sense[..., None]))
+    def stuck(self, yields: Array) -> Array:
+        """The same of bristles that yield after other ways (k,) or (n, k)."""
+        off = bent_bristles(self.logs, yields) - self.sense[..., None]
+        return self.logs.filtered(~self.logs.sliding[..., None] * off)
 
     @cached_property
     def since_reversal(self) -> Array:

@@ -15,8 +15,10 @@ from minimax_cal.dynamics.laws import LAWS, Term
 from minimax_cal.dynamics.result import WORDS, MotionDiagnosis, MotionEffect, best_worth
 from minimax_cal.ground.arrays import Array
 from minimax_cal.ground.stages import Progress
+from minimax_cal.simulators.motion.bristles import fit_bristles
 from minimax_cal.simulators.motion.fit import (
     ARMATURE,
+    BRISTLES,
     CURVE,
     DELAY,
     FRICTION,
@@ -42,9 +44,10 @@ ATTRIBUTES = {  # of the elements, in the order in which they are shown
     SPRINGS: "stiffness, springref",
     GAIN: "gear, gain",
     DELAY: "delay",
+    BRISTLES: "frictionloss, dcmotor with lugre",
 }
 STAYS = 1e-3  # fall of the mean log RMS torque by which an element stays
-MODULE = 0.01  # the same, for a module beside the file
+MODULE = 0.01  # the same, for a module beside the file, and of all rows for friction at rest
 SHOWN = 1e-3  # relative change of a joint's RMS that is listed
 LEVELS = ("degressive", "stribeck")  # laws that damping of higher powers comes near to
 SPRUNG, GEARED = ("cable",), ("drive_gain",)
@@ -80,11 +83,15 @@ def mean_log(values: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Where candidates are fitted and judged; each once."""
+    """Where candidates are fitted and judged; each once.
+
+    bristled: whether motors without input may hold friction at rest.
+    """
 
     judge: Judge
     opened: Opened
     study: Study
+    bristled: bool = False
     made: dict[Asked, Candidate] = field(default_factory=dict)
     followed: dict[Asked, float] = field(default_factory=dict)
 
@@ -92,12 +99,21 @@ class Bench:
         """The model with what is asked for, fitted to the runs to learn from."""
         if asked not in self.made:
             numbers = fit_numbers(self.study, asked)
+            if BRISTLES in asked.elements:
+                numbers = self.with_bristles(numbers)
             opened = self.written(numbers)
             text = self.module(opened, numbers) if asked.laws else ""
             with installed(text, opened.chain):
                 missed = self.judge.torque(opened.chain, numbers)
             self.made[asked] = Candidate(asked, numbers, opened, missed, text)
         return self.made[asked]
+
+    def with_bristles(self, numbers: Numbers) -> Numbers:
+        """Numbers with bristles too, by the same runs."""
+        opened = self.written(numbers)
+        with installed(self.module(opened, numbers) if numbers.laws else "", opened.chain):
+            off = self.judge.off(opened.chain, self.judge.learning, numbers)
+        return fit_bristles(self.study, numbers, off)
 
     def tracking(self, one: Candidate) -> float:
         """Mean log joint error of a candidate under logged commands; 0 where none were logged."""
@@ -171,6 +187,8 @@ def correct(bench: Bench, found: MotionDiagnosis, progress: Progress) -> Correct
     plain = without_idle(bench, by_elements(bench, full, whole))
     if not full.asked.laws or full.score > plain.score - MODULE:
         full = plain
+    if bench.bristled:
+        plain, full = (at_rest(bench, one) for one in (plain, full))
     rungs = tuple(ladder(bench, plain, full, progress))
     names = unwritten(plain.opened.chain, plain.numbers.bodies, plain.opened.chain.names)
     notices = tuple(f"link of {name}: MuJoCo did not take its mass and inertia from the file; give "
@@ -221,6 +239,15 @@ def without_idle(bench: Bench, best: Candidate) -> Candidate:
     return best
 
 
+def at_rest(bench: Bench, best: Candidate) -> Candidate:
+    """With bristles, if all rows gain by them, and more than those that move lose."""
+    more = bench.candidate(replace(best.asked, elements=best.asked.elements | {BRISTLES}))
+    gain = mean_log(best.missed.whole) - mean_log(more.missed.whole)
+    helps = gain > MODULE + max(0.0, more.score - best.score)
+    follows = bench.tracking(more) < bench.tracking(best) + STAYS
+    return more if helps and follows else best
+
+
 def without_law(asked: Asked, effect: str) -> Asked:
     """All but the laws of one effect."""
     return replace(asked, laws=tuple(term for term in asked.laws if term.effect != effect))
@@ -266,9 +293,9 @@ def worths(bench: Bench, plain: Candidate) -> Iterator[WrittenElement]:
     for name, attributes in ATTRIBUTES.items():
         if name in plain.asked.elements:
             bare = bench.candidate(plain.asked.without(name))
-            yield WrittenElement(
-                name, "file", attributes, worth_of(bare.missed.moving, plain.missed.moving)
-            )
+            rows = "whole" if name == BRISTLES else "moving"
+            yield WrittenElement(name, "file", attributes, worth_of(
+                getattr(bare.missed, rows), getattr(plain.missed, rows)))  # fmt: skip
 
 
 def law_worths(bench: Bench, full: Candidate) -> Iterator[WrittenElement]:

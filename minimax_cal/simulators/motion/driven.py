@@ -12,9 +12,11 @@ from scipy.interpolate import CubicSpline
 
 from minimax_cal.dynamics.rows import EDGE_S, Logs
 from minimax_cal.dynamics.run import Run
+from minimax_cal.dynamics.scene import bent_bristles
 from minimax_cal.ground.arrays import Array
 from minimax_cal.simulators.chain import Chain, mujoco
 from minimax_cal.simulators.drive import check_stable
+from minimax_cal.simulators.motion.numbers import FRICTION, bristles_in, given_bristles
 
 BANDWIDTH = 2.0 * np.pi * 5.0  # of drives that hold an arm to a log, where none are given [1/s]
 
@@ -38,6 +40,9 @@ def inverse_torque(chain: Chain, logs: Logs) -> Array:
     mj, model = mujoco(), chain.model
     data, (at, dofs) = mj.MjData(model), places(chain)
     out = np.empty(logs.motion.q.shape)
+    joint, number, bristle = np.array(bristles_in(chain), dtype=int).reshape(-1, 3).T
+    yields = given_bristles(chain)[1]
+    bent = (bent_bristles(logs, yields) * yields)[:, joint, number]
     floating = ~model.jnt_actgravcomp[list(chain.joints)].astype(bool)
     motion = logs.motion
     for k in range(len(out)):
@@ -45,6 +50,10 @@ def inverse_torque(chain: Chain, logs: Logs) -> Array:
         data.time = float(logs.since[k])
         mj.mj_inverse(model, data)
         out[k] = data.qfrc_inverse[dofs] + floating * data.qfrc_gravcomp[dofs]
+        if len(bristle):
+            data.act[model.actuator_actadr[bristle]] = bent[k]
+            mj.mj_fwdActuation(model, data)
+            np.subtract.at(out[k], joint, data.actuator_force[bristle])
     return out
 
 
@@ -124,12 +133,13 @@ def follow_gains(chain: Chain, run: Run, commands: Array, gains: Gains, source: 
 
 @contextmanager
 def own_drives_off(model: Any) -> Iterator[None]:
-    """A model without its actuators' forces, and with all its weight."""
+    """A model without its actuators' forces but for bristles, and with all its weight."""
     fields = ("actuator_gainprm", "actuator_biasprm", "body_gravcomp")
     kept = {name: getattr(model, name).copy() for name in fields}
+    drives = kept["actuator_biasprm"][:, FRICTION] == 0.0
     try:
         for name in fields:
-            getattr(model, name)[:] = 0.0
+            getattr(model, name)[drives if name.startswith("actuator") else ...] = 0.0
         yield
     finally:
         for name in fields:

@@ -37,6 +37,7 @@ DRY = ("degressive", "stribeck", "presliding", "load_friction", "angle_friction"
 
 FRICTION, MASSES, ARMATURE = "friction", "masses", "armature"
 CURVE, SPRINGS, GAIN, DELAY = "friction curve", "springs", "drive gain", "delay"
+BRISTLES = "friction at rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,6 +346,7 @@ def numbers_of(
     return before.put(
         bodies=bodies,
         friction=friction / gain,
+        bristles=before.bristles * (FRICTION not in asked.elements),
         damping=damping / per,
         armature=armature / gain,
         stiffness=stiffness,

@@ -111,13 +111,18 @@ class Judge:
         """The same runs and drives, for another model of the arm."""
         return replace(self, arm=replace(self.arm, robot=in_its_gravity(opened.chain)))
 
-    def torque(self, chain: Chain, numbers: Numbers | None = None) -> Missed:
-        """What a model gets wrong on the runs that judge."""
+    def off(self, chain: Chain, logs: Logs, numbers: Numbers | None) -> Array:
+        """(R, n) torque that a model gets wrong along some logs [unit of the log]."""
         gain = np.ones(len(self.inertia)) if numbers is None else numbers.gain
         late = 0.0 if numbers is None else numbers.late
-        seen = self.held.earlier(late) if late else self.held
-        said = inverse_torque(chain, self.held) * gain / self.arm.gain
-        off = (seen.y - self.held.filtered(said + self.known)) ** 2
+        seen = logs.earlier(late) if late else logs
+        said = inverse_torque(chain, logs) * gain / self.arm.gain
+        known = self.known if logs is self.held else Scene.of(self.arm, logs).known_torque
+        return np.asarray(seen.y - logs.filtered(said + known))
+
+    def torque(self, chain: Chain, numbers: Numbers | None = None) -> Missed:
+        """What a model gets wrong on the runs that judge."""
+        off = self.off(chain, self.held, numbers) ** 2
         moving = self.held.moving
         count = np.maximum(moving.sum(axis=0), 1)
         return Missed(np.sqrt(off.mean(axis=0)), np.sqrt((off * moving).sum(axis=0) / count))

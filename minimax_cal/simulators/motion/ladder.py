@@ -22,12 +22,15 @@ from minimax_cal.robots.gravity import weighed
 from minimax_cal.robots.urdf import MODELS
 from minimax_cal.simulators.chain import mujoco
 from minimax_cal.simulators.given import largest_inertia
+from minimax_cal.simulators.motion.bristles import has_bristles
 from minimax_cal.simulators.motion.correct import Bench, correct
 from minimax_cal.simulators.motion.fit import Study
 from minimax_cal.simulators.motion.judge import Judge
 from minimax_cal.simulators.motion.module import ENDING
 from minimax_cal.simulators.motion.opened import Opened, calibrated, open_model
 from minimax_cal.simulators.motion.result import MotionGap
+
+MOTOR = "dcmotor"  # what holds friction beside a constraint
 
 
 def motion_gap(
@@ -44,6 +47,7 @@ def motion_gap(
     drive_gain: Sequence[float] | None = None,
     ratio: float | Sequence[float] | None = None,
     gains: tuple[Sequence[float], Sequence[float]] | None = None,
+    friction: str | None = None,
     driven: bool = True,
     progress: Progress = silent,
 ) -> MotionGap:
@@ -69,6 +73,9 @@ def motion_gap(
         As of `diagnose_motion`.
     gains
         Stiffness [N m/rad] and damper [N m s/rad] of the drives, of all joints or of each.
+    friction
+        `dcmotor` for motors without input beside MuJoCo's `frictionloss`, whose LuGre friction is
+        that of a joint at rest (MuJoCo 3.16 or later).
     driven
         Whether drives move the arm along the held-out runs as well.
     progress
@@ -91,6 +98,10 @@ def motion_gap(
     if write is not None:
         check_writable(write, MODELS)
     mujoco()
+    if friction not in (None, MOTOR):
+        raise OptionError(f"friction={friction!r}: give {MOTOR}, or leave it")
+    if friction == MOTOR and not has_bristles():
+        raise OptionError(f"friction={MOTOR}: this MuJoCo has no motors without input; update it")
     progress("reading the model and the logs")
     runs = read_logs(model, logs)
     opened = open_model(model, runs[0].joints if runs else 0, tip)
@@ -106,7 +117,7 @@ def motion_gap(
         found = told_or_found(judge, opened, diagnosis, payload, progress)
         judge = replace(judge, arm=replace(judge.arm, fastest=found.arm.fastest,
                                            soft=found.arm.soft))  # fmt: skip
-        bench = bench_of(judge, opened, found)
+        bench = replace(bench_of(judge, opened, found), bristled=friction == MOTOR)
         made = correct(bench, found, progress)
     path = None if write is None else Path(write)
     beside = path.with_name(path.stem + ENDING) if path and made.full.module else None

@@ -29,7 +29,7 @@ def module_text(chain: Chain, numbers: Numbers, unit: Array, ratio: Array) -> st
         laws = [law_of(term, value * unit[j] / numbers.gain[j], value / numbers.gain[j], numbers,
                        float(ratio[j])) for term, value in pairs if term.joint == j]  # fmt: skip
         told[name] = {
-            "frictionloss": float(numbers.friction[j]),
+            "frictionloss": float(numbers.loss[j]),
             "damping": [float(v) for v in numbers.damping[j]],
             "laws": laws,
         }

@@ -19,12 +19,13 @@ from minimax_cal.simulators.document import Document
 from minimax_cal.simulators.elements import known, numbers, section, tune
 from minimax_cal.simulators.mjcf import new_tree
 from minimax_cal.simulators.motion.bodies import Bodies, inertial, parameters_of, pseudo_inertia
-from minimax_cal.simulators.motion.numbers import Numbers
+from minimax_cal.simulators.motion.numbers import Numbers, bristle
 from minimax_cal.simulators.servos import STEPS, carried
 
 SAME = 1e-12  # relative change of a number that is none
 TURNS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 STOPS = 4e-6  # friction moves the tool of a new file, at each joint, by no more [m]
+OPEN = {"motorconst": "1", "resistance": "1e9", "input": "none"}  # a motor that drives nothing
 HISTORY = 2  # samples of a delayed signal beyond those of the delay
 SHORTEST = 0.5  # of a timestep: a shorter delay is none
 
@@ -36,7 +37,7 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
         if differs(found.bodies[i], given.bodies[i]):
             weigh(body, found.bodies[i])
         put(joint, "armature", found.armature[i], given.armature[i])
-        put(joint, "frictionloss", found.friction[i], given.friction[i])
+        put(joint, "frictionloss", found.loss[i], given.loss[i])
         put(joint, "damping", powers(found.damping[i]), powers(given.damping[i]))
         put(joint, "stiffness", powers(found.stiffness[i]), powers(given.stiffness[i]))
         if differs(found.stiffness[i], given.stiffness[i]):
@@ -45,6 +46,7 @@ def write_numbers(document: Document, chain: Chain, given: Numbers, found: Numbe
             joint.set("springref", numbers([np.degrees(rest) if turns else rest]))
     write_gains(document.root, chain, found)
     write_delay(document.root, chain, found)
+    write_bristles(document.root, chain, found)
 
 
 def elements_of(root: ET.Element, chain: Chain) -> tuple[list[ET.Element], list[ET.Element]]:
@@ -114,9 +116,25 @@ def write_gains(root: ET.Element, chain: Chain, found: Numbers) -> None:
 
 
 def actuators_of(root: ET.Element, joint: str) -> list[ET.Element]:
-    """The actuators of a joint."""
+    """The actuators that drive a joint."""
     every = [e for part in root.iter("actuator") for e in part]
-    return [e for e in every if e.get("joint") == joint]
+    return [e for e in every if e.get("joint") == joint and e.get("input") != OPEN["input"]]
+
+
+def write_bristles(root: ET.Element, chain: Chain, found: Numbers) -> None:
+    """Give joints their bristles, and take away those that they have no more."""
+    for j, name in enumerate(chain.names):
+        for k, friction in enumerate(found.bristles[j]):
+            if friction > 0.0:
+                stiffness = friction / found.yields[j, k]
+                level = [stiffness, stiffness * found.damped[j], friction, friction, 1.0]
+                known(section(root, "actuator"), "dcmotor", bristle(name, k), joint=name,
+                      lugre=level, **OPEN)  # fmt: skip
+                continue
+            for part in root.iter("actuator"):
+                for old in part.findall("dcmotor"):
+                    if old.get("name") == bristle(name, k):
+                        part.remove(old)
 
 
 def write_delay(root: ET.Element, chain: Chain, found: Numbers) -> None:
